@@ -4,8 +4,8 @@ A script, started with ``python -I -S``: it imports nothing of the harness, and 
 memory. It stands between a run and somebody's program because a process that is killed can do nothing any more, but the
 system closes its pipes, and that can be waited for.
 
-It is told through its standard input, first one line of JSON, then ``STOP`` or ``DONE``; the end of that pipe, which
-comes with the end of whoever held it, ends the program and removes its folders. It answers through a second pipe, a
+It is told through its standard input, first one line of JSON, then ``STOP`` or ``DONE``; when that pipe closes
+because the parent process is gone, it ends the program and removes its folders. It answers through a second pipe, a
 line of JSON each: the program's process id or why it cannot be started, then its exit code.
 """
 
@@ -24,7 +24,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-STOP, DONE = b"S", b"D"  # ask the program to stop; end it, whoever asks takes care of its folders
+STOP, DONE = b"S", b"D"  # ask the program to stop; end it, the parent process removes its folders
 ENDING_S = 5.0  # for processes that were killed to be gone; what waits for a dead disk stays
 AFTERWARDS_S = 60.0  # for `docker kill`
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -46,7 +46,7 @@ def main(answers: int) -> None:
     _prctl(PR_SET_CHILD_SUBREAPER, 1)  # what the program started and left becomes a child of this process
     with open(0, "rb", buffering=0, closefd=False) as orders:
         line = orders.readline()
-    if not line.endswith(b"\n"):  # whoever asked is gone already
+    if not line.endswith(b"\n"):  # the parent process is gone already
         return
     order = json.loads(line)
     try:
