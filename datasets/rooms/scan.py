@@ -51,7 +51,7 @@ def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: 
 
 
 def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh, poses: Float64Array) -> BoolArray:
-    from su3d_bench.datasets.rooms.rendering.shade_kernels import drop_seen
+    from su3d_bench.datasets.rooms.rendering.shade_kernels import aim_at_faces, drop_seen
 
     corners = [points[grid.faces[:, k]] for k in range(4)]
     normals = np.cross(corners[2] - corners[0], corners[3] - corners[1])
@@ -59,16 +59,19 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
     normals = (normals / np.maximum(size, 1e-15)).astype(np.float32)
     centres = (sum(corners[1:], corners[0]) / 4).astype(np.float32)
     renderer = Renderer(mesh, VIEW_WIDTH, VIEW_HEIGHT)
-    intrinsics = camera_intrinsics(VIEW_WIDTH, VIEW_HEIGHT)
+    intrinsics = camera_intrinsics(VIEW_WIDTH, VIEW_HEIGHT).astype(np.float32)
     seen = np.zeros(len(centres), np.bool_)
     active = np.flatnonzero(size[:, 0] > 1e-10).astype(np.int32)
-    n_active = len(active)
+    n_active, n_pixels = len(active), VIEW_WIDTH * VIEW_HEIGHT
+    pixel, is_hit = np.empty(n_active, np.int32), np.empty(n_pixels, np.bool_)
+    depth, instance = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.int32)
     for index in (i for start in range(TOUR) for i in range(start, len(poses), TOUR)):
-        pose = poses[index]
-        depth, instance = renderer.depth_and_instance(pose)
-        n_active = drop_seen(active, n_active, centres, normals, owner, seen, pose.astype(np.float32),
-                             np.float32(intrinsics[0, 0]), np.float32(intrinsics[0, 2]), np.float32(intrinsics[1, 2]),
-                             depth, instance)  # fmt: skip
+        pose = poses[index].astype(np.float32)
+        aim_at_faces(active, n_active, centres, normals, pose, intrinsics[0, 0], intrinsics[0, 2], intrinsics[1, 2],
+                     VIEW_WIDTH, VIEW_HEIGHT, pixel, is_hit)  # fmt: skip
+        pixels = np.flatnonzero(is_hit)  # a third of the image: rays that decide nothing are not cast
+        depth[pixels], instance[pixels] = renderer.depth_and_instance(poses[index], pixels)
+        n_active = drop_seen(active, n_active, pixel, centres, normals, owner, seen, pose, depth, instance)
     return seen
 
 

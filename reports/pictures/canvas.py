@@ -263,6 +263,7 @@ DEPTH_BINS = 3  # near points are drawn larger than far ones, in this many steps
 MAX_SQUARE = 15
 SHADE_STRENGTH = 60.0
 SHADE_REACH = 2  # pixels of the oversampled image
+MAX_STEP_BEHIND = 0.02  # of log2 of depth
 
 
 @dataclass(frozen=True)
@@ -375,12 +376,25 @@ def _shade(depth: Float64Array) -> Float32Array:
 
     ``depth`` is NaN where nothing is drawn.
     """
-    log_depth = np.log2(depth)
-    behind = np.zeros_like(depth)
+    around = np.pad(np.log2(depth), SHADE_REACH, mode="wrap")
+    return np.exp(-SHADE_STRENGTH / 8.0 * steps_behind(around, SHADE_REACH, MAX_STEP_BEHIND)).astype(np.float32)
+
+
+@njit(cache=True)
+def steps_behind(around: Any, reach: int, most: float) -> Any:
+    """How far each pixel lies behind its eight neighbours ``reach`` pixels away, each up to ``most``.
+
+    ``around`` (h, w) has a border of ``reach`` pixels that are neighbours alone; NaN is neither before nor behind.
+    """
+    height, width = around.shape[0] - 2 * reach, around.shape[1] - 2 * reach
+    behind = np.zeros((height, width))
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
-        neighbour = np.roll(log_depth, (dy * SHADE_REACH, dx * SHADE_REACH), axis=(0, 1))
-        behind += np.nan_to_num(np.clip(log_depth - neighbour, 0.0, 0.02), nan=0.0)
-    return np.exp(-SHADE_STRENGTH / 8.0 * behind).astype(np.float32)
+        above, left = reach - dy * reach, reach - dx * reach
+        for row in range(height):
+            for column in range(width):
+                step = around[row + reach, column + reach] - around[row + above, column + left]
+                behind[row, column] += min(step, most) if step > 0.0 else 0.0
+    return behind
 
 
 def colour(view: View, colours: UInt8Array) -> UInt8Array:

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 from fuzz_words import verbs
+from painted_runs import PAINTED
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 
 RUN = (
-    "--scenes rooms/living0 --methods opensu3d oracle --protocols rooms-semantic rooms-instance --set rooms.n_frames=8 "
+    "--scenes rooms/bathroom0 --methods opensu3d oracle --protocols rooms-semantic rooms-instance --stride 200 "
     "--no-pictures --jobs 1"
 )
 
@@ -22,12 +23,12 @@ RUN = (
 CASES: dict[str, tuple[str, int, str]] = {
     "run": (f"{RUN} --out out", 0, "| opensu3d"),
     "ablate": (
-        "--vary m=1,2 --scenes rooms/living0 --set rooms.n_frames=8 --limit 2 --no-pictures --jobs 1 --out sweep",
+        "--vary m=1,2 --scenes rooms/bathroom0 --stride 400 --limit 2 --no-pictures --jobs 1 --out sweep",
         0,
         "sweep/metrics.json",
     ),
     "evaluate": (
-        "out/scenes/rooms.living0/opensu3d --dataset rooms --protocol rooms-instance --out evaluated",
+        "out/scenes/rooms.bathroom0/opensu3d --dataset rooms --protocol rooms-instance --out evaluated",
         0,
         "evaluated/metrics.json",
     ),
@@ -52,17 +53,17 @@ CASES: dict[str, tuple[str, int, str]] = {
     "sheets make": ("out --kind retrieval --per-kind 1 --jobs 1 --out sheets", 0, "sheets"),
     "sheets score": ("--key sheets-key --out scores", 0, "scores/scores.json"),
     "sheets pictures": ("out --what labels --out labels.png", 0, "labels.png"),
-    "query text": ("rooms/living0 'plant on shelf' --run out", 0, "opensu3d"),
-    "query make": ("--scenes rooms/living0 --per-kind 1 --out queries.toml", 0, "queries.toml"),
-    "query audit": ("--scenes rooms/living0 --n 2 --out audit", 0, "audit/index.html"),
+    "query text": ("rooms/bathroom0 'plant on shelf' --run out", 0, "opensu3d"),
+    "query make": (f"--scenes {PAINTED}/a --per-kind 1 --out queries.toml", 0, "queries.toml"),
+    "query audit": (f"--scenes {PAINTED}/a --n 2 --out audit", 0, "audit/index.html"),
     "query score": ("none.json --answers none.json", 2, "none.json"),
     "query show": ("paper", 0, "904 questions on 13 scenes"),
-    "query ask": ("rooms/living0 'What is the largest object?' --run out", 0, "#"),
+    "query ask": ("rooms/bathroom0 'What is the largest object?' --run out", 0, "#"),
     "runs refine": ("out", 0, "opensu3d"),
     "datasets list": ("", 0, "replica"),
-    "datasets check": ("rooms/living0 --set rooms.n_frames=8 --quick", 0, "living0"),
-    "datasets show": ("rooms/living0 --set rooms.n_frames=8 --out room.png", 0, "room.png"),
-    "datasets make": ("rooms --layout replica --scenes living0 --set n_frames=2 --out made", 0, ""),
+    "datasets check": ("rooms/bathroom0 --set rooms.width=160 rooms.height=120 --quick", 0, "bathroom0"),
+    "datasets show": ("rooms/bathroom0 --set rooms.width=160 rooms.height=120 --out room.png", 0, "room.png"),
+    "datasets make": ("rooms --layout replica --scenes bathroom0 --set n_frames=2 --jobs 1 --out made", 0, ""),
     "methods list": ("", 0, "opensu3d"),
     "methods check": ("oracle", 0, "nothing found wrong"),
     "methods show": ("opensu3d", 0, "opensu3d"),

@@ -23,8 +23,8 @@ HOSTILE = (
     "::error::v\x9b31m\u202egnp\u2066\u200b\ufeff\x85\x7f %0A::warning::u <script>alert(1)</script> [a](http://b) | c"
 )
 IN_A_PATH = HOSTILE.replace("/", "").replace("\x00", "")[:80]
-SCENE, METHOD = "rooms/living0", "opensu3d"
-FEW = ["--set", "rooms.n_frames=8"]
+SCENE, METHOD = "rooms/bathroom0", "opensu3d"
+FEW = ["--set", "rooms.n_frames=8", "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.05"]
 TEXTS = (".md", ".csv", ".html", ".tex", ".xml", ".txt", ".json", ".toml", ".svg")
 
 # What follows verbs that write texts, and verbs that print what each kind of file of others holds: a run of hostile
@@ -147,9 +147,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
         words = ["--scenes", SCENE, "--methods", METHOD, "oracle", *FEW, "--no-pictures", "--jobs", "1", "--quiet"]
         protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
         assert main(["run", *words, *protocols, "--out", "run"]) == 0
-        scenes = ["--scenes", "living0", "--set", "n_frames=2"]
-        assert main(["datasets", "make", "rooms", "--layout", "replica", *scenes, "--out", "data", "--quiet"]) == 0
-        (folder / "data" / "Replica" / "living0").rename(folder / "data" / "Replica" / IN_A_PATH)
+        scenes = ["--scenes", "bathroom0", "--set", "n_frames=2", "mesh_spacing_m=0.05"]
+        assert main(["datasets", "make", "rooms", "--layout", "replica", *scenes, "--jobs", "1", "--out", "data", "--quiet"]) == 0
+        (folder / "data" / "Replica" / "bathroom0").rename(folder / "data" / "Replica" / IN_A_PATH)
         assert main(["check", "--learn", "run", "--out", "reference.json"]) == 0
     return folder
 

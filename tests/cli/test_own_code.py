@@ -15,6 +15,7 @@ from places import ROOT
 from su3d_bench.cli.main import main
 
 METHOD, DATASET = "my_method.py:MyMethod", "my_dataset.py:MyDataset/near"
+FEW = ("rooms.n_frames=8", "rooms.mesh_spacing_m=0.05")
 
 
 @pytest.fixture(autouse=True)
@@ -142,7 +143,7 @@ def test_a_file_may_hold_dataclasses_and_is_read_anew_when_it_changed(capsys: py
 
 def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureFixture[str]) -> None:
     text = written("method", "", "")
-    words = ["run", "--scenes", "rooms/living0", "--set", "rooms.n_frames=8", "--profile", "oracle", "--limit", "1"]
+    words = ["run", "--scenes", "rooms/bathroom0", "--set", *FEW, "--profile", "oracle", "--limit", "1"]
     words += ["--methods", METHOD, "--protocols", "rooms-instance", "--jobs", "1", "--no-pictures", "--out", "out"]
     assert main(words) == 0
     assert main(words) == 0
@@ -203,8 +204,9 @@ def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: py
 
 def test_the_method_runs_on_the_built_in_rooms() -> None:
     assert main(["methods", "new", "my_method.py"]) == 0
-    words = "--scenes rooms/living0 --set rooms.n_frames=8 --profile oracle --jobs 1 --out r --no-pictures"
-    assert main(["run", "--methods", "my_method.py:MyMethod", *words.split(), "--protocols", "rooms-instance"]) == 0
+    words = "--scenes rooms/bathroom0 --profile oracle --jobs 1 --out r --no-pictures"
+    words += f" --protocols rooms-instance --set {' '.join(FEW)}"
+    assert main(["run", "--methods", "my_method.py:MyMethod", *words.split()]) == 0
     assert results("r")["my-method", "rooms-instance"]["AP25"] > 0
 
 

@@ -80,6 +80,7 @@ def test_native_layout_puts_the_scan_into_the_data_root(capsys: pytest.CaptureFi
     assert len(list((tmp_path / "native").rglob("bathroom0.npz"))) == 1
 
 
+@pytest.mark.proof
 def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
     words = [*MAKE[:-1], "2", "--layout", "replica", "--out", "made2", "--quiet"]
     done = subprocess.run([sys.executable, "-m", "su3d_bench", *words], capture_output=True, text=True)

@@ -34,12 +34,20 @@ def test_texts_made_here_give_the_numbers_of_the_run_itself(
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     protocols = ["rooms-semantic", "rooms-instance"]
-    words = ["--scenes", "rooms/living0", "--methods", "opensu3d", "--stride", "200", "--jobs", "1"]
+    words = ["--scenes", "rooms/bathroom0", "--methods", "opensu3d", "--stride", "200", "--jobs", "1"]
     assert main(["run", *words, "--protocols", *protocols, "--no-pictures", "--quiet", "--out", "out"]) == 0
     own = json.loads(Path("out/metrics.json").read_text())["results"]
     for name in protocols:
         assert make(name, f"{name}.npz") == 0
-        words = ["evaluate", "out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocols", name, "--quiet"]
+        words = [
+            "evaluate",
+            "out/scenes/rooms.bathroom0/opensu3d",
+            "--dataset",
+            "rooms",
+            "--protocols",
+            name,
+            "--quiet",
+        ]
         assert main([*words, "--json=own.json"]) == 0
         assert main([*words, "--text-features", f"{name}.npz", "--json=texts.json"]) == 0
         assert Path("texts.json").read_bytes() == Path("own.json").read_bytes()

@@ -81,7 +81,7 @@ def test_the_oracle_of_the_rooms_says_exactly_one(
     rooms_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
-    run = ["run", "--scenes", "rooms/living0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
+    run = ["run", "--scenes", "rooms/bathroom0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
     assert main([*run, "--quiet"]) == 0
     capsys.readouterr()
     assert main(["evaluate", "run", "--json", "out.json"]) == 0

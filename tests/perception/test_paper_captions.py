@@ -71,7 +71,7 @@ class Finished:
         settings += [f"perception.language.timeout_s={TIMEOUT_S}"]
         settings += [f"perception.language.max_retries={N_TRIES - 1}", "perception.language.max_failures_in_a_row=50"]
         settings += ["perception.language.max_concurrent=8", "perception.language.key_variable=SU3D_TEST_KEY"]
-        return main(paper_words(self._models, self.root / folder, "rooms/living0", settings, *words))
+        return main(paper_words(self._models, self.root / folder, "rooms/bathroom0", settings, "--limit", "4", *words))
 
     def file(self, name: str, folder: str = "first") -> Path:
         return next((self.root / folder).glob(f"scenes/*/opensu3d/{name}"))

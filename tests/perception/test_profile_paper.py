@@ -177,7 +177,7 @@ def test_a_room_runs_end_to_end(
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     methods = ("opensu3d", "sam3d")  # named masks, and masks of everything
-    assert main(paper_words(models, tmp_path / "out", "rooms/living0", (), "--methods", *methods)) == 0
+    assert main(paper_words(models, tmp_path / "out", "rooms/bathroom0", (), "--methods", *methods)) == 0
     for method in methods:
         found = read_prediction(next((tmp_path / "out").glob(f"scenes/*/{method}/prediction.npz")))
         assert isinstance(found, Instances) and len(found) > 0

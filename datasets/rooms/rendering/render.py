@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
@@ -43,7 +43,7 @@ class Renderer:
     def render(self, camera_to_world: Float64Array) -> RenderedFrame:
         from su3d_bench.datasets.rooms.rendering.shade_kernels import shade
 
-        rays, t_hit, primitive, uv = self._cast(camera_to_world)
+        rays, t_hit, primitive, uv = self._cast(camera_to_world, self._directions)
         n, mesh = len(rays), self._mesh
         rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
         origin = camera_to_world[:3, 3].astype(np.float32)
@@ -53,21 +53,22 @@ class Renderer:
         shape = (self.height, self.width)
         return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
 
-    def depth_and_instance(self, camera_to_world: Float64Array) -> tuple[Float32Array, Int32Array]:
-        """The images without colour: (H, W) depth in metres (0 for a miss) and object ids."""
-        _, t_hit, primitive, _ = self._cast(camera_to_world)
+    def depth_and_instance(self, camera_to_world: Float64Array, pixels: Int64Array) -> tuple[Float32Array, Int32Array]:
+        """Depth in metres (N,), 0 for a miss, and object ids (N,) at ``pixels`` (N,), counted along the rows."""
+        _, t_hit, primitive, _ = self._cast(camera_to_world, self._directions[pixels])
         hit = np.isfinite(t_hit)
         ids = self._mesh.instance_of_triangle[np.where(hit, primitive, 0)]
-        shape = (self.height, self.width)
-        return np.where(hit, t_hit, np.float32(0)).reshape(shape), np.where(hit, ids, np.int32(0)).reshape(shape)
+        return np.where(hit, t_hit, np.float32(0)), np.where(hit, ids, np.int32(0))
 
-    def _cast(self, pose: Float64Array) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
+    def _cast(
+        self, pose: Float64Array, directions: Float64Array
+    ) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
         from su3d_bench.datasets.rooms.rendering.shade_kernels import aim
 
         o3d = compiled_open3d()
 
-        rays = np.empty((self.width * self.height, 6), np.float32)
-        aim(self._directions, pose, rays)
+        rays = np.empty((len(directions), 6), np.float32)
+        aim(directions, pose, rays)
         answer = self._scene.cast_rays(o3d.core.Tensor(rays))
         return rays, answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
 

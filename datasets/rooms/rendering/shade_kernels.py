@@ -113,31 +113,47 @@ LOOSE_M, LOOSE_SHARE = 0.012, 0.012  # depth may differ by this much, and by thi
 
 
 @compiled
-def drop_seen(  # type: ignore[no-untyped-def]
-    active, n_active, centres, normals, owner, seen, pose, focal, cx, cy, depth, instance
+def aim_at_faces(  # type: ignore[no-untyped-def]
+    active, n_active, centres, normals, pose, focal, cx, cy, width, height, pixel, is_hit
 ):
+    """Fills ``pixel`` (F,) with the pixel nearest to the centre of each active face, or -1 where a camera sees none of
+    it: it lies outside the image or shows its back. ``is_hit`` (height * width,) marks those pixels.
+    """
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    is_hit[:] = False
+    for k in range(n_active):
+        f = active[k]
+        pixel[k] = -1
+        dx, dy, dz = centres[f, 0] - ox, centres[f, 1] - oy, centres[f, 2] - oz
+        if -(dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2]) > 0.0:
+            z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
+            if z > NEAREST_M:
+                column = math.floor((dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]) / z * focal + cx + 0.5)
+                row = math.floor((dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]) / z * focal + cy + 0.5)
+                if 0 <= column < width and 0 <= row < height:
+                    pixel[k] = row * width + column
+                    is_hit[pixel[k]] = True
+
+
+@compiled
+def drop_seen(active, n_active, pixel, centres, normals, owner, seen, pose, depth, instance):  # type: ignore[no-untyped-def]
     """Marks in ``seen`` the active faces that the image shows; answers how many stay active.
 
     ``active`` is compacted in place: what is seen once leaves it. A face is shown where the pixel nearest to its
     centre holds its own object at its depth.
     """
-    height, width = depth.shape
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     left = 0
     for k in range(n_active):
         f = active[k]
-        dx, dy, dz = centres[f, 0] - ox, centres[f, 1] - oy, centres[f, 2] - oz
-        facing = -(dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2])
         hit = False
-        if facing > 0.0:
+        if pixel[k] >= 0 and instance[pixel[k]] == owner[f]:
+            dx, dy, dz = centres[f, 0] - ox, centres[f, 1] - oy, centres[f, 2] - oz
+            facing = -(dx * normals[f, 0] + dy * normals[f, 1] + dz * normals[f, 2])
             z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
-            if z > NEAREST_M:
-                column = math.floor((dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]) / z * focal + cx + 0.5)
-                row = math.floor((dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]) / z * focal + cy + 0.5)
-                if 0 <= column < width and 0 <= row < height and instance[row, column] == owner[f]:
-                    cosine = facing / math.sqrt(dx * dx + dy * dy + dz * dz)
-                    loose = LOOSE_M + LOOSE_SHARE * z / max(cosine, 0.15)
-                    hit = cosine > GRAZING and abs(depth[row, column] - z) < loose
+            cosine = facing / math.sqrt(dx * dx + dy * dy + dz * dz)
+            loose = LOOSE_M + LOOSE_SHARE * z / max(cosine, 0.15)
+            hit = cosine > GRAZING and abs(depth[pixel[k]] - z) < loose
         if hit:
             seen[f] = True
         else:
