@@ -377,7 +377,8 @@ def _shade(depth: Float64Array) -> Float32Array:
     ``depth`` is NaN where nothing is drawn.
     """
     around = np.pad(np.log2(depth), SHADE_REACH, mode="wrap")
-    return np.exp(-SHADE_STRENGTH / 8.0 * steps_behind(around, SHADE_REACH, MAX_STEP_BEHIND)).astype(np.float32)
+    behind: Float64Array = steps_behind(around, SHADE_REACH, MAX_STEP_BEHIND)
+    return np.exp(-SHADE_STRENGTH / 8.0 * behind).astype(np.float32)
 
 
 @njit(cache=True)

@@ -12,6 +12,7 @@ from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
+from su3d_bench.store.records import UnscoredRecord
 
 # A number of things in a scene, and what is said of them before the first of them is named. Scenes share classes.
 _COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>(?!class)[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
@@ -79,16 +80,6 @@ class Found:
     update_ms: float | None
 
 
-@dataclass(frozen=True)
-class Unscored:
-    """Why a protocol does not score a map."""
-
-    scene: str
-    method: str
-    protocol: str
-    why: str
-
-
 def found_table(rows: Sequence[Found], run: str = "") -> Table:
     """A row a scene and method; ``run`` is named where there are several."""
     head = ["scene", "method", "instances", "points", "smallest / median / largest (m)", "updates", "ms an update"]
@@ -129,16 +120,16 @@ def _of_name(name: str, n: int) -> str:
     return name if n == 1 else f"{n} {plural(name) if is_countable(name) else name}"
 
 
-def not_scored_lines(reasons: Iterable[Unscored]) -> list[str]:
+def not_scored_lines(reasons: Iterable[UnscoredRecord]) -> list[str]:
     """One line a protocol, protocols of one reason together, scenes that lack the same as the first of them alone."""
-    of_kind: dict[tuple[str, tuple[str, ...]], list[Unscored]] = {}
+    of_kind: dict[tuple[str, tuple[str, ...]], list[UnscoredRecord]] = {}
     for reason in reasons:
         of_kind.setdefault((reason.protocol, _kind(reason)), []).append(reason)
     protocols: dict[tuple[str, str, int], list[str]] = {}
     for (protocol, _), alike in of_kind.items():
         first = alike[0]
         scene = printable(first.scene)
-        why = first.why if first.why.startswith((first.scene, scene)) else f"{scene}: {first.why}"
+        why = first.reason if first.reason.startswith((first.scene, scene)) else f"{scene}: {first.reason}"
         methods = ", ".join(dict.fromkeys(reason.method for reason in alike))
         n_scenes = len({reason.scene for reason in alike})
         protocols.setdefault((methods, why, n_scenes), []).append(protocol)
@@ -148,10 +139,10 @@ def not_scored_lines(reasons: Iterable[Unscored]) -> list[str]:
     ]
 
 
-def _kind(reason: Unscored) -> tuple[str, ...]:
+def _kind(reason: UnscoredRecord) -> tuple[str, ...]:
     """The words of a reason that are not of its scene: no path, and nothing that holds the scene's name."""
     own = reason.scene.rpartition("/")[2]
-    return tuple(word for word in reason.why.split() if "/" not in word and own not in word)
+    return tuple(word for word in reason.reason.split() if "/" not in word and own not in word)
 
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.

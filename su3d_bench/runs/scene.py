@@ -34,13 +34,14 @@ from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.solver import MapSolver, by_language_model
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.tables.run import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import job as jobs
 from su3d_bench.runs.executors import Event, Report
 from su3d_bench.runs.frame_loop import SceneLog
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.records import UnscoredRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 logger = logging.getLogger(__name__)
@@ -300,7 +301,7 @@ class _Scene:
             self.says(part, "drawing the map")
             truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
-        reasons = [Unscored(self.job.scene, part.name, *pair) for pair in unscored.items()]
+        reasons = [UnscoredRecord(self.job.scene, part.name, *pair) for pair in unscored.items()]
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
         doubts = folder.remarks("predict").get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}

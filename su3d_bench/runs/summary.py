@@ -30,7 +30,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Found, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, record_of_rules
 from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan
@@ -184,11 +184,13 @@ def record(plan: Plan, outcomes: Outcomes, status: str) -> records.RunRecord:
         failed=tuple(
             records.FailureRecord(one.scene, one.method, one.error) for one in outcomes if one.error is not None
         ),
-        unscored=tuple(
-            records.UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored
-        ),
+        unscored=_unscored(outcomes),
         warnings=tuple(dict.fromkeys(line for outcome in outcomes for line in outcome.warnings)),
     )
+
+
+def _unscored(outcomes: Outcomes) -> tuple[records.UnscoredRecord, ...]:
+    return tuple(records.UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored)
 
 
 # ---- what must be said
@@ -198,8 +200,8 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
     """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
     failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
     lines = [line for outcome in outcomes for line in outcome.warnings]
-    reasons = [Unscored(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored]
-    lines += not_scored_lines(reasons)
+    unscored = _unscored(outcomes)
+    lines += not_scored_lines(unscored)
     # A table says the caveat beneath it; what no protocol scores has no table.
     has_table = {(one.method, one.caveat) for one in outcomes if (one.scene, one.method) not in without_score}
     caveats: dict[str, dict[str, None]] = {}
@@ -207,7 +209,7 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
         if outcome.caveat and outcome.error is None and (outcome.method, outcome.caveat) not in has_table:
             caveats.setdefault(outcome.caveat, {})[outcome.method] = None
     lines += [f"{', '.join(methods)}: {caveat}" for caveat, methods in caveats.items()]
-    reported = {(reason.scene, reason.why) for reason in reasons}
+    reported = {(one.scene, one.reason) for one in unscored}
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
             lines.append(f"{outcome.scene}: no score of the truth: {outcome.error}")

@@ -60,7 +60,7 @@ def pairs_to_walk() -> Iterator[Any]:
     """All pairs; but for the first of each dataset and one of many groups they are left to proofs."""
     seen = set[Any]()
     for dataset, first, second in PAIRS:
-        brings = {dataset}
+        brings: set[Any] = {dataset}
         if not {True, False} <= seen:
             brings.add(len(Mixtures(first, second).groups) > EXACT_STEPS)
         yield pytest.param(dataset, first, second, marks=[] if brings - seen else pytest.mark.proof)

@@ -14,19 +14,15 @@ from painted_runs import PAINTED
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 
+SMALL = "--set rooms.width=320 rooms.height=240 --no-pictures --jobs 1"
 RUN = (
-    "--scenes rooms/bathroom0 --methods opensu3d oracle --protocols rooms-semantic rooms-instance --stride 200 "
-    "--no-pictures --jobs 1"
+    f"--scenes rooms/bathroom0 --methods opensu3d oracle --protocols rooms-semantic rooms-instance --stride 200 {SMALL}"
 )
 
 # What follows each verb, the exit code, and a file that it leaves or words that it says.
 CASES: dict[str, tuple[str, int, str]] = {
     "run": (f"{RUN} --out out", 0, "| opensu3d"),
-    "ablate": (
-        "--vary m=1,2 --scenes rooms/bathroom0 --stride 400 --limit 2 --no-pictures --jobs 1 --out sweep",
-        0,
-        "sweep/metrics.json",
-    ),
+    "ablate": (f"--vary m=1,2 --scenes rooms/bathroom0 --limit 2 {SMALL} --out sweep", 0, "sweep/metrics.json"),
     "evaluate": (
         "out/scenes/rooms.bathroom0/opensu3d --dataset rooms --protocol rooms-instance --out evaluated",
         0,

@@ -147,8 +147,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
         words = ["--scenes", SCENE, "--methods", METHOD, "oracle", *FEW, "--no-pictures", "--jobs", "1", "--quiet"]
         protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
         assert main(["run", *words, *protocols, "--out", "run"]) == 0
-        scenes = ["--scenes", "bathroom0", "--set", "n_frames=2", "mesh_spacing_m=0.05"]
-        assert main(["datasets", "make", "rooms", "--layout", "replica", *scenes, "--jobs", "1", "--out", "data", "--quiet"]) == 0
+        made = ["--layout", "replica", "--scenes", "bathroom0", "--jobs", "1", "--out", "data", "--quiet"]
+        assert main(["datasets", "make", "rooms", *made, "--set", "n_frames=2", "mesh_spacing_m=0.05"]) == 0
         (folder / "data" / "Replica" / "bathroom0").rename(folder / "data" / "Replica" / IN_A_PATH)
         assert main(["check", "--learn", "run", "--out", "reference.json"]) == 0
     return folder

@@ -25,8 +25,8 @@ def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    words = ["datasets", "make", "rooms", "--layout", "replica", "--scenes", "bedroom0", *ROOM, "--jobs", "1", "--quiet"]
-    assert main([*words, "--out", str(tmp_path / "data")]) == 0
+    words = ["--layout", "replica", "--scenes", "bedroom0", *ROOM, "--jobs", "1", "--quiet"]
+    assert main(["datasets", "make", "rooms", *words, "--out", str(tmp_path / "data")]) == 0
     both = ("openmask3d", "sam3d", "conceptgraphs")
     assert missing_meshes(both) == []
     (tmp_path / "data/Replica/bedroom0_mesh.ply").unlink()

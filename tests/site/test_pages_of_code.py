@@ -50,9 +50,10 @@ def test_every_protocol_has_a_page_with_every_rule_source_and_class(pages: dict[
             assert " ".join(remark.replace("`", "").split()) in shown.replace("`", ""), (name, remark)
         for other in loading.not_comparable_with(rules):
             assert f'href="./{other}.html"' in text
+        scored = {entry.id for entry in rules.scored}
         for entry in rules.classes:
             group = f"<td>{entry.group}</td>\n" if entry.group else ""
-            ignored = "ignored" if entry not in rules.scored else ""
+            ignored = "" if entry.id in scored else "ignored"
             assert f"<td>{entry.id}</td>\n<td>{entry.name}</td>\n{group}<td>{ignored}</td>" in text
         assert rules.digest in shown
 

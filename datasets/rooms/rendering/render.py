@@ -37,7 +37,7 @@ class Renderer:
         self._scene: Any = caster(mesh.vertices, mesh.triangles) if like is None else like._scene
         focal_inverse = np.linalg.inv(camera_intrinsics(width, height))
         u, v = np.meshgrid(np.arange(width), np.arange(height))
-        pixels = np.stack([u.ravel(), v.ravel(), np.ones(width * height)], axis=1)
+        pixels = np.stack([u.ravel(), v.ravel(), np.ones(width * height)], axis=1, dtype=np.float64)
         self._directions = pixels @ focal_inverse.T  # camera z is 1: the distance along a ray is the depth
 
     def render(self, camera_to_world: Float64Array) -> RenderedFrame:

@@ -28,7 +28,7 @@ from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.reports.tables.run import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
@@ -172,7 +172,7 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "settings": [{"key": ".".join(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
         "warnings": list(record.warnings),
-        "unscored": not_scored_lines(Unscored(*vars(one).values()) for one in record.unscored),
+        "unscored": not_scored_lines(record.unscored),
     }
 
 

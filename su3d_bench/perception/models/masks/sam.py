@@ -24,7 +24,7 @@ from su3d_bench.perception.models.files import ModelFiles, bounded, kept, load_c
 from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
 
 MASK_THRESHOLD = 0.0  # on the network's logits
-BACKGROUND_POINT, OBJECT_POINT = 0, 1
+OBJECT_POINT = 1
 # Logits at full size are float32: 64 masks of a 1200x680 image take 209 MB.
 FULL_SIZE_AT_ONCE = 64
 
