@@ -49,6 +49,22 @@ def results(out: str = "out") -> dict[str, bytes]:
 
 
 @pytest.mark.proof
+def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run() == 0
+    before = results()
+    (job() / "counts.npz").unlink()
+    jumps = random.Random(0)
+    for path in Path("out").rglob("*"):
+        when = jumps.choice((0, 4_000_000_000))
+        os.utime(path, (when, when))
+    monkeypatch.setattr(time, "time", lambda: jumps.choice((0.0, 4e9)))
+    assert run() == 0
+    assert results() == before
+    rows = [line.split(",") for line in (job() / "updates.csv").read_text().splitlines()]
+    assert all(float(row[rows[0].index("total_ms")]) >= 0 for row in rows[1:])
+
+
+@pytest.mark.proof
 def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undisturbed_one() -> None:
     program = [sys.executable, str(ROOT / "benchmarks"), "kill_at_random", "--kills", "10", "--seed", "3"]
     words = ["--only", "inline", "export", "sheets-score", "report-html", "--json", "found.json"]
