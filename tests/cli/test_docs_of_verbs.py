@@ -6,6 +6,7 @@ import re
 import runpy
 import shlex
 import subprocess
+from argparse import ArgumentParser
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,17 @@ def test_what_is_said_beside_the_help_is_of_verbs_that_exist() -> None:
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+@pytest.fixture(scope="module")
+def parser() -> ArgumentParser:
+    return build_parser()
+
+
 @pytest.mark.parametrize("file", PAGES, ids=str)
-def test_every_command_of_a_page_is_one_that_the_parser_takes(file: Path) -> None:
+def test_every_command_of_a_page_is_one_that_the_parser_takes(file: Path, parser: ArgumentParser) -> None:
     text = file.read_text().replace("\\\n", " ")
     for line in re.findall(r"^(?:! |SU3D_\w+=\S+ )?su3d-bench (.*)$", text, re.MULTILINE):
         if not re.search(r"VERB| \.\.\.|\||>", line):
-            build_parser().parse_args(shlex.split(line, comments=True))
+            parser.parse_args(shlex.split(line, comments=True))
 
 
 def table_of_variables() -> set[str]:
