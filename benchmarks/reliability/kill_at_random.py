@@ -22,6 +22,7 @@ one worker of a run. With ray, the workers are those of a cluster that is starte
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import random
 import shutil
@@ -213,7 +214,9 @@ class Trial:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="in all; most are of runs inline (default: 200)")
+    parser.add_argument(
+        "--kills", type=int, default=200, help="at least so many; most are of runs inline (default: 200)"
+    )
     parser.add_argument("--seed", default="0")
     parser.add_argument("--only", nargs="+", choices=list(SHARES), default=list(SHARES), help="what is killed")
     parser.add_argument(
@@ -225,7 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started = time.monotonic()
     tallies = {name: Tally(name) for name in given.only}
     n_shares = sum(SHARES[name] for name in tallies)
-    counts = {name: max(1, round(given.kills * SHARES[name] / n_shares)) for name in tallies}
+    counts = {name: math.ceil(given.kills * SHARES[name] / n_shares) for name in tallies}
     with tempfile.TemporaryDirectory(prefix="su3d-kills-") as place:
         scratch = Path(place)
         (scratch / "temporary").mkdir()

@@ -65,7 +65,7 @@ def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.proof
-def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undisturbed_one() -> None:
+def test_what_is_killed_at_random_ends_in_the_bytes_of_an_undisturbed_one() -> None:
     program = [sys.executable, str(ROOT / "benchmarks"), "kill_at_random", "--kills", "10", "--seed", "3"]
     words = ["--only", "inline", "export", "sheets-score", "report-html", "--json", "found.json"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, timeout=300)
@@ -77,7 +77,6 @@ def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undi
         assert (row["faults"], row["orphans"], row["leftovers"]) == ("0", "0", "0")
         assert int(row["compared"]) > 0
     assert sum(int(row["kills"]) for row in rows) >= 10
-    assert sum(int(row["files spoilt"]) for row in rows) > 0
 
 
 def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
