@@ -168,10 +168,12 @@ class FinishedRun:
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
         """The rules that scored the run: the program's own, else those that ``run.json`` keeps.
 
-        A ``ConfigError`` where they are not here, or are those of another version; ``to_the_letter``: or other ones
-        under the same version.
+        A ``ConfigError`` where they are not here or not in ``run.json``, or are those of another version;
+        ``to_the_letter``: or other ones under the same version.
         """
-        then, shown = self.protocols[protocol], printable(protocol, 80)
+        then, shown = self.protocols.get(protocol), printable(protocol, 80)
+        if then is None:
+            raise ConfigError(f"{self.name}: its scores name the protocol {shown}, which its run.json does not list")
         here = load_protocol(protocol) if protocol in protocol_names() else self._own_rules(then)
         if here.version != then.version:
             raise ConfigError(
