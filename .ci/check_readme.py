@@ -37,12 +37,12 @@ def differences(shown: str, written: str) -> list[str]:
     if shape_of(shown) != shape_of(written):
         return ["the README's table has other rows, columns or words than the one that the tool writes:", written]
     return [
-        *_farther(INTERVAL.sub("", shown), INTERVAL.sub("", written), TOLERANCE),
-        *_farther(" ".join(INTERVAL.findall(shown)), " ".join(INTERVAL.findall(written)), END_TOLERANCE),
+        *_over_tolerance(INTERVAL.sub("", shown), INTERVAL.sub("", written), TOLERANCE),
+        *_over_tolerance(" ".join(INTERVAL.findall(shown)), " ".join(INTERVAL.findall(written)), END_TOLERANCE),
     ]
 
 
-def _farther(shown: str, written: str, tolerance: float) -> list[str]:
+def _over_tolerance(shown: str, written: str, tolerance: float) -> list[str]:
     pairs = zip(NUMBER.findall(shown), NUMBER.findall(written), strict=True)
     return [f"README says {a}, the run {b}" for a, b in pairs if abs(float(a) - float(b)) > tolerance]
 

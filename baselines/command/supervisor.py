@@ -4,9 +4,9 @@ A script, started with ``python -I -S``: it imports nothing of the harness, and 
 memory. It stands between a run and somebody's program because a process that is killed can do nothing any more, but the
 system closes its pipes, and that can be waited for.
 
-It is told through its standard input, first one line of JSON, then ``STOP`` or ``DONE``; when that pipe closes
-because the parent process is gone, it ends the program and removes its folders. It answers through a second pipe, a
-line of JSON each: the program's process id or why it cannot be started, then its exit code.
+It reads its standard input: one line of JSON with the command, then ``STOP`` or ``DONE``. When that pipe closes because
+the parent process has died, it ends the program and removes its folders. It writes to a second pipe, one line of JSON
+per answer: the program's process id or why it cannot be started, then its exit code.
 """
 
 from __future__ import annotations

@@ -137,9 +137,8 @@ class Shares:
         return {"share of questions": asking.resampled(counts, weights)[:, 0]}
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
-        return {
-            "share of questions": float(asking.shares(asking.ShareCounts.joined(self.draw(rng, 10 * N_TRUTH)[0]))[0])
-        }
+        counts = asking.ShareCounts.joined(self.draw(rng, 10 * N_TRUTH)[0])
+        return {"share of questions": float(asking.shares(counts)[0])}
 
 
 class Instances:

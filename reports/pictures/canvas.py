@@ -376,25 +376,25 @@ def _shade(depth: Float64Array) -> Float32Array:
 
     ``depth`` is NaN where nothing is drawn.
     """
-    around = np.pad(np.log2(depth), SHADE_REACH, mode="wrap")
-    behind: Float64Array = steps_behind(around, SHADE_REACH, MAX_STEP_BEHIND)
+    padded = np.pad(np.log2(depth), SHADE_REACH, mode="wrap")
+    behind: Float64Array = depth_steps(padded, SHADE_REACH, MAX_STEP_BEHIND)
     return np.exp(-SHADE_STRENGTH / 8.0 * behind).astype(np.float32)
 
 
 @njit(cache=True)
-def steps_behind(around: Any, reach: int, most: float) -> Any:
-    """How far each pixel lies behind its eight neighbours ``reach`` pixels away, each up to ``most``.
+def depth_steps(padded: Any, reach: int, max_step: float) -> Any:
+    """How far each pixel lies behind its eight neighbours ``reach`` pixels away, each up to ``max_step``.
 
-    ``around`` (h, w) has a border of ``reach`` pixels that are neighbours alone; NaN is neither before nor behind.
+    ``padded`` has a border of ``reach`` pixels around the image; NaN adds nothing.
     """
-    height, width = around.shape[0] - 2 * reach, around.shape[1] - 2 * reach
+    height, width = padded.shape[0] - 2 * reach, padded.shape[1] - 2 * reach
     behind = np.zeros((height, width))
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
         above, left = reach - dy * reach, reach - dx * reach
         for row in range(height):
             for column in range(width):
-                step = around[row + reach, column + reach] - around[row + above, column + left]
-                behind[row, column] += min(step, most) if step > 0.0 else 0.0
+                step = padded[row + reach, column + reach] - padded[row + above, column + left]
+                behind[row, column] += min(step, max_step) if step > 0.0 else 0.0
     return behind
 
 

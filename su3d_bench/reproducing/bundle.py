@@ -12,7 +12,6 @@ import os
 import re
 import stat
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -182,10 +181,10 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
             _refuse_others(members, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
-    except (zipfile.BadZipFile, atomic.UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
-        raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     except OSError as error:
         raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
+    except atomic.DAMAGE as error:
+        raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     return Unpacked(into, manifest)
 
 

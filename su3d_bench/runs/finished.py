@@ -171,24 +171,24 @@ class FinishedRun:
         A ``ConfigError`` where they are not here or not in ``run.json``, or are those of another version;
         ``to_the_letter``: or other ones under the same version.
         """
-        then, shown = self.protocols.get(protocol), printable(protocol, 80)
-        if then is None:
+        recorded, shown = self.protocols.get(protocol), printable(protocol, 80)
+        if recorded is None:
             raise ConfigError(f"{self.name}: its scores name the protocol {shown}, which its run.json does not list")
-        here = load_protocol(protocol) if protocol in protocol_names() else self._own_rules(then)
-        if here.version != then.version:
+        here = load_protocol(protocol) if protocol in protocol_names() else self._own_rules(recorded)
+        if here.version != recorded.version:
             raise ConfigError(
-                f"{self.name}: was scored under {shown} version {then.version}, here is version {here.version}; score "
-                "it again"
+                f"{self.name}: was scored under {shown} version {recorded.version}, here is version {here.version}; "
+                "score it again"
             )
-        if here.digest != then.digest and (to_the_letter or then.rules is not None):
+        if here.digest != recorded.digest and (to_the_letter or recorded.rules is not None):
             raise ConfigError(f"{self.name}: the rules of {shown} are not those that scored it (same version)")
         return here
 
-    def _own_rules(self, then: records.ProtocolRecord) -> ProtocolRules:
+    def _own_rules(self, recorded: records.ProtocolRecord) -> ProtocolRules:
         """User-defined rules, which ``run.json`` keeps."""
-        where = f"{self.name}: the rules of {printable(then.name, 80)}"
-        own = None if then.rules is None else read_rules(then.rules, where)
-        if own is None or own.name != then.name:
+        where = f"{self.name}: the rules of {printable(recorded.name, 80)}"
+        own = None if recorded.rules is None else read_rules(recorded.rules, where)
+        if own is None or own.name != recorded.name:
             raise ConfigError(f"{where} are neither the program's nor in run.json; run its command again")
         return own
 

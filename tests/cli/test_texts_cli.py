@@ -39,15 +39,8 @@ def test_texts_made_here_give_the_numbers_of_the_run_itself(
     own = json.loads(Path("out/metrics.json").read_text())["results"]
     for name in protocols:
         assert make(name, f"{name}.npz") == 0
-        words = [
-            "evaluate",
-            "out/scenes/rooms.bathroom0/opensu3d",
-            "--dataset",
-            "rooms",
-            "--protocols",
-            name,
-            "--quiet",
-        ]
+        words = ["evaluate", "out/scenes/rooms.bathroom0/opensu3d", "--dataset", "rooms", "--quiet"]
+        words += ["--protocols", name]
         assert main([*words, "--json=own.json"]) == 0
         assert main([*words, "--text-features", f"{name}.npz", "--json=texts.json"]) == 0
         assert Path("texts.json").read_bytes() == Path("own.json").read_bytes()

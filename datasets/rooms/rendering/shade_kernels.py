@@ -116,8 +116,8 @@ LOOSE_M, LOOSE_SHARE = 0.012, 0.012  # depth may differ by this much, and by thi
 def aim_at_faces(  # type: ignore[no-untyped-def]
     active, n_active, centres, normals, pose, focal, cx, cy, width, height, pixel, is_hit
 ):
-    """Fills ``pixel`` (F,) with the pixel nearest to the centre of each active face, or -1 where a camera sees none of
-    it: it lies outside the image or shows its back. ``is_hit`` (height * width,) marks those pixels.
+    """Fills ``pixel`` (F,) with the pixel nearest to the centre of each active face, or -1 if the face lies outside the
+    image or faces away from the camera. ``is_hit`` (height * width,) marks those pixels.
     """
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     is_hit[:] = False

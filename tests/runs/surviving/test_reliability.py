@@ -14,6 +14,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from places import ROOT, SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import TemporaryFolder, filling
+from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.perception.cache import FrameCache
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 SUBJECT = f"{SCENES}/kill_subject.py"
@@ -58,15 +61,19 @@ def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
         when = jumps.choice((0, 4_000_000_000))
         os.utime(path, (when, when))
     monkeypatch.setattr(time, "time", lambda: jumps.choice((0.0, 4e9)))
+    score = Mock(wraps=score_scene)
+    monkeypatch.setattr(scene_run, "score_scene", score)
     assert run() == 0
     assert results() == before
+    assert score.call_count == 1, "the step that lacks a file is done again, and no other"
     rows = [line.split(",") for line in (job() / "updates.csv").read_text().splitlines()]
     assert all(float(row[rows[0].index("total_ms")]) >= 0 for row in rows[1:])
 
 
 @pytest.mark.proof
-def test_what_is_killed_at_random_ends_in_the_bytes_of_an_undisturbed_one() -> None:
-    program = [sys.executable, str(ROOT / "benchmarks"), "kill_at_random", "--kills", "10", "--seed", "3"]
+def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undisturbed_one() -> None:
+    seed = "116"  # its first kill is a power cut
+    program = [sys.executable, str(ROOT / "benchmarks"), "kill_at_random", "--kills", "10", "--seed", seed]
     words = ["--only", "inline", "export", "sheets-score", "report-html", "--json", "found.json"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -77,6 +84,7 @@ def test_what_is_killed_at_random_ends_in_the_bytes_of_an_undisturbed_one() -> N
         assert (row["faults"], row["orphans"], row["leftovers"]) == ("0", "0", "0")
         assert int(row["compared"]) > 0
     assert sum(int(row["kills"]) for row in rows) >= 10
+    assert sum(int(row["files spoilt"]) for row in rows) > 0
 
 
 def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(

@@ -164,10 +164,9 @@ def canonical_text(text: str) -> str:
 def _load(folder: Path, load: Callable[[], Any]) -> Any:
     try:
         return load()
-    except Exception as error:
-        # the tokenizers library raises bare Exceptions for whatever is wrong with a file
+    except Exception as error:  # tokenizers raises plain Exception for any fault of a file; others are raised again
         if type(error) is Exception or isinstance(error, OSError | ValueError | KeyError | TypeError | AttributeError):
             raise DataError(
-                f"{folder}: its tokenizer cannot be read: {bounded(error)}; fetch its files anew"
+                f"{folder}: its tokenizer cannot be read: {bounded(error)}; fetch its files again"
             ) from error
         raise
