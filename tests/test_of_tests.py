@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,6 +49,18 @@ def test_programs_in_texts_import_what_there_is(folder: str) -> None:
     }
     assert names or folder == "benchmarks"
     assert sorted(name for name in names if not _exists(name)) == []
+
+
+def test_every_program_of_benchmarks_finds_what_it_imports() -> None:
+    program = (
+        "import runpy\n"
+        "files = runpy.run_path('benchmarks/measuring/folders.py')['PROGRAMS'].values()\n"
+        "for file in files:\n"
+        "    if '__main__' in file.read_text():\n"
+        "        runpy.run_path(str(file), run_name='imported')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-2000:]
 
 
 def _exists(name: str) -> bool:

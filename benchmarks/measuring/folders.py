@@ -1,4 +1,4 @@
-"""Importing this lets a benchmark import every other by its name, and what tests share: scenes, models, damage."""
+"""Importing this lets a benchmark import every other by its name, what tests share, and the programs of ``tools``."""
 
 from __future__ import annotations
 
@@ -8,4 +8,5 @@ from pathlib import Path
 BENCHMARKS = Path(__file__).resolve().parents[1]
 ROOT = BENCHMARKS.parent
 PROGRAMS = {file.stem: file for file in sorted(BENCHMARKS.glob("*/*.py"))}
-sys.path[:0] = sorted({str(file.parent) for folder in (BENCHMARKS, ROOT / "tests") for file in folder.glob("**/*.py")})
+FOLDERS = (BENCHMARKS, ROOT / "tests", ROOT / "tools")
+sys.path[:0] = sorted({str(file.parent) for folder in FOLDERS for file in folder.glob("**/*.py")})
