@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, error_line
 from su3d_bench.core.interfaces import SaysUp
 from su3d_bench.core.registry import DATASETS
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
@@ -67,8 +67,8 @@ def _remarks(job: SceneJob) -> Remarks:
         if isinstance(dataset, SaysUp) and (doubt := dataset.up(job.scene_name).doubt) is not None:
             lines.append(f"{job.scene}: {doubt}")
         return tuple(lines), verdict is not None and verdict.is_wrong
-    except Exception:  # noqa: BLE001 - a plug-in may raise anything; the scene's own work meets it and records it
-        return NOTHING
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; a scene that cannot be read fails later
+        return (f"{job.scene}: poses and depth could not be checked: {error_line(error)}",), False
 
 
 @contextmanager

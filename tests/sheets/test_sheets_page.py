@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from chromium import Chromium, find_chromium
+from chromium import Chromium, needs_chromium
 from made_sheets import HOSTILE, made
 from waiting import wait_until
 
 from su3d_bench.sheets.items import ANSWER_COLUMNS, SheetKind
 from su3d_bench.sheets.sets import MadeSheets, write_sheets
 
-needs_browser = pytest.mark.skipif(find_chromium() is None, reason="no browser: install chromium")
 TEXTS = ("chair", "place to sit", "red cup", "lamp next to a bed")
 COUNT = "document.getElementById('count').textContent"
 
@@ -60,7 +59,7 @@ def test_the_page_says_what_may_run_and_load(tmp_path: Path) -> None:
     assert not re.findall(r"https?://|\bsrc=\"(?!data)|<link|@import|\son\w+=", text)
 
 
-@needs_browser
+@needs_chromium
 def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_path: Path, browser: Chromium) -> None:
     both, page = written(tmp_path, "retrieval", TEXTS)
     browser.open(page)
@@ -84,7 +83,7 @@ def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_pat
     assert browser.faults() == []
 
 
-@needs_browser
+@needs_chromium
 def test_hostile_text_is_shown_and_does_nothing(tmp_path: Path, browser: Chromium) -> None:
     both, page = written(tmp_path, "retrieval", HOSTILE)
     browser.open(page)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chromium import find_chromium
+from chromium import needs_chromium
 from looks import CHECKS, complaints, unfold
 from made_sheets import made
 from places import SCENES
@@ -89,10 +89,8 @@ PAGES: Mapping[str, Callable[[Path], Path]] = {
     "method of a registry": page_of_method,
 }
 
-needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 
-
-@needs_browser
+@needs_chromium
 @pytest.mark.parametrize("name", PAGES)
 def test_each_page(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     page = PAGES[name](tmp_path_factory.mktemp("page"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import runs_page
-from chromium import Chromium, find_chromium
+from chromium import Chromium, needs_chromium
 from looks import WHOLE, complaints
 from painted_runs import COLLECTOR, painted_page, painted_run
 from runs_page import browser_for_pages, options, picture
@@ -16,7 +16,7 @@ from runs_page import browser_for_pages, options, picture
 from su3d_bench.core.maps import Instances
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
-pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+pytestmark = needs_chromium
 FIELD = (
     "[...document.querySelectorAll('#maps .toolbar .field')].find((one) => one.textContent.trim().startsWith({label}))"
     ".querySelector('select, input')"

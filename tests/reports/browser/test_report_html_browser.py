@@ -9,10 +9,10 @@ from pathlib import Path
 import chromium
 import pytest
 import runs_page
-from chromium import Chromium, find_chromium
+from chromium import Chromium, needs_chromium
 from looks import WHOLE, complaints
 
-pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+pytestmark = needs_chromium
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
 GALLERY = "Worst errors"  # its controls have tests of their own
 

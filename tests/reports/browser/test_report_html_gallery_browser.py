@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chromium import Chromium, find_chromium
+from chromium import Chromium, needs_chromium
 from looks import WHOLE
 from painted import Collector
 from painted_runs import COLLECTOR, painted_page, painted_run
@@ -19,8 +19,6 @@ from runs_page import SELECT, choose
 from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Frame, SceneInfo
-
-needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 
 
 class Mistaken(Collector):
@@ -153,7 +151,7 @@ def anew(browser: Chromium) -> Iterator[Chromium]:
     assert [line for line in browser.faults() if "GL" not in line] == []
 
 
-@needs_browser
+@needs_chromium
 @pytest.mark.parametrize("kind", ["missed", "label"])
 def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
     choose(anew, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")

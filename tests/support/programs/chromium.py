@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
 from waiting import wait_until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -31,6 +32,9 @@ KEY_CODES = {
 def find_chromium() -> str | None:
     """The browser's program; None where none is installed."""
     return next((found for name in NAMES if (found := shutil.which(name)) is not None), None)
+
+
+needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium: apt-get install chromium")
 
 
 # What the browser answers where the page that was asked goes away.
