@@ -9,7 +9,6 @@ from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
 
-import pytest
 from places import ROOT, TESTS
 
 FILES = sorted(TESTS.rglob("*.py"))
@@ -39,15 +38,14 @@ def test_nobody_waits_by_sleeping() -> None:
     } == MAY_SLEEP
 
 
-@pytest.mark.parametrize("folder", ["tests", "benchmarks"])
-def test_programs_in_texts_import_what_there_is(folder: str) -> None:
+def test_programs_in_texts_import_what_there_is() -> None:
     """Imports in the text of a program that a test starts, which no other tool looks at."""
     names = {
         name
-        for file in (ROOT / folder).rglob("*.py")
+        for file in (*FILES, *(ROOT / "benchmarks").rglob("*.py"))
         for name in re.findall(r"\b(?:from|import) (su3d_bench(?:\.\w+)+)", file.read_text())
     }
-    assert names or folder == "benchmarks"
+    assert names
     assert sorted(name for name in names if not _exists(name)) == []
 
 

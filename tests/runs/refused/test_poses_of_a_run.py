@@ -86,13 +86,10 @@ def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_l
 
 
 def test_a_check_that_fails_itself_is_a_warning_not_silence(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*words: object) -> None:
-        raise ZeroDivisionError("no depth")
-
-    monkeypatch.setattr(poses, "judge_scene", fails)
+    monkeypatch.setattr(poses, "judge_scene", lambda *words: 1 / 0)
     plan = make_plan(Settings((Setting(("scenes",), ("replica/bathroom0",), ""),)))
     (line,) = poses.judged(plan.jobs)[0].doubts or ()
-    assert line == "replica/bathroom0: poses and depth could not be checked: ZeroDivisionError: no depth"
+    assert line.startswith("replica/bathroom0: poses and depth could not be checked: ") and "ZeroDivisionError" in line
 
 
 def test_a_world_whose_up_is_not_z_is_a_warning_of_a_run(root: Path) -> None:
