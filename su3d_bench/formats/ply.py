@@ -246,10 +246,10 @@ def _equal_rows(promise: Promise, header: Header, body: bytes, at: int) -> Found
     rows: Any = np.ndarray(promise.n_rows, np.dtype(fields), body, at) if n_bytes else np.zeros(promise.n_rows, fields)
     columns = []
     for k, column in enumerate(promise.properties):
-        lengths = rows[f"n{k}"].astype(np.int64) if column.count_type is not None else None
+        lengths = rows[f"n{k}"] if column.count_type is not None else None
         if lengths is not None and promise.n_rows and (lengths != lengths[0]).any():
             return None
-        columns.append((lengths, rows[f"v{k}"].reshape(-1)))
+        columns.append((None if lengths is None else lengths.astype(np.int64), rows[f"v{k}"].reshape(-1)))
     return columns, at + n_bytes
 
 
