@@ -1,4 +1,4 @@
-"""``su3d-bench compare`` and ``check``: two runs compared, and the gate for CI."""
+"""``su3d-bench compare`` and ``check``: compare two runs, and check a run for regressions in CI."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "compare", call_compare)
-    parser.option("left A", "the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
-    parser.option("right B", "the run that is held against it; differences are B - A")
-    parser.option("--method METHOD", "compare this method alone (default: all of the same name)")
+    parser.option("left A", "run folder or FOLDER:METHOD; FOLDER,FOLDER for several seeds")
+    parser.option("right B", "run to compare with A; differences are B - A")
+    parser.option("--method METHOD", "method to compare (default: all that both runs have)")
     parser.shared("--protocols")
-    parser.option("--per-class", "each class too")
+    parser.option("--per-class", "also compare each class")
     parser.shared("--format")
     parser = add_verb(verbs, "check", call_check)
-    parser.option("runs [RUN...]", "the run to check")
-    parser.option("--against FILE", "the reference")
-    parser.option("--learn RUN...", "repeats of one run to learn from")
-    parser.option("--out FILE", "where --learn writes the reference")
-    parser.option("--cost-limit TIMES", "how many times as long a method may take (with --learn)", type=float)
+    parser.option("runs [RUN...]", "run to check")
+    parser.option("--against FILE", "reference file")
+    parser.option("--learn RUN...", "repetitions of one run to build the reference from")
+    parser.option("--out FILE", "reference file that --learn writes")
+    parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --learn)", type=float)
     parser.option(
         "--across-machines POINTS",
-        "by how many points headline values may differ on another machine (with --learn; default: 2)",
+        "tolerance across machines in points (with --learn; default: 2)",
         type=float,
     )
-    parser.option("--markdown FILE", "write the table for a pull request")
+    parser.option("--markdown FILE", "write the table as Markdown, for a pull request")
     parser.option("--junit FILE", "write JUnit XML")
     parser.option(
-        "--github", "print GitHub annotations (default: in its workflows)", action=argparse.BooleanOptionalAction
+        "--github", "print GitHub annotations (default: in GitHub workflows)", action=argparse.BooleanOptionalAction
     )
 
 
 def call_compare(arguments: argparse.Namespace) -> None:
-    """Compare two runs over their common scenes: exact test, and differences with interval.
+    """Compare two runs on their common scenes: differences with confidence intervals and exact tests.
 
     su3d-bench compare runs/before runs/after --per-class
     su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json
@@ -52,7 +52,7 @@ def call_compare(arguments: argparse.Namespace) -> None:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
-    """Compare a run with a reference and fail where a number got worse; or learn a reference from runs.
+    """Fail if a run regresses against a reference; or build a reference from runs.
 
     su3d-bench check --learn runs/a runs/b runs/c --out reference.json
     su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml
@@ -73,7 +73,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.finished import read_run
 
     if arguments.runs or arguments.against or arguments.out is None:
-        raise ConfigError("check: --learn takes the runs and needs --out FILE; it checks nothing")
+        raise ConfigError("check: --learn takes the runs and needs --out FILE, without RUN and --against")
     cost_limit = COST_LIMIT if arguments.cost_limit is None else arguments.cost_limit
     across = ACROSS_MACHINES if arguments.across_machines is None else arguments.across_machines / 100
     if not 1 < cost_limit <= MOST_COST_LIMIT or not 0 <= across <= 1:
@@ -92,10 +92,10 @@ def _learn(arguments: argparse.Namespace) -> int:
     )
     output.answer_either(arguments, about, line)
     if reference.n_runs == 1:
-        remark("one run shows no spread: every value must be met exactly; learn from several where runs vary")
+        remark("built from one run: every value must match exactly; use several runs if results vary")
     for method in runs[0].methods:
         if method not in reference.costs:
-            remark(f"{printable(method, 80)}: no cost is learnt: it {why_no_cost(runs[0], method)}")
+            remark(f"{printable(method, 80)}: no cost limit: {why_no_cost(runs[0], method)}")
     return EXIT_DONE
 
 

@@ -1,4 +1,4 @@
-"""``su3d-bench datasets``: what is here, whether it is whole, how it looks, and making what is not."""
+"""``su3d-bench datasets``: list, check, show, fetch and generate datasets."""
 
 from __future__ import annotations
 
@@ -13,60 +13,56 @@ from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, count
 from su3d_bench.cli.output import answer_either
 
-LAYOUTS = ("native", "replica", "scannet")  # as those of su3d_bench.datasets.layouts, which take long to load
+LAYOUTS = ("native", "replica", "scannet")  # a copy of su3d_bench.datasets.layouts, which is slow to import
 MAX_LISTED = 40
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List the datasets and their scenes, check, show or fetch scenes, make rooms on disk, or write a dataset.
+    """List, check, show, fetch and generate datasets, or create your own.
 
     su3d-bench datasets list
     su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data
     """
     actions = add_group(verbs, "datasets", add_parser, lists=True)
     parser = add_verb(actions, "list", call_list)
-    parser.option("names [DATASET...]", "such as scannet (default: all)")
+    parser.option("names [DATASET...]", "datasets to list (default: all)")
     parser = add_verb(actions, "check", call_check)
-    parser.option("scenes SCENE...", "addresses or patterns, such as 'replica/*'")
-    parser.option(
-        "--quick", "read 20 evenly spaced frames of each scene, as is always done where scenes are made on demand"
-    )
+    parser.option("scenes SCENE...", "scenes or patterns, such as 'replica/*'")
+    parser.option("--quick", "read only 20 evenly spaced frames of each scene")
     parser.shared("--jobs", "--set")
     parser = add_verb(actions, "show", call_show)
-    parser.option("scene SCENE", "the scene's address, such as rooms/living0")
-    parser.option("--out FILE", "the PNG to write (default: DATASET-SCENE.png here)")
-    parser.option("--stride N", "draw every Nth camera (default: 48 cameras in all)", type=count)
+    parser.option("scene SCENE", "scene, such as rooms/living0")
+    parser.option("--out FILE", "PNG file to write (default: DATASET-SCENE.png)")
+    parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, takes_up=True)
-    parser.option("dataset", "what to make scenes of: rooms")
-    parser.option("--scenes SCENE...", "names or patterns (default: 'DATASET/*')")
+    parser.option("dataset", "dataset to generate: rooms")
+    parser.option("--scenes SCENE...", "scenes or patterns (default: 'DATASET/*')")
     parser.option(
         "--layout",
-        "native: the scans that the dataset keeps in its data root, frames are rendered when asked for; "
-        "replica: every file of Replica, the render and the original release, about 300 MB a room; scannet: scans with "
-        ".sens, mesh and annotation (default: native)",
+        "file layout: native (frames rendered on demand), replica or scannet (default: native)",
         choices=LAYOUTS,
         default="native",
     )
-    parser.option("--out DIR", "the data root to make (native: default $SU3D_DATA)")
+    parser.option("--out DIR", "data root to write to (native: default $SU3D_DATA)")
     parser.shared("--set", "--jobs")
     fetch.add_data(actions)
     add_new(actions, "dataset")
 
 
 def call_check(arguments: argparse.Namespace) -> int:
-    """Look at every file and frame of scenes, name all that is wrong, and tell the digest that results carry.
+    """Check every file and frame of scenes, and report all problems and the dataset digest.
 
     su3d-bench datasets check 'replica/*'
     su3d-bench datasets check rooms/living0 --set rooms.n_frames=40 --json
     """
-    from su3d_bench.cli import scenes  # here and below: it takes long to load
+    from su3d_bench.cli import scenes  # here and below: slow to import
 
     return scenes.check(arguments)
 
 
 def call_show(arguments: argparse.Namespace) -> None:
-    """Draw a scene: the walk seen from above, some frames, and the ground truth by class and by instance.
+    """Draw a scene: camera path from above, sample frames, and the ground truth by class and instance.
 
     su3d-bench datasets show rooms/living0 --set rooms.n_frames=40
     su3d-bench datasets show replica/room0 --out room0.png --stride 50
@@ -77,7 +73,7 @@ def call_show(arguments: argparse.Namespace) -> None:
 
 
 def call_make(arguments: argparse.Namespace) -> None:
-    """Make scenes on disk, whole or not at all; the same command again takes up what a killed one left.
+    """Generate scenes on disk; the same command resumes an interrupted one.
 
     su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'
     su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200
@@ -88,7 +84,7 @@ def call_make(arguments: argparse.Namespace) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List every dataset and the scenes that are there; of those named also how to get what is not.
+    """List datasets and available scenes; with names, also how to obtain missing ones.
 
     su3d-bench datasets list
     su3d-bench datasets list scannet --json
@@ -105,12 +101,12 @@ def call_list(arguments: argparse.Namespace) -> None:
 
 
 def data_root() -> Path:
-    """Where a run looks for datasets; said here again because what plans a run takes as long to load as the list."""
+    """The data root; repeated here because the module that plans runs is slow to import."""
     return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
 
 
 def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:
-    """A line each for datasets of which nothing is here, places below ``root`` as they are called there."""
+    """One line per dataset that was not found, with places relative to ``root``."""
     if not rows:
         return []
     width = max(len(row["name"]) for row in rows)
@@ -119,7 +115,7 @@ def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:
         places = [Path(place) for place in row["places"]]
         shown = [str(place.relative_to(root) if place.is_relative_to(root) else place) for place in places]
         lines.append(f"  {row['name']:<{width}}  looked for in {', '.join(shown) or '.'}")
-    return ["", "not here (su3d-bench datasets list NAME says how to get one):", *lines]
+    return ["", "not found (su3d-bench datasets list NAME shows how to get one):", *lines]
 
 
 def _lines(row: dict[str, Any]) -> list[str]:

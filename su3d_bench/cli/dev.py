@@ -1,4 +1,4 @@
-"""``su3d-bench dev``: the cache, this machine, completion in a shell, and registries of results."""
+"""``su3d-bench dev``: the cache, the installation, shell completion, and registries of results."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ MOST_REFUSED = 20  # lines
 
 
 def add_parser(verbs: Verbs) -> None:
-    """Look after the program: its cache, this machine, completion in a shell, registries of results.
+    """Manage the cache, check the installation, set up shell completion, keep registries of results.
 
     su3d-bench dev doctor
     su3d-bench dev cache list
     """
     actions = add_group(verbs, "dev", add_parser)
     _add_cache(actions)
-    add_verb(actions, "doctor", doctor.call, uses_all_cores=True)  # computes nothing, and shows the settings of threads
+    add_verb(actions, "doctor", doctor.call, uses_all_cores=True)  # computes nothing, and shows the thread settings
     parser = add_verb(actions, "completion", call_completion)
-    parser.option("shell", "bash, zsh or fish", choices=SHELLS)
+    parser.option("shell", "shell to complete for", choices=SHELLS)
     _add_registry(actions)
 
 
 def _add_cache(verbs: Verbs) -> None:
-    """List what is kept in $SU3D_CACHE to be quick, and remove it.
+    """Show and clear the cache in $SU3D_CACHE.
 
     su3d-bench dev cache list
     su3d-bench dev cache clear perception --older-than 30
@@ -45,15 +45,15 @@ def _add_cache(verbs: Verbs) -> None:
     parser = add_verb(actions, "clear", call_cache_clear)
     parser.option(
         "kinds KIND...",
-        f"{', '.join(KIND_NAMES)}, or all (which leaves replies: they may have cost money)",
+        f"{', '.join(KIND_NAMES)}, or all (all but replies, which may have cost money)",
         choices=(*KIND_NAMES, "all"),
     )
-    parser.option("--older-than DAYS", "only what is older (default: 0)", type=float, default=0.0)
+    parser.option("--older-than DAYS", "remove only older files (default: 0)", type=float, default=0.0)
     parser.shared("--dry-run")
 
 
 def call_cache_list(arguments: argparse.Namespace) -> None:
-    """List what is kept by kind: how many files, how large, how old.
+    """Show the number, size and age of cached files by kind.
 
     su3d-bench dev cache list
     su3d-bench dev cache list --json
@@ -111,12 +111,12 @@ def call_cache_clear(arguments: argparse.Namespace) -> None:
         lines.append(f"{kind.name}: {counted(n_files, 'file')}, {size_text(n_bytes)} {done}")
     answer_either(arguments, {"folder": str(root), "is_dry": arguments.dry_run, "kinds": rows}, *lines)
     if "all" in wanted and "replies" not in wanted and any(cache_entries(root, KINDS["replies"])):
-        text = "replies of language models stay; su3d-bench dev cache clear replies removes them"
+        text = "replies of language models were not removed; to remove them: su3d-bench dev cache clear replies"
         remark(text, quiet=arguments.quiet)
 
 
 def call_completion(arguments: argparse.Namespace) -> None:
-    """Print a script that completes verbs, options and choices in a shell.
+    """Print a shell completion script.
 
     eval "$(su3d-bench dev completion bash)"
     su3d-bench dev completion fish | source
@@ -128,26 +128,26 @@ def call_completion(arguments: argparse.Namespace) -> None:
 
 
 def _add_registry(verbs: Verbs) -> None:
-    """Keep a registry of results: take bundles in after scoring them again, and make a site of their rankings.
+    """Maintain a registry of results: add re-scored bundles and build a site of rankings.
 
     su3d-bench dev registry add reproduced/rooms/bundle.zip --to my-registry
     su3d-bench dev registry build my-registry --out site
     """
     actions = add_group(verbs, "registry", _add_registry)
     parser = add_verb(actions, "add", call_registry_add)
-    parser.option("bundles BUNDLE...", "archives of report bundle or reproduce")
-    parser.option("--to DIR", "the registry's folder (default: where you are)", default=Path())
-    parser.option("--name NAME", "of the bundle in the registry (default: its file's, or its recipe and digest)")
+    parser.option("bundles BUNDLE...", "archives written by report bundle or reproduce")
+    parser.option("--to DIR", "registry folder (default: the current folder)", default=Path())
+    parser.option("--name NAME", "name of the bundle in the registry (default: from its file or recipe)")
     parser = add_verb(actions, "build", call_registry_build)
-    parser.option("folder DIR", "a registry, or any folder of bundles")
-    parser.option("--out DIR", "where the site goes (default: site)", default=Path("site"))
-    parser.option("--title TEXT", "of the first page (default: Registry of results)")
-    parser.option("--bundles-at URL", "link the bundles there (default: named, not linked)")
+    parser.option("folder DIR", "registry, or any folder of bundles")
+    parser.option("--out DIR", "folder of the site (default: site)", default=Path("site"))
+    parser.option("--title TEXT", "title of the first page (default: Registry of results)")
+    parser.option("--bundles-at URL", "base URL for links to bundles (default: no links)")
     add_new(actions, REGISTRY)
 
 
 def call_registry_add(arguments: argparse.Namespace) -> int:
-    """Score bundles again and take them into a registry; exit code 1 where one is refused, with its reasons.
+    """Re-score bundles and add them to a registry; exit code 1 if one is rejected.
 
     su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms
     su3d-bench dev registry add bundles/mine.zip
@@ -157,7 +157,7 @@ def call_registry_add(arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.registry import add_bundle, lines_of
 
     if arguments.name is not None and len(arguments.bundles) > 1:
-        raise ConfigError("--name: is of one bundle; add them one after the other")
+        raise ConfigError("--name: applies to one bundle; add the bundles one at a time")
     found = []
     for bundle in arguments.bundles:
         found.append(add_bundle(bundle, arguments.to, arguments.name))
@@ -169,7 +169,7 @@ def call_registry_add(arguments: argparse.Namespace) -> int:
 
 
 def call_registry_build(arguments: argparse.Namespace) -> int:
-    """Make a static site of a registry's bundles; exit code 1 where something in it can stand in no ranking.
+    """Build a static site of a registry; exit code 1 if an entry cannot be ranked.
 
     su3d-bench dev registry build my-registry --out site
     su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles
@@ -180,10 +180,10 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     registry = read_registry(arguments.folder)
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
     pages = write_site(registry, arguments.out, title, arguments.bundles_at)
-    refused = [f"left out: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
+    refused = [f"excluded: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
     remark(*refused[:MOST_REFUSED])
     if len(refused) > MOST_REFUSED:
-        remark(f"left out: {len(refused) - MOST_REFUSED} more")
+        remark(f"excluded: {len(refused) - MOST_REFUSED} more")
     counts = f"{counted(len(registry.rows), 'row')} of {counted(registry.n_bundles, 'bundle')} in "
     value: dict[str, Any] = {
         "index": str(pages[0]),

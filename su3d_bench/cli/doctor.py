@@ -1,4 +1,4 @@
-"""``su3d-bench dev doctor``: whether this machine has what the program needs, and what to do where not."""
+"""``su3d-bench dev doctor``: check the installation and suggest fixes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, counted, printable, shown
 
 PROGRAM = "su3d-bench"
-PATIENCE_S = 180.0  # of one import, on a disk that is read for the first time
+PATIENCE_S = 180.0  # for one import, from a cold disk
 LEAST_FREE = 10**9  # bytes: a room, its cache, its run
 LEAST_MEMORY = 4 * 10**9  # bytes: a room under opensu3d takes one; docs/running/performance.md
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# What is loaded in a process of its own, which a compiled library that lacks another one may end.
+# Imported in a child process: a compiled library with a missing dependency can crash it.
 LOADED = {
     "numba": "import numba; found = {}",
     "opencv-python-headless": "import cv2; found = {}",
@@ -38,7 +38,7 @@ FOR_OPEN3D = "apt-get install libgl1 libx11-6 libgomp1"  # on Debian and Ubuntu
 
 @dataclass(frozen=True)
 class Check:
-    """One line: ``missing`` is what the main job cannot run without, ``note`` what something else may want."""
+    """One line: ``missing`` means that the main job cannot run, ``note`` is optional."""
 
     what: str
     state: Literal["ok", "note", "missing"]
@@ -47,7 +47,7 @@ class Check:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    """Look at libraries, GPU, data, models, folders and cores; exit code 1 where the main job cannot run.
+    """Check libraries, GPU, data, models, folders and cores; exit code 1 if a required one is missing.
 
     su3d-bench dev doctor
     su3d-bench dev doctor --json
@@ -64,7 +64,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def examine() -> list[Check]:
-    """Every check, in the order in which things are installed."""
+    """All checks, in order of installation."""
     return [_python(), *_libraries(), *_folders(), _kernels(), *_datasets(), _models(), _cores(), _memory()]
 
 
@@ -75,7 +75,7 @@ def _python() -> Check:
 
 
 def requirements() -> dict[str, str]:
-    """The packages that the installed program asks for, and the extra to which each belongs ("" for the core)."""
+    """The required packages, and the extra to which each belongs ("" for the core)."""
     from importlib.metadata import PackageNotFoundError, requires
 
     try:
@@ -92,7 +92,7 @@ def requirements() -> dict[str, str]:
 
 
 def version_of(package: str) -> str | None:
-    """The version that is installed, if any."""
+    """The installed version, or None."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -123,24 +123,24 @@ def _libraries() -> Iterator[Check]:
 
 
 def _abilities(found: dict[str, Any]) -> str:
-    """What a library says that it can compute on."""
+    """The devices that a library reports."""
     if "providers" in found:
-        return f"; computes by {', '.join(name.removesuffix('ExecutionProvider') for name in found['providers'])}"
+        return f"; providers: {', '.join(name.removesuffix('ExecutionProvider') for name in found['providers'])}"
     if "gpus" not in found:
         return ""
-    built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPUs alone"
+    built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPU only"
     return f"; {', '.join(found['gpus']) or f'no GPU ({built}), see docs/running/gpu.md'}"
 
 
 def loaded(package: str) -> tuple[dict[str, Any], str]:
-    """What ``package`` says of itself when it is loaded in a process of its own, and why it cannot be."""
+    """What ``package`` reports when imported in a child process, and the error if the import fails."""
     if package not in LOADED:
         return {}, ""
     text = f"{LOADED[package]}\nimport json, sys\nsys.stdout.write('\\n' + json.dumps(found))"
     path = os.pathsep.join(folder for folder in sys.path if folder)
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", text],  # -P: nothing in the folder where one stands takes a library's place
+            [sys.executable, "-P", "-c", text],  # -P: files in the current folder must not shadow a library
             capture_output=True,
             text=True,
             errors="replace",
@@ -155,7 +155,7 @@ def loaded(package: str) -> tuple[dict[str, Any], str]:
     try:
         return json.loads(done.stdout.splitlines()[-1]), ""
     except (ValueError, IndexError):
-        return {}, printable((done.stderr.strip().splitlines() or ["said nothing"])[-1], 200)
+        return {}, printable((done.stderr.strip().splitlines() or ["printed nothing"])[-1], 200)
 
 
 def _folders() -> Iterator[Check]:
@@ -172,31 +172,33 @@ def _folders() -> Iterator[Check]:
 
 
 def _folder(what: str, folder: Path, setting: str) -> Check:
-    """Whether files can be written, locked and have room where ``folder`` is or would be."""
+    """Check that ``folder`` can be written and locked and has free space."""
     from su3d_bench.core.files.locks import NO_LOCKS, hold_folder
     from su3d_bench.store.caches import size_text
 
     existing = next((place for place in (folder, *folder.parents) if place.exists()), Path("/"))
-    where = shown(folder) if existing == folder else f"{shown(folder)} (to be made)"
+    where = shown(folder) if existing == folder else f"{shown(folder)} (not created yet)"
     try:
         with tempfile.TemporaryDirectory(dir=existing, prefix=".su3d-doctor-") as made:
             os.close(hold_folder(Path(made)))
     except OSError as error:
         if error.errno in NO_LOCKS:
-            return Check(what, "note", f"{where}: its disk has no locks", f"best on another disk: {setting}")
+            return Check(
+                what, "note", f"{where}: the file system does not support locks", f"choose another with {setting}"
+            )
         reason = error.strerror or str(error)
         return Check(what, "missing", f"{where}: cannot be written: {reason}", f"choose another with {setting}")
     found = f"{where}: {size_text(free := shutil.disk_usage(existing).free)} free"
     if free >= LEAST_FREE:
         return Check(what, "ok", found)
-    return Check(what, "note", found, f"make room, or another with {setting}")
+    return Check(what, "note", found, f"free some space, or choose another with {setting}")
 
 
 def _kernels() -> Check:
     from su3d_bench.store.caches import kernel_folders, why_slow
 
     slow = why_slow()
-    kept = f"is kept in the first that takes it: {', '.join(map(shown, kernel_folders()))}"
+    kept = f"stored in the first writable one of: {', '.join(map(shown, kernel_folders()))}"
     return Check("compiled code", "note" if slow else "ok", slow or kept)
 
 
@@ -210,9 +212,9 @@ def _datasets() -> Iterator[Check]:
         try:
             dataset_class = registry.load("dataset", name)
             n_scenes = len(dataset_class(data_root(), dataset_class.Options()).scenes())
-        except Su3dError:  # datasets list says why
+        except Su3dError:  # datasets list shows the reason
             n_scenes = 0
-        hint = "" if n_scenes else "su3d-bench datasets list says where it looks"
+        hint = "" if n_scenes else "to see where it is looked for: su3d-bench datasets list"
         yield Check(f"dataset {name}", "note" if hint else "ok", counted(n_scenes, "scene"), hint)
 
 
@@ -225,7 +227,9 @@ def _models() -> Check:
     found = f"{len(here)} of {len(MODELS)} in {shown(models_folder(None))} and the Hugging Face cache"
     if here:
         return Check("models", "ok", f"{found}: {', '.join(here)}")
-    return Check("models", "note", f"{found}; only real models need them", "su3d-bench models list says what to fetch")
+    return Check(
+        "models", "note", f"{found}; only real models need them", "to see what to fetch: su3d-bench models list"
+    )
 
 
 def _cores() -> Check:

@@ -1,4 +1,4 @@
-"""``su3d-bench evaluate``: predictions made elsewhere to the numbers of the published protocols."""
+"""``su3d-bench evaluate``: score predictions of other programs under the published protocols."""
 
 from __future__ import annotations
 
@@ -12,27 +12,24 @@ from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import ConfigError
 
-SCHEMA = 1  # of the JSON file of several methods
+SCHEMA = 1  # version of the JSON for several methods
 OF_A_REQUEST = ("dataset", "ground_truth", "truth_values", "format", "text_features", "confidences", "queries")
 
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "evaluate", call)
-    parser.option("predictions [PREDICTIONS...]", "a folder of predictions, a run folder, or files", type=Path)
+    parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
+        "several methods; METHOD alone names PREDICTIONS (default: name of --out)",
         action="extend",
         default=[],
     )
-    parser.option(
-        "--out DIR", "write a run folder there, which compare, attribute, report, check, sheets, query and export take"
-    )
-    parser.option("--dataset NAME", "whose ground truth, below $SU3D_DATA: replica, scannet, rooms")
+    parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query")
+    parser.option("--dataset NAME", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
     parser.option(
         "--ground-truth DIR",
-        "ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
-        "OpenLex3D's release",
+        "folder of ground truth as text, one <scene>.txt each; or OpenLex3D's release",
     )
     parser.option(
         "--truth-values",
@@ -41,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
         choices=("classes", "instances", "numbers"),
     )
     parser.shared("--protocols", "--scenes")
-    parser.option("--format FORMAT", "of the predictions, where it cannot be recognised")
+    parser.option("--format FORMAT", "format of the predictions (default: recognised)")
     parser.shared("--text-features")
     parser.option(
         "--confidences",
@@ -49,12 +46,12 @@ def add_parser(verbs: Verbs) -> None:
         choices=("protocol", "file"),
     )
     parser.shared("--queries")
-    parser.option("--per-class", "print the table of every class too")
+    parser.option("--per-class", "also print the table of every class")
     parser.shared("--table-format")
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Score predictions made elsewhere, under every protocol that fits; the format is recognised.
+    """Score predictions of other programs under every protocol that fits.
 
     su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
     su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
@@ -85,11 +82,11 @@ def call(arguments: argparse.Namespace) -> None:
 
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
-    """The predictions by the method that they are called."""
+    """The predictions by method name."""
     from su3d_bench.evaluation.result import own_name
 
     if not arguments.predictions and not arguments.name:
-        raise ConfigError("evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS")
+        raise ConfigError("evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS")
     named: dict[str, list[Path]] = {}
     for text in arguments.name:
         method, equals, path = text.partition("=")
@@ -97,21 +94,21 @@ def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
             named.setdefault(method, []).append(Path(path))
         elif equals or not arguments.predictions or len(arguments.name) > 1:
             raise ConfigError(
-                f"evaluate: --name {text}: expected METHOD=PREDICTIONS of each method, or PREDICTIONS... --name METHOD"
+                f"evaluate: --name {text}: expected METHOD=PREDICTIONS for each method, or PREDICTIONS... --name METHOD"
             )
         else:
             named[text] = list(arguments.predictions)
     if len(named) == 1 and arguments.out is None:
-        raise ConfigError("evaluate: --name calls a method of a run; give --out DIR too, or several methods")
+        raise ConfigError("evaluate: --name names a method of a run; add --out DIR")
     return named or {own_name(arguments.out): list(arguments.predictions)}
 
 
 def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: bool) -> None:
-    """Where the run is, and what takes it."""
+    """Print the run folder and commands for next steps."""
     run, method = shlex.quote(str(out)), shlex.quote(methods[0])
     pair = f"{run}:{method} " + (f"{run}:{shlex.quote(methods[1])}" if len(methods) > 1 else "OTHER_RUN")
     whose = f" --method {method}" if len(methods) > 1 else ""
-    state = " (held this evaluation already, and is as it was)" if was_there else ""
+    state = " (unchanged: has this evaluation already)" if was_there else ""
     remark(
         f"run folder: {out}{state}",
         f"next: su3d-bench compare {pair}",

@@ -1,4 +1,4 @@
-"""``su3d-bench runs export``: predictions as the files that other evaluators take."""
+"""``su3d-bench runs export``: write predictions in the formats of other evaluators."""
 
 from __future__ import annotations
 
@@ -25,32 +25,27 @@ QUERY_RULES = "opensun3d-queries"
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "export", call)
-    parser.option("path RUN_OR_PREDICTION", "a run folder, or files of predictions", type=Path)
+    parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
     parser.option(
         "--to",
-        "openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
-        "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex; "
-        "opensun3d: the masks that answer the query of each scene of arkitscenes, with confidences",
+        "format to write: openlex3d, scannet, scannetpp or opensun3d",
         required=True,
         choices=TARGETS,
     )
-    parser.option("--out DIR", "a new folder for the files", required=True)
-    parser.option("--method METHOD", "whose maps of a run (default: the only one that it was asked for)")
+    parser.option("--out DIR", "new folder for the files", required=True)
+    parser.option("--method METHOD", "method whose maps are exported (default: the only one of the run)")
     parser.shared("--scenes")
-    parser.option("--format FORMAT", "the format of the prediction (default: found from its files)")
+    parser.option("--format FORMAT", "format of the predictions (default: recognised)")
     parser.option(
         "--protocol PROTOCOL",
-        "for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
+        "protocol with the classes (scannet, scannetpp; default: the only one that fits)",
     )
     parser.shared("--text-features")
 
 
 @dataclass(frozen=True)
 class Source:
-    """One scene's prediction: who reads it from where under which name; its address, as far as its dataset is known.
-
-    ``run`` is the run folder that it lies in.
-    """
+    """One scene's prediction: its reader, path and scene address. ``run`` is its run folder, if any."""
 
     reader: Reader
     path: Path
@@ -60,7 +55,7 @@ class Source:
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Write predictions, our own or another program's, as the files that another evaluator takes.
+    """Export predictions in the format of another evaluator.
 
     su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d
     su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis
@@ -73,7 +68,7 @@ def call(arguments: argparse.Namespace) -> None:
         ("--text-features", arguments.text_features, TARGETS[1:]),
     ):
         if value is not None and arguments.to not in users:
-            raise ConfigError(f"{flag} {value}: belongs to --to {' or '.join(users)}; leave it out")
+            raise ConfigError(f"{flag} {value}: only valid with --to {' or '.join(users)}; leave it out")
     sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
     names = _names([source.address for source in sources], is_flat=not is_openlex)
     rows = []
@@ -100,9 +95,9 @@ def call(arguments: argparse.Namespace) -> None:
 
 
 def _partial_remark(run: Path | None) -> tuple[str, ...]:
-    """That a map is of the first frames only, where its run was limited."""
+    """A warning if the run was limited to the first frames."""
     limit = 0 if run is None else _config_of(run).limit
-    return (f"partial: the map is of the first {limit} updates of the scene",) if limit else ()
+    return (f"partial: the map uses only the first {limit} updates",) if limit else ()
 
 
 def _config_of(run: Path) -> RunConfig:
@@ -112,30 +107,30 @@ def _config_of(run: Path) -> RunConfig:
 
 
 def sources_of(path: Path, format: str | None, method: str | None) -> list[Source]:
-    """Every scene at ``path``: those of one method of a run folder, or what the reader of its format finds."""
+    """All scenes at ``path``: of one method of a run folder, or found by the reader of its format."""
     from su3d_bench.predictions.formats import READERS, recognise
 
     maps = _maps_of_run(path) if format in {None, "su3d-bench"} else {}
     if not maps and method is not None:
-        raise ConfigError(f"--method {method}: {path} is no run folder; leave it out")
+        raise ConfigError(f"--method {method}: only valid for a run folder, {path} is not one")
     if maps:
         method = method or _only_method(maps)
         if method is None:
-            raise ConfigError(f"{path}: holds the maps of {', '.join(maps)}; choose one with --method")
+            raise ConfigError(f"{path}: has maps of {', '.join(maps)}; choose one with --method")
         if method not in maps:
-            raise ConfigError(f"{path}: holds no map of the method '{method}'{suggest(method, maps, 'it has')}")
+            raise ConfigError(f"{path}: no map of method '{method}'{suggest(method, maps, 'it has')}")
         reader = READERS["su3d-bench"]
         run = _run_of(maps[method][0])
         return [Source(reader, file, name, name, run) for file in maps[method] for name in reader.scenes(file)]
     reader = recognise(path, format)
     scenes = reader.scenes(path)
     if not scenes:
-        raise PredictionError(f"{printable(str(path), 300)}: has no prediction in the format '{reader.name}'")
+        raise PredictionError(f"{printable(str(path), 300)}: no prediction in format '{reader.name}'")
     return [Source(reader, path, name, name, _run_of(file)) for name, file in scenes.items()]
 
 
 def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
-    """The one method that a run was asked for; the ceiling that comes with it is not meant."""
+    """The only method of a run, the added ground-truth ceiling aside."""
     from su3d_bench.core.registry import CEILING_METHOD
 
     run = _run_of(next(iter(maps.values()))[0])
@@ -145,7 +140,7 @@ def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
 
 
 def _run_of(file: Path) -> Path | None:
-    """The run folder that a map lies in."""
+    """The run folder of a map."""
     above = file.absolute().parents
     is_in_run = file.name == "prediction.npz" and len(above) > 3 and (above[3] / "run.toml").is_file()
     return above[3] if is_in_run else None
@@ -160,7 +155,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
-    """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
+    """The sources that match a pattern, or all; a scene without a dataset takes that of the pattern."""
     from su3d_bench.runs.scenes import split_address
 
     if not patterns:
@@ -175,13 +170,13 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
                 matching.append(replace(source, address=f"{dataset}/{source.scene}") if lacks_dataset else source)
         if not matching:
             hint = suggest(pattern, [source.scene for source in sources], "it has")
-            raise ConfigError(printable(f"no scene of {path} matches '{pattern}'{hint}"))
+            raise ConfigError(printable(f"{path}: no scene matches '{pattern}'{hint}"))
         matches.update({source.address: source for source in matching})
     return list(matches.values())
 
 
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
-    """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
+    """The file name of each scene: its address, or its last part in a flat folder, where it must be unique."""
     from su3d_bench.predictions.export import file_name
     from su3d_bench.runs.scenes import split_address
 
@@ -192,14 +187,14 @@ def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
         names.append("/".join(file_name(part) for part in (parts[-1:] if is_flat else parts)))
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise ConfigError(f"two scenes are called '{twice}', and their files would be one; choose with --scenes")
+        raise ConfigError(f"two scenes are named '{twice}'; choose one with --scenes")
     return names
 
 
 def _write_for_classes(
     content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
 ) -> tuple[str, ...]:
-    """The files of a scene for a benchmark whose files have classes over the points of the truth."""
+    """The files of a scene in a format with classes on the ground-truth points."""
     from su3d_bench.predictions import export
     from su3d_bench.predictions.base import VertexMasks
 
@@ -226,7 +221,7 @@ def _write_for_classes(
 def _write_answer(
     content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
 ) -> tuple[str, ...]:
-    """The masks of a scene that answer what its dataset is searched for: as they are, or asked of a map."""
+    """The masks that answer the query of a scene: as predicted, or by querying its map."""
     from su3d_bench.core.interfaces import AsksText, HasSurface
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.predictions import export
@@ -236,7 +231,7 @@ def _write_answer(
         return export.write_opensun3d(export.answer_as_it_is(content), name, folder)
     dataset, scene = _scene_of(source, "arkitscenes", is_quiet=arguments.quiet)
     if not isinstance(dataset, AsksText) or not isinstance(dataset, HasSurface):
-        raise PredictionError("its dataset asks for nothing in its scenes; --to opensun3d takes scenes of arkitscenes")
+        raise PredictionError("the dataset has no queries; --to opensun3d needs scenes of arkitscenes")
     rules = load_protocol(QUERY_RULES)
     encoder = _encoder(content, source, rules, arguments.text_features)
     asked = dataset.asked_text(scene)
@@ -245,12 +240,12 @@ def _write_answer(
 
 
 def _scene_of(source: Source, usual: str, *, is_quiet: bool) -> tuple[Any, str]:
-    """The dataset and the scene of a prediction, with the options and the data of the run that it lies in."""
+    """The dataset and the scene of a prediction, with the settings of its run."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.runs.finished import data_of_map
 
     if "/" not in source.address:
-        raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes {usual}/{source.scene}")
+        raise PredictionError(f"dataset unknown; name it, such as --scenes {usual}/{source.scene}")
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
     data = data_of_map(source.run, source.address, source.path)
@@ -258,9 +253,9 @@ def _scene_of(source: Source, usual: str, *, is_quiet: bool) -> tuple[Any, str]:
 
 
 def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool) -> ProtocolRules:
-    """The protocol of ``name``, or the dataset's only one of instances with classes; several of one list count as one.
+    """The protocol ``name``, or the dataset's only instance protocol with classes.
 
-    Those of kind top-k fit only where classes are ranked (``is_ranked``).
+    Protocols of kind top-k fit only ranked classes (``is_ranked``).
     """
     from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
     from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
@@ -272,20 +267,20 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if has_masks(rules)}
     if name is None:
         if len({(rules.ground_truth, rules.classes) for rules in fitting.values()}) != 1:
-            known = ", ".join(fitting) or "none fits by itself"
-            raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
+            known = ", ".join(fitting) or "none fits"
+            raise ConfigError(f"{dataset.name}: several class lists; choose a protocol with --protocol ({known})")
         return next(iter(fitting.values()))
     is_own = run is not None and not name.endswith(".toml") and name not in protocol_names()
     finished = read_run(run) if run is not None and is_own else None
     rules = finished.rules(name) if finished is not None and name in finished.protocols else load_protocol(name)
     reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
     if reason is not None or not (has_masks(rules) or (is_ranked and rules.kind == "top-k")):
-        raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
+        raise ConfigError(f"--protocol {name}: {reason or 'no instance classes'}")
     return rules
 
 
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:
-    """What names the features; None where the prediction has classes or no features."""
+    """The encoder for the features; None if the prediction has classes or no features."""
     from su3d_bench.evaluation.scoring import facts_of
     from su3d_bench.evaluation.texts import encoder_for, read_text_features
     from su3d_bench.metrics.fitness import n_feature_dimensions

@@ -1,4 +1,4 @@
-"""``su3d-bench models fetch`` and ``datasets fetch``: published weights and data, once their terms are accepted."""
+"""``su3d-bench models fetch`` and ``datasets fetch``: download published weights and data."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ MB = 1_000_000
 
 
 def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
-    """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
+    """Add ``--accept``, ``--dry-run``, ``--retries`` and, with ``has_servers``, ``--mirror`` and ``--sources``."""
     parser.option(
         "--accept NAME...",
-        "accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
+        "accept the licence of NAME, or a licence such as MIT (default: ask)",
         action="extend",
         default=[],
     )
     parser.shared("--dry-run")
-    parser.option("--retries N", "how often a broken download is taken up again (default: 3)", type=int, default=3)
+    parser.option("--retries N", "download retries (default: 3)", type=int, default=3)
     if has_servers:
         parser.option(
             "--mirror NAME=URL...",
-            "take its files from this folder of another server; for a repository of the hub, another endpoint",
+            "download NAME from another server or hub endpoint",
             action="extend",
             default=[],
         )
         parser.option(
             "--sources FILE",
-            "a TOML file of your own in the form of the program's table, whose entries take the place of its own",
+            "TOML file of sources that override the built-in ones",
         )
 
 
@@ -53,7 +53,7 @@ def retries_of(arguments: argparse.Namespace) -> int:
 
 
 def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
-    """Show, ask, bring what is missing, and answer; with ``--dry-run`` only show."""
+    """Download what is missing once its licence is accepted; with ``--dry-run`` only show it."""
     from su3d_bench.fetching.bringing import fetch
 
     _known_terms(arguments, [entry.source for entry in planned])
@@ -71,18 +71,18 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
 
 
 def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[Brought]) -> None:
-    """Say where everything lies, and with which checksums it came."""
+    """Print folders and checksums."""
     rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
-    lines = [f"{name}: was there already: {folder}" for name, folder in here]
+    lines = [f"{name}: already present: {folder}" for name, folder in here]
     for entry in brought:
         row = {"name": entry.source.name, "folder": str(entry.place), "files": [asdict(file) for file in entry.files]}
         rows.append(row | {"remarks": list(entry.remarks)})
         lines.append(f"{entry.source.name}: {entry.place}")
         for file in entry.files:
             sums = (
-                f"agrees with: {', '.join(file.held_against)}"
+                f"verified against: {', '.join(file.held_against)}"
                 if file.held_against
-                else "no checksum is stated; recorded"
+                else "no published checksum; recorded"
             )
             lines.append(f"  {file.sha256}  {file.name}  ({sums})")
         remark(*(f"{entry.source.name}: {text}" for text in entry.remarks), quiet=arguments.quiet)
@@ -90,7 +90,7 @@ def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path
 
 
 def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
-    """A source as ``--dry-run --json`` gives it: every fact with where it was read."""
+    """A source as ``--dry-run --json`` prints it."""
     from su3d_bench.fetching.download import hub_addresses
 
     return source.model_dump(mode="json", exclude_none=True) | {
@@ -102,21 +102,21 @@ def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
 
 
 def plan_lines(source: Source, here: Path | None) -> list[str]:
-    """A source in words: size, licence, every address."""
+    """A source as lines: size, licence, addresses."""
     from su3d_bench.store.caches import size_text
 
     about = "" if source.is_exact else "about "
     size = "size not stated" if source.n_bytes is None else f"{about}{size_text(source.n_bytes)}"
     return [
         f"{source.name}: {source.what}",
-        f"  {size}, {f'was there already: {here}' if here is not None else 'to be fetched'}",
+        f"  {size}, {f'already present: {here}' if here is not None else 'to be downloaded'}",
         f"  licence {source.licence.name}: {source.licence.address}",
         *(f"  {address}" for address in plan_row(source, here)["addresses"]),
     ]
 
 
 def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
-    """Ask for each licence that was not accepted; ``ConfigError`` where it is not, or nobody is there to answer."""
+    """Ask for each licence not yet accepted; ``ConfigError`` if declined or without a terminal."""
     given = {name.lower() for name in arguments.accept}
     open_ones = [s for s in sources if not {s.name.lower(), s.licence.name.lower(), s.group} & given]
     licences: dict[tuple[str, str], list[Source]] = {}
@@ -130,25 +130,25 @@ def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
         names = ", ".join(source.name for source in those)
         if not (sys.stdin.isatty() and sys.stderr.isatty()):
             raise ConfigError(
-                f"fetch: the licence '{name}' ({address}) of {names} was not accepted; read it, then add --accept "
+                f"fetch: licence '{name}' ({address}) of {names} not accepted; read it, then add --accept "
                 f"{those[0].name if len(those) == 1 else shlex.quote(name)}"
             )
-        remark(f"{names}: under '{name}', {address}; do you accept it? [y/N]")
+        remark(f"{names}: licence '{name}', {address}; do you accept it? [y/N]")
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-            raise ConfigError(f"fetch: the licence '{name}' of {names} was not accepted; nothing of it was fetched")
+            raise ConfigError(f"fetch: licence '{name}' of {names} not accepted; nothing was downloaded")
 
 
 def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
-    """``ConfigError`` where ``--accept`` names what is neither asked for nor a licence of it."""
+    """``ConfigError`` if ``--accept`` names neither a requested item nor its licence."""
     known = [name for s in sources for name in (s.name, s.licence.name, s.group)]
     for name in arguments.accept:
         if name.lower() not in {word.lower() for word in known}:
-            raise ConfigError(f"--accept '{name}': is nothing that is asked for{suggest(name, known)}")
+            raise ConfigError(f"--accept '{name}': neither a requested item nor its licence{suggest(name, known)}")
 
 
 @contextmanager
 def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
-    """What hears how much has come, and draws a bar a file where stderr is a terminal."""
+    """A progress callback that draws one bar per file if stderr is a terminal."""
     with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
         if bars is None:
             yield lambda name, done, total: None
@@ -169,14 +169,14 @@ def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
 
 def add_models(verbs: Verbs) -> None:
     parser = add_verb(verbs, "fetch", call_models, takes_up=True)
-    parser.option("names [MODEL...]", "short names, as models list has them")
-    parser.option("--for PROFILE", "every model that this profile loads: paper", dest="profile")
+    parser.option("names [MODEL...]", "names from models list")
+    parser.option("--for PROFILE", "all models of a profile: paper", dest="profile")
     _add_fetch_options(parser)
     parser.shared("--set")
 
 
 def call_models(arguments: argparse.Namespace) -> None:
-    """Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.
+    """Download foundation models into $SU3D_MODELS.
 
     su3d-bench models fetch --for paper --accept MIT Apache-2.0
     su3d-bench models fetch sam-vit-h --dry-run
@@ -191,26 +191,26 @@ def call_models(arguments: argparse.Namespace) -> None:
 
 
 def add_data(verbs: Verbs) -> None:
-    """Fetch published data: shown first, resumed, checked, unpacked where it is looked for.
+    """Download published datasets; downloads are resumed and verified.
 
     su3d-bench datasets fetch replica --dry-run
     su3d-bench datasets fetch scannet --dry-run
     """
     actions = add_group(verbs, "fetch", add_data)
     parser = add_verb(actions, "replica", call_replica, takes_up=True)
-    parser.option("parts [PART...]", "frames, meshes (default: both)")
-    parser.option("--keep-archives", "keep what was unpacked, in .fetched")
+    parser.option("parts [PART...]", "frames or meshes (default: both)")
+    parser.option("--keep-archives", "keep the archives, in .fetched")
     _add_fetch_options(parser)
     parser = add_verb(actions, "scannet", call_scannet, takes_up=True)
-    parser.option("scans [SCAN...]", "scene0000_00, paper, train, val or test (default: paper)")
+    parser.option("scans [SCAN...]", "scans or splits: scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
     parser.option("--script FILE", "your official download script", given)
-    parser.option("--from URL", "your own link, in which v1/scans and v2/scans lie", given, dest="address")
+    parser.option("--from URL", "your URL of a folder with v1/scans and v2/scans", given, dest="address")
     _add_fetch_options(parser, has_servers=False)
 
 
 def call_replica(arguments: argparse.Namespace) -> None:
-    """Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.
+    """Download Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames and the annotated meshes.
 
     su3d-bench datasets fetch replica --dry-run
     su3d-bench datasets fetch replica frames --accept replica
@@ -224,7 +224,7 @@ def call_replica(arguments: argparse.Namespace) -> None:
 
 
 def call_scannet(arguments: argparse.Namespace) -> None:
-    """Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.
+    """Download ScanNet into $SU3D_DATA with the official script or your link.
 
     su3d-bench datasets fetch scannet --script download-scannet.py
     su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet

@@ -1,4 +1,4 @@
-"""``su3d-bench``: parse, hand to the verb, turn errors into one line and an exit code."""
+"""``su3d-bench``: parse the command line, call the command, turn errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 from su3d_bench.core.version import __version__
 
-# The verbs as the help lists them; each is in the module of this folder that bears its name or stands beside it.
+# The commands in the order of the help; each is in the module of its name, or in that of MODULE_OF.
 GROUPS = {
     "run and score": ("run", "ablate", "evaluate", "reproduce"),
     "compare and report": ("compare", "check", "report", "runs"),
-    "questions and people": ("query", "sheets"),
-    "data, models and rules": ("datasets", "models", "methods", "protocols"),
+    "questions and human evaluation": ("query", "sheets"),
+    "data, models and methods": ("datasets", "models", "methods", "protocols"),
     "maintain": ("dev",),
 }
 MODULE_OF = {"ablate": "run", "check": "compare"}
@@ -37,7 +37,7 @@ EPILOG = """examples:
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
-    """The verbs in groups, each with what its help begins with."""
+    """Lists the commands in groups, each with the first clause of its help."""
 
     def _format_action(self, action: argparse.Action) -> str:
         if not isinstance(action, argparse._SubParsersAction):
@@ -52,7 +52,7 @@ class Help(argparse.RawDescriptionHelpFormatter):
 
 
 def build_parser(verb: str | None = None) -> Parser:
-    """The parser of all verbs, or of ``verb`` alone where it is one; nothing heavy is imported for it."""
+    """The parser of all commands, or of ``verb`` only if it is one; imports nothing heavy."""
     parser = Parser(prog="su3d-bench", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
@@ -66,8 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` and return its exit code: 0 done, 1 check failed, 2 wrong input, 3 incomplete,
     4 internal.
 
-    Who reads the answer moves the code only where it should have been kept: a pipe whose reader has gone, or a closed
-    stdout, leaves it as it is; a stdout that refuses the answer, such as a file on a full disk, turns 0 into 2.
+    A closed pipe or stdout does not change the code; a write error on stdout, such as a full disk, turns 0 into 2.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     with doors() as out:
@@ -75,20 +74,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         out.flush()
         if out.refused is not None:
             reason = out.refused.strerror or out.refused
-            remark(f"su3d-bench: stdout: cannot be written: {reason}; what was done is kept, its answer is not whole")
+            remark(
+                f"su3d-bench: stdout: write error ({reason}); the results are saved, the printed output is incomplete"
+            )
             code = code or EXIT_WRONG_INPUT
     return code
 
 
 def complete(parser: Parser) -> None:
-    """Answer the shell that completes a command line, and end."""
+    """Print completions for the shell and exit."""
     import argcomplete
 
     argcomplete.autocomplete(parser)
 
 
 def _refuse_records(arguments: argparse.Namespace) -> None:
-    """Refuse an ``--out`` that is a file of a finished run, whatever the verb would put there."""
+    """Refuse an ``--out`` that is a file of a finished run."""
     out = getattr(arguments, "out", None)
     if isinstance(out, Path) and os.path.isfile(out):
         from su3d_bench.store.run_folder import refuse_records
@@ -97,31 +98,31 @@ def _refuse_records(arguments: argparse.Namespace) -> None:
 
 
 def _exit_code(words: Sequence[str]) -> int:
-    """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
+    """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
     try:
         parser = build_parser(words[0] if words else None)
-        if "_ARGCOMPLETE" in os.environ:  # a shell asks what may follow; see su3d-bench dev completion
+        if "_ARGCOMPLETE" in os.environ:  # shell completion; see su3d-bench dev completion
             complete(parser)
         arguments = parser.parse_args(words)
-        if "call" not in arguments:  # a verb with several sub-verbs, given alone
+        if "call" not in arguments:  # a group of commands without a command
             arguments = parser.parse_args([*words, "list"])
-        from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
+        from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
         _refuse_records(arguments)
         if not arguments.uses_all_cores:
-            limit_threads()  # before numerical libraries are loaded
+            limit_threads()  # before numerical libraries are imported
         with ending_in_order():
             code: int | None = arguments.call(arguments)
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
-        how = f"ended by {end}" if isinstance(end, Ended) else "interrupted"
-        again = "takes it up again" if getattr(arguments, "takes_up", False) else "begins anew"
+        how = f"stopped by {end}" if isinstance(end, Ended) else "interrupted"
+        again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Ended) else EXIT_INTERRUPTED
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
-    except Exception as error:  # noqa: BLE001 - the one place where whatever else went wrong becomes a line
+    except Exception as error:  # noqa: BLE001 - the one place that turns every other exception into a line
         is_debug = "--debug" in words
         if is_debug:
             import traceback
@@ -130,7 +131,7 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        if errors.own_line(error):  # the mistake is in somebody's own method or dataset
+        if errors.own_line(error):  # raised in a user-defined method or dataset
             remark(f"su3d-bench: {errors.error_line(error)}")
             return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")

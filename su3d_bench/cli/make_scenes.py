@@ -1,4 +1,4 @@
-"""``su3d-bench datasets make``: scenes cut into units of work, made side by side, moved to their place when whole."""
+"""``su3d-bench datasets make``: generate scenes in parallel; a scene appears when it is complete."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
-FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter
+FRAMES_A_UNIT = 400  # a quarter of a room: much more work than building the room in each process
 WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A piece of work: the frames at ``indices``, or (None) the truth; without ``target`` the scan alone.
+    """A unit of work: the frames at ``indices``, or (None) the ground truth; without ``target`` only the scan.
 
-    ``layout`` is the name of one; units go to other processes.
+    ``layout`` is a name, because units are sent to other processes.
     """
 
     dataset: Part
@@ -47,12 +47,12 @@ class Unit:
 
 
 def make(arguments: argparse.Namespace) -> None:
-    """Make what was asked for and print, scene by scene, whether it was made or was there already."""
+    """Generate the requested scenes and print the status of each."""
     part = dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
     is_native = arguments.layout == "native"
     if arguments.out is None and not is_native:
-        raise ConfigError(f"datasets make --layout {arguments.layout}: say where with --out DIR")
+        raise ConfigError(f"datasets make --layout {arguments.layout}: name the folder with --out DIR")
     out = arguments.out or data_root()
     make_folder(out)
     with RunFolder(out).locked():
@@ -61,7 +61,7 @@ def make(arguments: argparse.Namespace) -> None:
     rows = [
         {
             "scene": scene,
-            "status": "made" if scene in made else "was there already",
+            "status": "generated" if scene in made else "already present",
             "address": f"{reader}/{scene if is_native else LAYOUTS[arguments.layout].scene_name(scene)}",
         }
         for scene in scenes
@@ -74,9 +74,9 @@ def make(arguments: argparse.Namespace) -> None:
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:
     dataset_class = registry.load("dataset", name)
     if not all(hasattr(dataset_class, wanted) for wanted in WHAT_A_LAYOUT_TAKES):
-        raise ConfigError(f"datasets make {name}: its scenes are not made here; known: rooms")
+        raise ConfigError(f"datasets make {name}: scenes of this dataset cannot be generated; known: rooms")
     own_name = str(dataset_class.name)
-    # An option may be written as in `run --set`, with the dataset's name before it, or alone.
+    # A setting may have the name of the dataset as prefix, as in `run --set`.
     texts = [text if text.partition("=")[0].count(".") else f"{own_name}.{text}" for text in assignments]
     return part_of("dataset", name, read_assignments(texts, (), (own_name,)))
 
@@ -87,7 +87,7 @@ def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
     for address in addresses:
         if not address.startswith(prefix):
             hint = nearest(address, [prefix + "*"]) or f"; expected '{prefix}...'"
-            raise ConfigError(f"datasets make {part.target}: '{address}' is no scene of it{hint}")
+            raise ConfigError(f"datasets make {part.target}: no scene '{address}'{hint}")
     chosen, _ = expand_scenes(addresses, {part.target: part})
     return [scene for _, scene in chosen]
 
@@ -99,7 +99,7 @@ def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argpar
 
 
 def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    """Write scenes in the layout of ``arguments``, whose ``jobs`` and ``quiet`` count; those that were not there."""
+    """Write scenes in the layout of ``arguments`` (also ``jobs``, ``quiet``); returns those that were missing."""
     layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
     units = []
     for target in plan_scenes(layout, dataset, scenes, out):
@@ -121,7 +121,7 @@ def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse
 
 def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[Unit], None]) -> None:
     n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
-    with overall_progress("making", is_quiet=arguments.quiet) as (begin, report):
+    with overall_progress("generating", is_quiet=arguments.quiet) as (begin, report):
         begin(sum(unit.n_steps for unit in units))
         if n_workers > 1:
             outcomes = run_processes(_work, units, report, jobs=n_workers, lost=_lost)
@@ -133,7 +133,7 @@ def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[U
 
 def _work(unit: Unit, report: Report) -> Unit:
     dataset = _dataset(unit.dataset, unit.root)
-    name = f"{unit.scene}, {'truth' if unit.indices is None else f'frames from {unit.indices.start}'}"
+    name = f"{unit.scene}, {'ground truth' if unit.indices is None else f'frames from {unit.indices.start}'}"
     if unit.target is None:
         dataset.scan(unit.scene)
     elif unit.indices is None:
@@ -142,16 +142,16 @@ def _work(unit: Unit, report: Report) -> Unit:
         layout, n = LAYOUTS[unit.layout], unit.n_steps
 
         def count(n_done: int) -> None:
-            report(Event(name, "making", n_done, n))
+            report(Event(name, "generating", n_done, n))
 
         write_frames(layout, dataset, unit.target, unit.indices, count)
-    report(Event(name, "made", unit.n_steps, unit.n_steps))
+    report(Event(name, "generated", unit.n_steps, unit.n_steps))
     return unit
 
 
 @cache
 def _dataset(part: Part, root: Path) -> Any:
-    """One dataset a process, because it keeps the room that the next unit is likely to want."""
+    """One dataset per process, because it caches the room that the next unit is likely to use."""
     return build_dataset(part, root)
 
 

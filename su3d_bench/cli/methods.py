@@ -1,4 +1,4 @@
-"""``su3d-bench methods``: the methods that can be run, where they come from, what they need, and their settings."""
+"""``su3d-bench methods``: list methods, show their settings, check one, or create your own."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WIDTH = 118
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.
+    """List methods, show their settings, check one, or create your own.
 
     su3d-bench methods list
     su3d-bench methods show opensu3d
@@ -29,14 +29,14 @@ def add_parser(verbs: Verbs) -> None:
     actions = add_group(verbs, "methods", add_parser, lists=True)
     add_verb(actions, "list", call_list)
     parser = add_verb(actions, "show", call_show)
-    parser.option("name METHOD", "its name, or file.py:Class")
+    parser.option("name METHOD", "method, or file.py:Class")
     parser = add_verb(actions, "check", call_check)
-    parser.option("name METHOD", "its name, or file.py:Class")
+    parser.option("name METHOD", "method, or file.py:Class")
     add_new(actions, "method")
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List the methods that can be run: where they come from, their licence, what they need.
+    """List methods with source, licence and requirements.
 
     su3d-bench methods list
     su3d-bench methods list --json
@@ -48,7 +48,7 @@ def call_list(arguments: argparse.Namespace) -> None:
 
 
 def call_check(arguments: argparse.Namespace) -> None:
-    """Try a method on two frames of a room, and name what is wrong with what it gives.
+    """Run a method on two frames and check its output.
 
     su3d-bench methods check oracle
     su3d-bench methods check my_method.py:MyMethod
@@ -59,7 +59,7 @@ def call_check(arguments: argparse.Namespace) -> None:
     made = f"{trial.kind} of {counted(trial.n_points, 'point')}"
     made += "" if trial.n_instances is None else f", {counted(trial.n_instances, 'instance')}"
     features = "with features" if trial.has_features else "without features"
-    text = f"{trial.method}: two frames of {trial.scene} gave {made}, {features}: nothing found wrong"
+    text = f"{trial.method}: two frames of {trial.scene} gave {made}, {features}: OK"
     answer_either(arguments, asdict(trial), text)
 
 
@@ -73,7 +73,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
 
 
 def call_show(arguments: argparse.Namespace) -> None:
-    """Show the settings of a method, its presets and what papers report of it.
+    """Show the settings, presets and published results of a method.
 
     su3d-bench methods show opensu3d
     su3d-bench methods show my_method.py:MyMethod
@@ -96,12 +96,12 @@ def call_show(arguments: argparse.Namespace) -> None:
     answer(*(f"# {line}" for line in _lines(row)))
     answer_document("\n" + write_toml(leaves) if leaves else f"# {one_line(method.name)} has no settings")
     if presets:
-        answer("", "# presets, each a method of its own name")
+        answer("", "# presets, each usable as a method")
         for name, settings in presets.items():
             assigned = ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
             answer(f"# {method.name}@{name}: {assigned}")
     if figures:
-        answer("", "# as reported, each in its own set-up; no two need be comparable")
+        answer("", "# published results; set-ups differ, so they may not be comparable")
         answer(*(f"# {line}" for figure in figures for line in _figure_lines(figure)))
 
 

@@ -1,4 +1,4 @@
-"""``su3d-bench models``: which foundation models there are, whether they are here and whole, and what they take."""
+"""``su3d-bench models``: list, download, check and benchmark foundation models."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List the foundation models, fetch them, check their files, or run them once.
+    """List, download, check and benchmark foundation models.
 
     su3d-bench models list
     su3d-bench models fetch --for paper --dry-run
@@ -26,17 +26,17 @@ def add_parser(verbs: Verbs) -> None:
     listing = add_verb(actions, "list", call_list)
     listing.shared("--set")
     checking = add_verb(actions, "check", call_check)
-    checking.option("names [MODEL...]", "short names (default: every model that is here)")
+    checking.option("names [MODEL...]", "models to check (default: all that are present)")
     checking.shared("--set")
     parser = add_verb(actions, "warm", call_warm)
-    parser.option("name [ENCODER]", "an encoder alone (default: the profile's models)")
-    parser.option("--profile PROFILE", "whose models (default: paper)")
+    parser.option("name [ENCODER]", "encoder to load (default: all models of the profile)")
+    parser.option("--profile PROFILE", "profile whose models are loaded (default: paper)")
     parser.shared("--device", "--set")
     fetch.add_models(actions)
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List every model: size, licence, which profile loads it, and where it lies or that it is missing.
+    """List all models with size, licence, profile and location.
 
     su3d-bench models list
     su3d-bench models list --json
@@ -52,7 +52,7 @@ def call_list(arguments: argparse.Namespace) -> None:
         lines.append(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
     answer_either(arguments, [_state_row(state) for state in states], *lines)
     if missing := [state.entry.name for state in states if not state.files]:
-        text = f"{len(missing)} missing; su3d-bench models check {missing[0]} says what to fetch"
+        text = f"{len(missing)} missing; su3d-bench models check {missing[0]} shows what to download"
         remark(text, quiet=arguments.quiet or arguments.json)
 
 
@@ -112,7 +112,7 @@ def call_check(arguments: argparse.Namespace) -> int:
         if names and not state.files
     ]
     if not rows:
-        raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
+        raise ConfigError("models check: no models found; to list them: su3d-bench models list")
     answer_either(arguments, rows, *(line for row in rows for line in _check_lines(row)))
     return EXIT_CHECK_FAILED if any(row["problems"] for row in rows) else EXIT_DONE
 
@@ -120,13 +120,13 @@ def call_check(arguments: argparse.Namespace) -> int:
 def _check_lines(row: dict[str, Any]) -> list[str]:
     if row["form"] is None:
         return list(row["problems"])
-    state = "wrong" if row["problems"] else "whole"
+    state = "invalid" if row["problems"] else "OK"
     digests = [f"  {digest}  {name}" for name, digest in row["sha256"].items()]
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
 
 
 def call_warm(arguments: argparse.Namespace) -> None:
-    """Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.
+    """Load models, run them on a synthetic frame, and report time and memory.
 
     su3d-bench models warm --profile paper --device cuda
     su3d-bench models warm clip-vit-b-32
@@ -138,7 +138,7 @@ def call_warm(arguments: argparse.Namespace) -> None:
     config = perception_config(arguments)
     device = device_for(config.models.device, 0)
     if arguments.name is None:
-        config = config.model_copy(update={"cache": False})  # what is measured must be computed
+        config = config.model_copy(update={"cache": False})  # a cached result cannot be timed
         profile = arguments.profile or "paper"
         perception = build_perception(profile, config, scene=warm_scene(), cache_root=Path(), mesh=None)
         result = warm_perception(perception, device)

@@ -1,4 +1,4 @@
-"""The sub-verbs ``new``: a method, a dataset, a protocol or a registry of one's own that runs as it stands."""
+"""The commands ``new``: write a template of a method, dataset, protocol or registry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
 REGISTRY = "registry"
 TEMPLATES = Path(__file__).parent / "templates"
 TEMPLATE_OF = {"method": "my_method.py.txt", "dataset": "my_dataset.py.txt", "protocol": "my_protocol.toml"}
-# Where each file of a registry's template goes; an empty folder is none for git, so that bundles has a file of its own.
+# Target of each template file; git does not store empty folders, so bundles gets a file.
 REGISTRY_FILES = {
     "README.md": "README.md",
     "requirements.txt": "requirements.txt",
@@ -22,7 +22,7 @@ REGISTRY_FILES = {
     "workflow.yml": ".github/workflows/registry.yml",
 }
 KEPT = "bundles/.gitkeep"
-# What to type next; {at} is how the file is named to the command line.
+# Next commands; {at} is the file on the command line.
 NEXT = {
     "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
     "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
@@ -32,10 +32,10 @@ NEXT = {
 
 
 def add_new(verbs: Verbs, what: str) -> None:
-    """The sub-verb ``new`` of methods, datasets, protocols and registries."""
+    """Add the command ``new`` of methods, datasets, protocols and registries."""
     group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
     place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
-    about = f"""Write a {what} of your own that works as it is, to begin from.
+    about = f"""Create a {what} from a working template.
 
     su3d-bench {group} new {place}
     su3d-bench {group} new {place} --json
@@ -43,9 +43,9 @@ def add_new(verbs: Verbs, what: str) -> None:
     parser = add_verb(verbs, "new", call, about)
     parser.set_defaults(what=what)
     if what == REGISTRY:
-        parser.option("file DIR", "the folder to write")
+        parser.option("file DIR", "folder to create")
     else:
-        parser.option("file FILE", "to write; its name becomes the name in it")
+        parser.option("file FILE", "file to create; its name becomes the name of the class")
 
 
 def call(arguments: argparse.Namespace) -> None:
@@ -60,9 +60,9 @@ def call(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{what}s new: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
     words = re.findall(r"[A-Za-z0-9]+", file.stem)
     if not words or words[0][0].isdigit():
-        raise ConfigError(f"{what}s new: no name can be made of '{file.stem}'; such as: my_{what}{SUFFIX[what]}")
+        raise ConfigError(f"{what}s new: '{file.stem}' is not a valid name; use one such as my_{what}{SUFFIX[what]}")
     if file.exists():
-        raise ConfigError(f"{what}s new: {file} is there already; name another file, nothing is overwritten")
+        raise ConfigError(f"{what}s new: {file} exists; choose another name")
     name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
     template = file_text(TEMPLATES / TEMPLATE_OF[what])
     text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
@@ -74,7 +74,7 @@ def call(arguments: argparse.Namespace) -> None:
 
 
 def _new_registry(folder: Path, arguments: argparse.Namespace) -> None:
-    """A repository whose CI scores the bundles of pull requests anew and publishes the site."""
+    """Create a repository whose CI re-scores the bundles of pull requests and publishes the site."""
     import os
     import shlex
 
@@ -84,14 +84,12 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> None:
 
     name = Path(os.path.abspath(folder)).name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
-        raise ConfigError(f"dev registry new: '{name}' is no name for a repository; such as: my-registry")
+        raise ConfigError(f"dev registry new: '{name}' is not a valid repository name; use one such as my-registry")
     taken = next(
         (path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None
     )
     if taken is not None or (os.path.lexists(folder) and not folder.is_dir()):
-        raise ConfigError(
-            f"dev registry new: {taken or folder} is there already; name another folder, nothing is overwritten"
-        )
+        raise ConfigError(f"dev registry new: {taken or folder} exists; choose another folder")
     for source, place in REGISTRY_FILES.items():
         text = file_text(TEMPLATES / "registry" / source)
         written(folder / place, text.replace("my-registry", name).replace("VERSION", __version__))

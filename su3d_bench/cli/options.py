@@ -1,4 +1,4 @@
-"""Options of the command line: its parser, the shape of every verb, and the options that several verbs have."""
+"""The argument parser, how commands are added to it, and the options that several commands share."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
     from su3d_bench.perception.profiles import PerceptionConfig
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
-Verbs = Any  # argparse._SubParsersAction of a parser's verbs
-Call = Callable[[argparse.Namespace], int | None]  # what a verb does; its exit code, none for done
+Verbs = Any  # argparse._SubParsersAction
+Call = Callable[[argparse.Namespace], int | None]  # runs a command; returns its exit code or None
 PATHS = ("FILE", "DIR", "RUN", "PNG", "BUNDLE")
 TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 LANGUAGE = ("perception", "language")
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt verb or option."""
+    """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt command or option."""
 
     def error(self, message: str) -> None:  # type: ignore[override]
         verb = self.prog.partition(" ")[2]
         raise ConfigError(f"{verb}{': ' if verb else ''}{message}; see {self.prog} --help")
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As the base class, but each verb itself refuses what it does not know: it can suggest one of its options."""
+        """As the base class, but each command rejects unknown arguments itself, with a suggestion."""
         parsed, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unknown argument '{unknown[0]}'{nearest(unknown[0], self._option_string_actions)}")
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """As the base class, with a suggestion for a choice that does not exist."""
+        """As the base class, with a suggestion for an invalid choice."""
         if action.choices is not None and value not in action.choices:
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             if isinstance(action, argparse._SubParsersAction):
@@ -49,21 +49,21 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
     def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:
-        """Add the option or argument that ``form`` writes as help shows it; ``more`` as ``add_argument`` takes it.
+        """Add an option or argument in the form that help shows; ``more`` as for ``add_argument``.
 
-        ``group``: of options that exclude each other.
+        ``group``: a mutually exclusive group.
         """
         name, settings = option(form, text, **more)
         (group or self).add_argument(name, **settings)
 
     def shared(self, *names: str, **changes: Any) -> None:
-        """Add options of ``SHARED``; ``changes`` are for a verb in which they cannot be the same."""
+        """Add options of ``SHARED``, with ``changes`` to their settings."""
         for name in names:
             self.add_argument(name, **SHARED[name] | changes)
 
 
 class JsonFlag(argparse.Action):
-    """``--json``: ``json`` is true where the answer is printed as JSON, ``json_file`` is where it is written."""
+    """``--json``: ``json`` is true if JSON is printed, ``json_file`` is the file to write it to."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **form: Any) -> None:
         super().__init__(option_strings, dest, nargs="?", default=False, metavar="FILE.json", **form)
@@ -72,20 +72,20 @@ class JsonFlag(argparse.Action):
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
     ) -> None:
         if values is not None and not values.endswith(".json"):
-            parser.error(f"--json {values}: a file for JSON ends in .json; to print JSON, write --json last")
+            parser.error(f"--json {values}: expected a file that ends in .json; to print JSON, put --json last")
         namespace.json, namespace.json_file = values is None, values and Path(values)
 
 
 def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
-    """The name of an option or argument and what ``add_argument`` takes of it, from the form that help shows.
+    """The name and the ``add_argument`` settings of an option or argument, from the form that help shows.
 
-    ``--out FILE`` takes a value, ``RUN...`` one or more, ``[RUN...]`` none or more, ``[DIR]`` none or one. What is
-    called FILE, DIR, RUN, PNG or BUNDLE is a path; an option without a value is a switch.
+    ``--out FILE`` takes one value, ``RUN...`` one or more, ``[RUN...]`` any number, ``[DIR]`` at most one. FILE, DIR,
+    RUN, PNG and BUNDLE are paths; an option without a value is a flag.
 
-    >>> option("--scenes SCENE...", "these alone")
-    ('--scenes', {'help': 'these alone', 'metavar': 'SCENE', 'nargs': '+'})
-    >>> option("--per-class", "each class too")
-    ('--per-class', {'help': 'each class too', 'action': 'store_true'})
+    >>> option("--scenes SCENE...", "scenes to use")
+    ('--scenes', {'help': 'scenes to use', 'metavar': 'SCENE', 'nargs': '+'})
+    >>> option("--per-class", "show each class")
+    ('--per-class', {'help': 'show each class', 'action': 'store_true'})
     """
     name, _, value = form.partition(" ")
     is_optional = value.startswith("[")
@@ -106,29 +106,29 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
 def add_verb(
     verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, takes_up: bool = False
 ) -> Parser:
-    """A verb's parser, whose help is the docstring of ``call`` or ``about``; with ``--json``, ``--quiet``, ``--debug``.
+    """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
-    Numerical libraries use one thread unless the verb ``uses_all_cores``. One that ``takes_up`` resumes what was
-    interrupted; others start again.
+    Numerical libraries use one thread unless it ``uses_all_cores``. A command that ``takes_up`` resumes after an
+    interruption; others start again.
     """
     parser = _parser(verbs, name, about or call.__doc__)
     parser.set_defaults(call=call, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
-    parser.add_argument("--json", action=JsonFlag, help="print the answer as JSON; with a file, write it there")
-    parser.option("--quiet", "no progress and no remarks on stderr")
+    parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
+    parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
     return parser
 
 
 def add_group(verbs: Verbs, name: str, add: Callable[[Verbs], None], *, lists: bool = False) -> Verbs:
-    """The sub-verbs of a verb such as ``datasets``, whose help is the docstring of ``add``, the function that adds it.
+    """Add a group of commands such as ``datasets``, whose help is the docstring of ``add``.
 
-    Given alone it does its ``list`` if it ``lists``.
+    Without a command it runs ``list`` if it ``lists``.
     """
     return _parser(verbs, name, add.__doc__).add_subparsers(dest="action", metavar="VERB", required=not lists)
 
 
 def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
-    """A parser whose help is ``about``: a summary, an empty line, and examples, a line each."""
+    """A parser whose help is ``about``: a summary, an empty line, and one example per line."""
     summary, _, examples = (about or "").strip().partition("\n\n")
     summary = " ".join(summary.split())
     parser: Parser = verbs.add_parser(
@@ -142,7 +142,7 @@ def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
 
 
 def count(text: str) -> int:
-    """The type of an option that is a number from 1 on."""
+    """Option type: an integer of 1 or more."""
     try:
         value = int(text)
     except ValueError:
@@ -153,14 +153,14 @@ def count(text: str) -> int:
 
 
 def index(text: str) -> int:
-    """The type of an option that is a number from 0 on."""
+    """Option type: an integer of 0 or more."""
     if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
 
 
 def positive(text: str) -> float:
-    """The type of an option that is a finite number above 0."""
+    """Option type: a finite number above 0."""
     try:
         value = float(text)
     except ValueError:
@@ -170,71 +170,70 @@ def positive(text: str) -> float:
     return value
 
 
-# The options that several verbs have, each with its one help text.
+# Options of several commands, each with one help text.
 SHARED: dict[str, dict[str, Any]] = dict(
     [
-        option("run RUN", "the folder of a run"),
+        option("run RUN", "run folder"),
         option("runs RUN...", "folders of finished runs"),
-        option("--jobs N", "processes side by side (default: the CPU cores)", type=count),
-        option("--device DEVICE", "of models: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)"),
-        option("--methods METHOD...", "these alone (default: all)", default=[]),
-        option("--scenes SCENE...", "these alone, or patterns (default: all)", default=[]),
-        option("--protocols PROTOCOL...", "these alone (default: all that fit)", action="extend", default=[]),
+        option("--jobs N", "parallel processes (default: number of CPU cores)", type=count),
+        option("--device DEVICE", "device for models and matching: cpu, cuda or cuda:N (default: cpu)"),
+        option("--methods METHOD...", "methods to use (default: all)", default=[]),
+        option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
+        option("--protocols PROTOCOL...", "protocols to use (default: all that fit)", action="extend", default=[]),
         option(
             "--set KEY=VALUE...",
-            "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data/models",
+            "settings, such as opensu3d.top_m=10 or perception.models.folder=/data/models",
             action="extend",
             default=[],
         ),
-        option("--config FILE", "a TOML file of settings, such as the run.toml of a run"),
-        option("--run DIR", "run folder (default: the latest in runs/ with the scene)"),
-        option("--method METHOD", "whose maps (default: opensu3d)", default="opensu3d"),
+        option("--config FILE", "TOML file of settings, such as the run.toml of a run"),
+        option("--run DIR", "run folder (default: the latest in runs/ that has the scene)"),
+        option("--method METHOD", "method whose maps are used (default: opensu3d)", default="opensu3d"),
         option(
             "--format",
-            "of tables (default: text where they are printed, markdown in a file)",
+            "table format (default: text on stdout, markdown in files)",
             dest="table_format",
             choices=TABLE_FORMATS,
         ),
-        option("--seed N", "of everything random (default: 0)", type=index, default=0),
-        option("--limit N", "only the first N updates of each scene; marks it partial", type=int),
+        option("--seed N", "random seed (default: 0)", type=index, default=0),
+        option("--limit N", "use only the first N updates of each scene (marked partial)", type=int),
         option(
             "--profile PROFILE",
-            "who supplies perception: auto, embedded, oracle, stored, paper (default: auto; of a recipe its own)",
+            "perception backend: auto, embedded, oracle, stored or paper (default: auto)",
         ),
         option(
             "--solver",
-            "who answers questions: built-in (geometry alone, the default), or llm, a language model",
+            "how to answer questions: built-in (geometry) or llm (default: built-in)",
             choices=("built-in", "llm"),
         ),
-        option("--leave-out FILE", "without the questions that a CSV file lists by their id"),
+        option("--leave-out FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
-            "features of class names, for predictions that have features: .npz with names and features",
+            ".npz file with text features, for predictions with features",
         ),
         option(
             "--queries FILE",
-            "texts and their objects, for protocols without classes: .toml or .csv with scene, text and objects, files "
-            "of ScanRefer, Nr3D or OpenLex3D, or .txt with one text per line",
+            "file of queries (.toml, .csv, .txt, ScanRefer, Nr3D or OpenLex3D), for protocols without classes",
         ),
-        option("--executor WHERE", "inline, processes, ray or slurm (default: processes, inline for one job)"),
+        option("--executor WHERE", "where jobs run: inline, processes, ray or slurm (default: processes)"),
         option(
             "--ray-address ADDRESS",
-            "of a Ray cluster, or local to start one here (default: RAY_ADDRESS, or the one that runs here)",
+            "address of the Ray cluster, or local to start one (default: $RAY_ADDRESS)",
         ),
-        option("--gpus-per-job N", "that ray or slurm gives a scene, such as 0.5", type=float),
-        option("--retries N", "of a scene whose machine was lost (default: 2)", type=int),
-        option("--slurm KEY=VALUE...", "submitit's, such as slurm_partition=gpu timeout_min=60"),
-        option("--offline", "use stored replies of language models, ask nobody", action=argparse.BooleanOptionalAction),
-        option("--dry-run", "say what would be done and what it takes, and do nothing"),
+        option("--gpus-per-job N", "GPUs per scene (ray, slurm), such as 0.5", type=float),
+        option("--retries N", "retries of a scene after a lost worker (default: 2)", type=int),
+        option("--slurm KEY=VALUE...", "submitit options, such as slurm_partition=gpu timeout_min=60"),
+        option("--offline", "use only stored replies of language models", action=argparse.BooleanOptionalAction),
+        option("--dry-run", "show what would be done and what it takes, and exit"),
     ]
 )
-SHARED["--table-format"] = SHARED["--format"]  # where --format is of what is read
-# Where scenes run; docs/running/clusters.md has more on them.
+SHARED["--table-format"] = SHARED["--format"]  # where --format is an input format
+# Where scenes run; see docs/running/clusters.md.
 EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
 
 
 def open_map(arguments: argparse.Namespace, verb: str, text: str) -> tuple[RunFolder, JobFolder, Prediction]:
-    """The map of ``scene`` by ``--method`` in ``--run``; a ``ConfigError`` where scene and text are swapped."""
+    """The map of ``scene`` by ``--method`` in ``--run``; ``ConfigError`` if scene and text are swapped."""
     import shlex
 
     from su3d_bench.runs.finished import map_of_scene
@@ -243,12 +242,12 @@ def open_map(arguments: argparse.Namespace, verb: str, text: str) -> tuple[RunFo
     scene = arguments.scene
     if not looks_like_scene(scene) and looks_like_scene(text):
         command = shlex.join(["su3d-bench", "query", verb, text, scene])
-        raise ConfigError(f"'{scene}' is no scene: the scene comes first, then the text; {command}")
+        raise ConfigError(f"'{scene}' is not a scene; give the scene first, then the text: {command}")
     return map_of_scene(scene, arguments.method, arguments.run)
 
 
 def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
-    """What ``--set`` says of perception, and ``--device`` where the verb has it."""
+    """The perception settings of ``--set`` and ``--device``."""
     from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
     from su3d_bench.perception.profiles import PerceptionConfig
 
@@ -259,16 +258,16 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
 
 
 def add_language_options(parser: Parser, default: str = "the paper's gpt-4-1106-preview") -> None:
-    """The options of verbs that ask a language model: which, where, at what price."""
+    """Add the options of commands that use a language model."""
     parser.option("--model NAME", f"language model (default: {default})")
-    parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)")
+    parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI)")
     parser.shared("--config", "--set", "--dry-run")
     parser.option("--offline", SHARED["--offline"]["help"])
-    parser.option("--ask-failed-again", "ask again what an earlier command failed to get")
+    parser.option("--ask-failed-again", "repeat requests that failed in an earlier command")
 
 
 def given_language_option(arguments: argparse.Namespace) -> str | None:
-    """The first option of ``add_language_options`` that was given."""
+    """The first option of ``add_language_options`` that was set, or None."""
     names = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
     return next((f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)), None)
 
@@ -276,10 +275,9 @@ def given_language_option(arguments: argparse.Namespace) -> str | None:
 def chat_client(
     arguments: argparse.Namespace, run: RunFolder, text_model: str | None = None
 ) -> tuple[ChatClient, LanguageConfig]:
-    """The client whose replies are kept in the folder ``language`` of the run, and its settings.
+    """The client, which stores replies in the folder ``language`` of the run, and its settings.
 
-    Those of the file, then ``--set``, then the options; keys of other sections are left to other verbs. ``text_model``
-    is asked where none of them names a model.
+    Options override ``--set``, which overrides the file. ``text_model`` is the default model.
     """
     from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
     from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
@@ -289,24 +287,24 @@ def chat_client(
     assigned = read_assignments(arguments.set, (), ())
     for entry in assigned.entries:
         if entry.path[:2] != LANGUAGE:
-            raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE is of use here")
+            raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE can be set here")
     flags = [("text_model", "--model", arguments.model), ("base_url", "--base-url", arguments.base_url)]
     given = tuple(Setting((*LANGUAGE, key), value, flag) for key, flag, value in flags if value is not None)
     usual = () if text_model is None else (Setting((*LANGUAGE, "text_model"), text_model, "default"),)
     config = resolve(Settings(usual) + settings + assigned + Settings(given), LANGUAGE, LanguageConfig)
     store = ReplyStore(run.path / "language")
-    arguments.takes_up = True  # with every reply that is there
+    arguments.takes_up = True  # from the stored replies
     return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
 
 
 def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> None:
-    """Print what asking a language model all ``requests`` would cost, nothing without a client; the exit code."""
+    """Print the cost of sending all ``requests`` to a language model; zero without a client."""
     from su3d_bench.cli.output import answer_either
     from su3d_bench.perception.language.client import Estimate
 
     if client is None:
         nothing = Estimate(n_requests=0, n_stored=0, input_tokens=0, output_tokens=0, usd=0.0, models=())
-        answer_either(arguments, nothing.to_json(), "no model is asked: nothing to pay")
+        answer_either(arguments, nothing.to_json(), "no language model is used: no cost")
     else:
         estimate = client.estimate(requests)
         answer_either(arguments, estimate.to_json(), estimate.line())

@@ -1,4 +1,4 @@
-"""What verbs print: answers on stdout and in files, remarks and progress on stderr."""
+"""Output of commands: results on stdout and in files, warnings and progress on stderr."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Prose, Table
     from su3d_bench.runs.executors import Event, Report
 
-MOST_UNSEEN = 8  # words that are named
-WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: a terminal with room for a long bar, and both bars
-MOST_OF_A_BAR = 80  # characters of its words
+MOST_UNSEEN = 8  # words that are listed
+WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
+MOST_OF_A_BAR = 80  # characters of the label
 
 
 def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
-    """The tables in the form of ``--format``; ``is_file`` where they are not printed."""
+    """The tables in the format of ``--format``; ``is_file`` if they are written to a file."""
     from su3d_bench.reports.tables.formats import FORMATS, plain
 
     form = arguments.table_format or ("markdown" if is_file else "text")
@@ -35,17 +35,17 @@ def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, 
 
 
 def answer(*lines: str) -> None:
-    """Print an answer to stdout, a line each, whatever stands in them."""
+    """Print lines to stdout, with control characters escaped."""
     print("\n".join(map(one_line, lines)))
 
 
 def answer_document(text: str) -> None:
-    """Print to stdout what is of several lines by its form, which lets none of a name's through, such as a table."""
+    """Print a multi-line document, such as a table, to stdout."""
     answer(*text.rstrip("\n").split("\n"))
 
 
 def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
-    """Print or write ``value`` where ``--json`` asks for it; whether it stands in place of the words."""
+    """Print or write ``value`` as JSON if ``--json`` is set; returns whether it replaces the text."""
     text = escaped_json(_defined(value), indent=2, allow_nan=False)
     if arguments.json_file is not None:
         path = written(arguments.json_file, f"{text}\n")
@@ -56,7 +56,7 @@ def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
 
 
 def _defined(value: Any) -> Any:
-    """``value`` with null for a number that is none, which JSON does not know."""
+    """``value`` with null for NaN and infinity, which JSON does not have."""
     if isinstance(value, dict):
         return {name: _defined(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -65,30 +65,30 @@ def _defined(value: Any) -> Any:
 
 
 def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:
-    """Print ``value`` where ``--json`` asks for it, else ``lines``."""
+    """Print ``value`` with ``--json``, else ``lines``."""
     if not answer_json(arguments, value):
         answer(*lines)
 
 
 def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
-    """Print ``value`` where ``--json`` asks for it, else the tables."""
+    """Print ``value`` with ``--json``, else the tables."""
     if not answer_json(arguments, value):
         answer_document(formatted(parts, arguments))
 
 
 def show() -> None:
-    """Have what was answered so far shown, before something that takes its time."""
+    """Flush stdout before something slow."""
     sys.stdout.flush()
 
 
 def answer_commands(lines: Sequence[str]) -> None:
-    """Print commands to the machine that runs the job, which escape what they quote."""
+    """Print workflow commands, whose text is already escaped."""
     for line in lines:
         sys.stdout.write_command(line) if isinstance(sys.stdout, Door) else print(line)
 
 
 def written(path: Path, text: str) -> Path:
-    """Write ``text`` to a file that a flag named, with its folder; its path."""
+    """Write ``text`` to the file of an option, creating its folder; returns the path."""
     from su3d_bench.core.files.atomic import make_folder, write_text
     from su3d_bench.store.run_folder import refuse_records
 
@@ -99,7 +99,7 @@ def written(path: Path, text: str) -> Path:
 
 
 def answer_or_write(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
-    """Write the tables to the file of ``--out``, or give them as ``answer_tables`` does."""
+    """Write the tables to the file of ``--out``, or print them as ``answer_tables`` does."""
     if arguments.out is None:
         answer_tables(arguments, value, parts)
     else:
@@ -109,7 +109,7 @@ def answer_or_write(arguments: argparse.Namespace, value: Any, parts: Sequence[T
 
 
 def file_name_of(text: str, kind: Literal["text", "question"]) -> str:
-    """What a picture of the answer to ``text`` is called; no two texts of a kind have one name.
+    """The file name for a picture of the answer to ``text``; unique per text and kind.
 
     >>> file_name_of("plant on shelf", "text"), file_name_of("Where is it?", "question")
     ('plant-on-shelf', 'where-is-it')
@@ -123,7 +123,7 @@ def file_name_of(text: str, kind: Literal["text", "question"]) -> str:
 
 
 def file_name_of_scene(address: str) -> str:
-    """What a picture of a scene is called; no two addresses have one name.
+    """The file name for a picture of a scene; unique per address.
 
     >>> file_name_of_scene("replica/room0"), file_name_of_scene("mine/hall/left")
     ('replica-room0', 'mine-hall-left-f6ee616f')
@@ -140,26 +140,26 @@ def _few_digits(text: str) -> str:
 
 
 def remark(*lines: str, quiet: bool = False) -> None:
-    """Print remarks to stderr, a line each."""
+    """Print lines to stderr."""
     for line in () if quiet else lines:
         print(one_line(line), file=sys.stderr)
 
 
 def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
-    """Say which words of ``text`` the encoder never saw, where it knows that."""
+    """Warn about words of ``text`` that the encoder was not trained on, if it knows."""
     from su3d_bench.core.interfaces import KnowsItsWords
 
     if isinstance(encoder, KnowsItsWords) and (words := encoder.unseen_words(text)):
         named = ", ".join(f"'{printable(word, 40)}'" for word in words[:MOST_UNSEEN])
         more = f" and {len(words) - MOST_UNSEEN} more" if len(words) > MOST_UNSEEN else ""
-        remark(f"encoder {encoder.name} never saw {named}{more}; what it makes of that is a guess", quiet=quiet)
+        remark(f"encoder {encoder.name} was not trained on {named}{more}; results are unreliable", quiet=quiet)
 
 
 @contextmanager
 def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[Report]:
-    """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal.
+    """A ``Report`` that draws progress bars while the block runs, if stderr is a terminal.
 
-    ``last_step`` is what a scene does after its last frame, where no event says it.
+    ``last_step`` labels what happens after the last frame of a scene.
     """
     with drawn_bars(is_quiet=is_quiet) as bars:
         yield _Board(bars, n_scenes, last_step).report if bars is not None else lambda event: None
@@ -167,7 +167,7 @@ def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[
 
 @contextmanager
 def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Progress | None]:
-    """Bars on stderr while the block runs, each with a field ``remark``; None where stderr is no terminal."""
+    """Progress bars on stderr, each with a field ``remark``; None if stderr is not a terminal."""
     if is_quiet or not sys.stderr.isatty():
         yield None
         return
@@ -186,14 +186,14 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
     from rich.text import Text
 
     class Description(ProgressColumn):
-        """The words of a bar, which hold names of scenes and methods: no markup, nothing that acts on a terminal."""
+        """The label of a bar, without markup or control characters."""
 
         def render(self, task: Task) -> Text:
             return Text(one_line(task.description)[:MOST_OF_A_BAR], no_wrap=True, overflow="ellipsis")
 
     console = Console(file=stream_behind(sys.stderr))
     remarks = TextColumn("{task.fields[remark]}", markup=False)
-    # Where the terminal is narrow, names give way alone: only their column may be folded.
+    # In a narrow terminal only the column of names may be folded.
     time = (TimeRemainingColumn if tells_time_left else TimeElapsedColumn)(table_column=Column(no_wrap=True))
     width = BAR if console.width >= WIDE else NARROW_BAR
     bar = BarColumn(bar_width=width, table_column=Column(width=width))
@@ -204,7 +204,7 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
 
 
 def _above(bars: Progress) -> AbstractContextManager[None]:
-    """What is printed to stderr in the block stands above the bars."""
+    """Print lines to stderr above the bars."""
     from rich.text import Text
 
     def show(text: str) -> None:
@@ -215,7 +215,7 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
 
 @contextmanager
 def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[int], None], Report]]:
-    """Progress over the steps of all units: a function that takes their number, and a ``Report``.
+    """Progress over the steps of all units: a function to set their number, and a ``Report``.
 
     On a terminal it is one bar with the time left, elsewhere one line per unit that is done.
     """
@@ -244,7 +244,7 @@ def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[i
 
 
 class _Board:
-    """Turns events into bars: one for all scenes, one for the current method of each scene under way."""
+    """Turns events into bars: one for all scenes, one for the current method of each running scene."""
 
     def __init__(self, bars: Progress, n_scenes: int, last_step: str) -> None:
         self._bars = bars
@@ -274,7 +274,7 @@ class _Board:
             self._bars.update(task, remark=event.doing or (is_last and self._last_step) or self._remark(event))
 
     def _remove(self, unit: str) -> None:
-        """The bars of a scene that is done, or whose next method begins."""
+        """Remove the bars of a scene that is done or starts its next method."""
         for key in [key for key in self._tasks if key[0] == unit]:
             self._bars.remove_task(self._tasks.pop(key))
 

@@ -1,4 +1,4 @@
-"""``su3d-bench protocols``: the evaluations, every rule of one, how two differ, the texts that one compares with."""
+"""``su3d-bench protocols``: list protocols, show rules, compare two, encode texts, or create your own."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List the protocols, show the rules of one, compare the rules of two, or write one of your own.
+    """List protocols, show their rules, compare two, or create your own.
 
     su3d-bench protocols show rooms-semantic
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
@@ -29,28 +29,28 @@ def add_parser(verbs: Verbs) -> None:
     actions = add_group(verbs, "protocols", add_parser, lists=True)
     add_verb(actions, "list", call_list)
     parser = add_verb(actions, "show", call_show)
-    parser.option("name PROTOCOL", "its name, or a .toml file of the same form")
-    parser.option("--names", "the texts, one a line, to encode elsewhere")
+    parser.option("name PROTOCOL", "protocol, or .toml file")
+    parser.option("--names", "print the texts, one per line")
     parser.shared("--queries")
     parser = add_verb(actions, "diff", call_diff)
-    parser.option("name A", "a protocol's name, or a .toml file of the same form")
-    parser.option("other B", "the protocol that it is compared with")
+    parser.option("name A", "protocol, or .toml file")
+    parser.option("other B", "protocol to compare with")
     parser.option(
         "--prediction RUN[:METHOD]",
-        "score it under every choice of the rules, and split the difference of its numbers among them",
+        "attribute the difference of its scores to the rules",
     )
-    parser.option("--out PNG", "with --prediction: draw the steps to this file")
+    parser.option("--out PNG", "plot of the steps (with --prediction)")
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
-    parser.option("--protocol P", "whose texts; a name, or a .toml file", required=True)
-    parser.option("--encoder E", "what encodes them, a name of su3d-bench models list (default: the protocol's)")
+    parser.option("--protocol P", "protocol, or .toml file", required=True)
+    parser.option("--encoder E", "encoder from models list (default: that of the protocol)")
     parser.shared("--queries", "--device", "--set")
-    parser.option("--out FILE", "where names and features go", required=True)
+    parser.option("--out FILE", ".npz file to write", required=True)
     add_new(actions, "protocol")
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List the protocols and whose evaluations they repeat.
+    """List the protocols and the evaluations that they reproduce.
 
     su3d-bench protocols list
     su3d-bench protocols list --json
@@ -71,7 +71,7 @@ def call_list(arguments: argparse.Namespace) -> None:
 
 
 def call_show(arguments: argparse.Namespace) -> None:
-    """Print every rule of a protocol with its source, or the texts that features are compared with.
+    """Show every rule of a protocol with its source.
 
     su3d-bench protocols show rooms-semantic
     su3d-bench protocols show rooms-semantic --names
@@ -84,7 +84,7 @@ def call_show(arguments: argparse.Namespace) -> None:
         _answer_names(arguments, rules)
         return
     if arguments.queries is not None:
-        raise ConfigError("protocols show: --queries belongs to --names")
+        raise ConfigError("protocols show: --queries needs --names")
     stated = original_of(arguments.name)
     value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
     facts = {"original": "not said"} if stated is None else stated.facts
@@ -98,7 +98,7 @@ def _plain(stated: Stated | None) -> dict[str, Any] | None:
 
 
 def call_diff(arguments: argparse.Namespace) -> None:
-    """Print the rules in which two protocols differ, and with --prediction what each does to the numbers.
+    """Show the rules in which two protocols differ, and with --prediction the effect of each.
 
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png
@@ -108,7 +108,7 @@ def call_diff(arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.tables.comparison import rules_tables
 
     if arguments.out is not None and arguments.prediction is None:
-        raise ConfigError("protocols diff: --out draws the steps of a --prediction; name one")
+        raise ConfigError("protocols diff: --out needs --prediction")
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
     apart = rules_apart(first, second)
     if arguments.prediction is not None:
@@ -121,7 +121,7 @@ def call_diff(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         from su3d_bench.reports.pictures.plots import draw_walk
 
-        show()  # the plot takes longer than the answer
+        show()  # the plot is slower than the tables
         draw_walk(value, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
@@ -136,7 +136,7 @@ def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:
 
 
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
-    """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
+    """One line per rule, followed by the comment of the file that sets it."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.fitness import labels_taken
     from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
@@ -159,11 +159,11 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     return lines
 
 
-FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they speak of
+FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries and their objects
 
 
 def call_texts(arguments: argparse.Namespace) -> None:
-    """Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.
+    """Encode the class names or queries of a protocol, for evaluate --text-features.
 
     su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz
     su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz
@@ -175,7 +175,7 @@ def call_texts(arguments: argparse.Namespace) -> None:
 
     out: Path = arguments.out
     if out.suffix != ".npz":
-        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in .npz")
+        raise ConfigError(f"protocols texts: --out {shown(out)}: expected a file that ends in .npz")
     rules = load_protocol(arguments.protocol)
     named = named_texts(rules, arguments.queries)
     name = _encoder_name(arguments.encoder, rules.name, rules.encoder)
@@ -195,7 +195,7 @@ def call_texts(arguments: argparse.Namespace) -> None:
 
 
 def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> str:
-    """The model's short name of the encoder that is asked for, else of the protocol's own."""
+    """The name of the requested encoder, or of that of the protocol."""
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
     from su3d_bench.perception.models.config import EMBEDDED
@@ -204,7 +204,7 @@ def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> s
     asked = said or of_protocol
     if asked is None:
         listed = ", ".join(known)
-        raise ConfigError(f"protocols texts: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
+        raise ConfigError(f"protocols texts: protocol '{protocol}' has no encoder; choose one with --encoder: {listed}")
     if asked in (*known, EmbeddedEncoder.name):
         return asked if asked in known else EMBEDDED
     if (entry := encoder_known_as(asked)) is not None:

@@ -1,4 +1,4 @@
-"""``su3d-bench query text`` and ``query ask``: the map of a scene searched for a text, and asked a question."""
+"""``su3d-bench query text`` and ``query ask``: search a map for a text, or ask it a question."""
 
 from __future__ import annotations
 
@@ -22,46 +22,46 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    """Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.
+    """Search a map for a text, ask it questions, or work with question sets.
 
     su3d-bench query text rooms/living0 "plant on shelf"
     su3d-bench query show paper
     """
     actions = add_group(verbs, "query", add_parser)
     parser = add_verb(actions, "text", call_text)
-    parser.option("scene", "the scene's address, such as rooms/living0")
-    parser.option("text", "what to look for")
+    parser.option("scene", "scene, such as rooms/living0")
+    parser.option("text", "text to search for")
     parser.shared("--run", "--method")
-    parser.option("--top N", "how many instances to list (default: 10)", type=count, default=10)
+    parser.option("--top N", "number of instances to list (default: 10)", type=count, default=10)
     parser.shared("--device")
-    parser.option("--out FILE", "where the picture goes (default: beside the map)")
+    parser.option("--out FILE", "picture to write (default: next to the map)")
     parser = add_verb(actions, "ask", call_ask)
-    parser.option("scene", "the scene's address, such as rooms/living0")
-    parser.option("question", "the question, in English")
+    parser.option("scene", "scene, such as rooms/living0")
+    parser.option("question", "question in English")
     parser.shared("--run", "--method")
     parser.option(
-        "--solver", "who answers: geometry alone, or a language model", choices=("built-in", "llm"), default="built-in"
+        "--solver", "built-in (geometry) or llm (a language model)", choices=("built-in", "llm"), default="built-in"
     )
     parser.option(
         "--names",
-        "the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
+        "labels n, or n' of runs refine (default: n' if available)",
         choices=("auto", "label", "refined"),
         default="auto",
     )
     parser.option(
         "--eye",
-        "where one stands for left and right, in metres (default: the middle of the map)",
+        "viewpoint for left and right, in metres (default: centre of the map)",
         nargs=3,
         type=float,
         metavar=("X", "Y", "Z"),
     )
-    parser.option("--out FILE", "where the picture goes (default: beside the map)")
+    parser.option("--out FILE", "picture to write (default: next to the map)")
     options.add_language_options(parser)
     questions.add_parser(actions)
 
 
 def call_text(arguments: argparse.Namespace) -> None:
-    """Rank the instances of a scene's map by their similarity to a text and draw the heat map.
+    """Rank the instances of a map by similarity to a text, and draw a heat map.
 
     su3d-bench query text rooms/living0 "plant on shelf"
     su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json
@@ -72,11 +72,11 @@ def call_text(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.finished import encoder_of
 
     if not arguments.text.strip():
-        raise ConfigError('the text is empty; say what to look for: su3d-bench query text rooms/living0 "a plant"')
+        raise ConfigError('the text is empty; use for example: su3d-bench query text rooms/living0 "a plant"')
     run, job, prediction = options.open_map(arguments, "text", arguments.text)
     if not isinstance(prediction, Instances):
-        what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
-        raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
+        what = "one feature per point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
+        raise PredictionError(f"{job.prediction}: has {what}, so nothing can be ranked; choose another --method")
     encoder = encoder_of(run, arguments.device or "cpu")
     ranking = rank(prediction, arguments.text, encoder)
     rows: list[dict[str, Any]] = [
@@ -98,7 +98,7 @@ def call_text(arguments: argparse.Namespace) -> None:
             place = "".join(f"{value:7.2f}" for value in row["centroid"])
             scored = f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}"
             output.answer(f"{scored}  {place:<22}  {row['name']}")
-        output.show()  # the picture takes longer than the answer
+        output.show()  # the picture is slower than the answer
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
     draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
@@ -107,7 +107,7 @@ def call_text(arguments: argparse.Namespace) -> None:
 
 
 def call_ask(arguments: argparse.Namespace) -> None:
-    """Answer a question about a scene from its map: by geometry, or by a language model.
+    """Answer a question about a scene from its map, by geometry or a language model.
 
     su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
     su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run
@@ -117,11 +117,11 @@ def call_ask(arguments: argparse.Namespace) -> None:
 
     if not arguments.question.strip():
         raise ConfigError(
-            'the question is empty; ask such as: su3d-bench query ask rooms/living0 "How many lamps are there?"'
+            'the question is empty; use for example: su3d-bench query ask rooms/living0 "How many lamps are there?"'
         )
     run, job, instances = options.open_map(arguments, "ask", arguments.question)
     if not isinstance(instances, Instances):
-        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
+        raise PredictionError(f"{job.prediction}: has no instances, so questions cannot be answered")
     refined, note = _refined(job, arguments.names)
     scene = map_of(instances, refined)
     if arguments.dry_run:
@@ -131,7 +131,7 @@ def call_ask(arguments: argparse.Namespace) -> None:
     if not arguments.json:
         output.answer(reply.text)
         remark(*reply.notes, f"names: {note}", quiet=arguments.quiet)
-        output.show()  # the picture takes longer than the answer
+        output.show()  # the picture is slower than the answer
     picture = _draw_ask(instances, scene, reply, job, arguments)
     value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
     value |= {"names": note, "picture": None if picture is None else str(picture)}
@@ -140,16 +140,16 @@ def call_ask(arguments: argparse.Namespace) -> None:
 
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
-    """Labels n' where they are wanted and there, and which names these are."""
+    """The scene with labels n or n', and a note on which."""
     from su3d_bench.questions.refining import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:
         if wanted == "refined":
-            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench runs refine")
+            raise StoreError(f"{job.path}: no labels n'; create them with su3d-bench runs refine")
         return None, "labels n"
     n_left_out = sum(bool(name.left_out) for name in records.names)
-    without = f", without {n_left_out} that it leaves out" if n_left_out else ""
+    without = f", without {n_left_out} excluded instances" if n_left_out else ""
     return records.refined, f"labels n' by {records.model or 'vote'}{without}"
 
 
@@ -174,17 +174,17 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
         return LanguageSolver(scene, *options.chat_client(arguments, run)).answer(arguments.question)
     eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
     if eye is not None and not np.isfinite(eye).all():
-        raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")
-    unnamed: dict[str, None] = {}  # nouns by which the map calls nothing, each once
+        raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers (metres)")
+    unnamed: dict[str, None] = {}  # nouns that are not names of the map, each once
 
     def nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
         unnamed[noun] = None
         return nearest_by(encoder)(noun, names)
 
-    encoder = EmbeddedEncoder()  # whose files are read only where a name is looked for
+    encoder = EmbeddedEncoder()  # its files are read only if a name is looked up
     reply = Solver(scene, eye, nearest_name).answer(arguments.question)
     asked = arguments.question.split()
-    for noun in unnamed or asked[: len(asked) == 1]:  # of one word there is no question, only a noun
+    for noun in unnamed or asked[: len(asked) == 1]:  # a single word is a noun, not a question
         output.remark_unseen(encoder, noun, quiet=arguments.quiet)
     return reply
 
@@ -192,12 +192,12 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
 def _draw_ask(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
-    """Draw the answer; None where it names no object."""
+    """Draw the answer; None if it names no object."""
     from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:
-            remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
+            remark(f"{arguments.out}: not drawn, because the answer names no object", quiet=arguments.quiet)
         return None
     picture: Path = arguments.out or job.picture(f"ask-{output.file_name_of(arguments.question, 'question')}.png")
     rows = [tuple(scene.by_id(object_id).row for object_id in ids) for ids in (reply.object_ids, reply.reference_ids)]

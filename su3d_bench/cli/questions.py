@@ -1,4 +1,4 @@
-"""``su3d-bench query make|show|audit|score``: sets of questions with known answers."""
+"""``su3d-bench query make|show|audit|score``: question sets with known answers."""
 
 from __future__ import annotations
 
@@ -26,46 +26,44 @@ MOST_CHARACTERS = 80
 
 
 def add_parser(verbs: Verbs) -> None:
-    scenes = "--scenes SCENE...", "addresses or patterns, such as 'rooms/*'"
+    scenes = "--scenes SCENE...", "scenes or patterns, such as 'rooms/*'"
     parser = add_verb(verbs, "make", _make)
     parser.option(*scenes, required=True)
-    parser.option("--out FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
-    parser.option(
-        "--per-kind N", "at most N questions of each kind and scene, or objects of a scene (default: all)", type=count
-    )
+    parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", required=True)
+    parser.option("--per-kind N", "maximum number of questions per kind and scene (default: all)", type=count)
     parser.option(
         "--source",
-        "auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
+        "auto (from the dataset if it has questions) or generated (default: auto)",
         default=SOURCES[0],
         choices=SOURCES,
     )
     parser.shared("--leave-out")
     parser.option(
         "--form",
-        "own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
+        "own query sets, or Beacon3D's metadata_*.json (default: own)",
         default=FORMS[0],
         choices=FORMS,
     )
     parser = add_verb(verbs, "show", _show)
-    parser.option("file FILE", "a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'", type=str)
+    parser.option("file FILE", "question set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or paper", type=str)
     parser = add_verb(verbs, "audit", _audit)
     parser.option(*scenes)
-    parser.option("--out DIR", "where page, pictures and table go")
-    parser.option("--n N", "so many questions (default: 200)", type=count, default=200)
+    parser.option("--out DIR", "folder for page, pictures and table")
+    parser.option("--n N", "number of questions (default: 200)", type=count, default=200)
     parser.shared("--seed")
-    parser.option("--kinds KIND...", "these alone, such as retrieval, property, 'what on'", default=[])
-    parser.option("--score FILE", "add up the verdicts in this audit.csv instead")
+    parser.option("--kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[])
+    parser.option("--score FILE", "summarise the verdicts in this audit.csv")
     parser.shared("--format")
     parser = add_verb(verbs, "score", _score)
-    parser.option("file FILE", "a metadata_*.json of Beacon3D")
-    parser.option("--answers FILE", "JSON with what a system answered, in Beacon3D's order", required=True)
-    parser.option("--judge", "let a language model score the answers that match no right one")
+    parser.option("file FILE", "metadata_*.json of Beacon3D")
+    parser.option("--answers FILE", "JSON file of answers, in Beacon3D's order", required=True)
+    parser.option("--judge", "score unmatched free-form answers with an LLM judge")
     options.add_language_options(parser, JUDGE_MODEL)
     parser.shared("--format")
 
 
 def _make(arguments: argparse.Namespace) -> None:
-    """Make a set of questions with known answers from the ground truth of scenes.
+    """Generate a question set with known answers from the ground truth of scenes.
 
     su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml
     su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json
@@ -83,20 +81,22 @@ def _make(arguments: argparse.Namespace) -> None:
 
 
 def _make_beacon3d(arguments: argparse.Namespace) -> None:
-    """Write one of Beacon3D's metadata files over objects of the scenes."""
+    """Write a metadata file of Beacon3D about objects of the scenes."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
-        raise ConfigError("query make: --leave-out and --source belong to --form own")
+        raise ConfigError("query make: --leave-out and --source need --form own")
     if arguments.out.suffix != ".json":
-        raise ConfigError(f"query make: --form {arguments.form} is written as JSON; name --out FILE.json")
+        raise ConfigError(f"query make: --form {arguments.form} writes JSON; use --out FILE.json")
     objects = {}
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         if scene in objects:
-            raise ConfigError(f"query make: two datasets have a scene '{scene}', and the form has scenes by name")
+            raise ConfigError(
+                f"query make: two datasets have a scene '{scene}', but this form identifies scenes by name"
+            )
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
     content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.form) - 1]
@@ -118,14 +118,14 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
         found = questions_of(dataset, scene, own=arguments.source == "auto")
         kept = [question for question in found if question.id not in left_out]
         questions = chosen(kept, arguments.per_kind)
-        without = f", {len(found) - len(kept)} left out" if left_out else ""
+        without = f", {len(found) - len(kept)} excluded" if left_out else ""
         remark(f"{dataset.name}/{scene}: {counted(len(questions), 'question')}{without}", quiet=arguments.quiet)
         made += questions
     return made
 
 
 def _show(arguments: argparse.Namespace) -> None:
-    """Show a set of questions: how many of each kind, and the first of them.
+    """Show a question set: counts by kind, and the first questions.
 
     su3d-bench query show queries.toml
     su3d-bench query show paper --json
@@ -150,20 +150,20 @@ def _line(question: Question) -> str:
 
 
 def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
-    """How many of each kind, as JSON has it and in words."""
+    """The counts by kind, as JSON and as text."""
     counts = Counter(question.kind for question in questions)
     n_known = sum(question.is_known for question in questions)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     on = counted(len({question.scene for question in questions}), "scene")
     text = f"{counted(len(questions), 'question')} on {on} ({kinds}); {n_known} with known answers"
     if n_replies := sum(bool(question.reply) for question in questions):
-        text += f", {n_replies} with one in words"
+        text += f", {n_replies} with a free-form answer"
     content = {"n": len(questions), "n_known": n_known, "n_replies": n_replies, "kinds": dict(counts)}
     return content, text
 
 
 def _audit(arguments: argparse.Namespace) -> None:
-    """Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.
+    """Sample questions with pictures for a manual audit, or summarise its verdicts.
 
     su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit
     su3d-bench query audit --score audit/audit.csv
@@ -187,7 +187,7 @@ def _audit(arguments: argparse.Namespace) -> None:
         every += of_scene
     drawn = sample(of_kinds(every, arguments.kinds), arguments.n, arguments.seed)
     if not drawn:
-        raise DataError("query audit: nothing can be asked of these scenes")
+        raise DataError("query audit: these scenes give no questions")
     places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
     page = make_audit(
         drawn, places.__getitem__, arguments.out, lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet)
@@ -196,14 +196,14 @@ def _audit(arguments: argparse.Namespace) -> None:
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     lines = (
         f"{counted(len(drawn), 'question')} ({kinds})",
-        f"look at {page}, write right, arguable or wrong into audit.csv, then: "
+        f"open {page}, enter right, arguable or wrong into audit.csv, then: "
         f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
     output.answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
 
 
 def _score(arguments: argparse.Namespace) -> None:
-    """Score answers to the questions of a metadata_*.json of Beacon3D.
+    """Score answers to questions of Beacon3D.
 
     su3d-bench query score metadata_qa.json --answers answers.json
     su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run
@@ -221,6 +221,6 @@ def _score(arguments: argparse.Namespace) -> None:
             return
         judge = partial(beacon3d.judged, model=client, config=config)
     elif flag := options.given_language_option(arguments):
-        raise ConfigError(f"query score: {flag} belongs to --judge")
+        raise ConfigError(f"query score: {flag} needs --judge")
     answered = beacon3d.answered_file(arguments.file, arguments.answers, judge)
     output.answer_tables(arguments, beacon3d.answered_json(answered), [beacon3d.answered_table(answered)])

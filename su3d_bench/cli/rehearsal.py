@@ -1,4 +1,4 @@
-"""A rehearsal: the recipe's runs on rooms made in the layouts of its datasets."""
+"""Rehearsal: the runs of a recipe on synthetic rooms in the layouts of its datasets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DATA = "data"
 def rehearsed(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> Asked:
-    """``asked`` of rooms below ``out/data``, made where they are not there yet."""
+    """``asked`` for rooms in ``out/data``, generated if missing."""
     asked = _perceived(recipe, asked, arguments)
     rooms = tuple(arguments.rooms or recipe.rehearsal.rooms)
     settings = tuple(arguments.room_settings or recipe.rehearsal.settings)
@@ -31,7 +31,7 @@ def rehearsed(
     unknown = [name for name in datasets if name not in LAYOUTS and name != "rooms"]
     if unknown:
         raise ConfigError(
-            f"--rehearse: no room can be made in the layout of {some(unknown, 3)}; there are {some([*LAYOUTS], 9)}"
+            f"--rehearse: rooms cannot be generated in the layout of {some(unknown, 3)}; known: {some([*LAYOUTS], 9)}"
         )
     scenes: dict[str, tuple[str, ...]] = {}
     data = out / DATA
@@ -50,14 +50,14 @@ def rehearsed(
 
 
 def places(out: Path) -> dict[str, str]:
-    """Variables of the environment under which a rehearsal into ``out`` finds its data."""
+    """Environment variables with which a rehearsal in ``out`` finds its data."""
     return {"SU3D_DATA": str((out / DATA).absolute())}
 
 
 def _perceived(recipe: Recipe, asked: Asked, arguments: argparse.Namespace) -> Asked:
-    """``asked`` with the profile that is rehearsed, which the first line says."""
+    """``asked`` with the profile of the rehearsal, which is printed."""
     profile = asked.profile or recipe.rehearsal.profile
     if profile == recipe.profile:
         return replace(asked, profile=profile)
-    remark(f"rehearsal: the profile '{profile}' in place of '{recipe.profile}'", quiet=arguments.quiet)
+    remark(f"rehearsal: profile '{profile}' instead of '{recipe.profile}'", quiet=arguments.quiet)
     return replace(asked, profile=profile, encoder=asked.encoder or EMBEDDED)

@@ -1,4 +1,4 @@
-"""``su3d-bench report``: what is made from finished runs; pages and archives in ``report_files``."""
+"""``su3d-bench report``: tables and plots of finished runs; pages and archives are in ``report_files``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
 def add_parser(verbs: Verbs) -> None:
-    """Make tables, pages and archives from finished runs, and check a paper against them.
+    """Create tables, pages and archives from finished runs, and verify published tables.
 
     su3d-bench report tables runs/my-run --format latex --table II
     su3d-bench report verify paper.tex
@@ -36,30 +36,28 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_tables(verbs: Verbs) -> None:
     parser = add_verb(verbs, "tables", call_tables)
-    parser.option("runs RUN...", "folders of finished runs, or of what sheets score wrote")
+    parser.option("runs RUN...", "run folders, or folders written by sheets score")
     parser.shared("--format")
-    parser.option(
-        "--table ...", "of the paper, or its reasoning scores (default: none)", choices=PAPER_TABLES, default=[]
-    )
+    parser.option("--table ...", "tables of the paper (default: none)", choices=PAPER_TABLES, default=[])
     for name, what in (
-        ("methods", "these rows, in this order, alone (default: all)"),
-        ("datasets", "scenes of these alone (default: all)"),
-        ("protocols", "under these alone (default: all)"),
-        ("metrics", "these columns (default: the headline ones)"),
+        ("methods", "methods to show, in this order (default: all)"),
+        ("datasets", "datasets to show (default: all)"),
+        ("protocols", "protocols to show (default: all)"),
+        ("metrics", "metrics to show (default: the headline metrics)"),
     ):
         parser.option(f"--{name} {name[:-1].upper()}...", what, default=[])
-    parser.option("--intervals", "show the 95 %% interval over scenes")
-    parser.option("--truth-scores", "show what the truth itself scores")
-    parser.option("--scenes-count", "show the number of scenes even where none is missing")
-    parser.option("--significant", "mark the best only where it differs from the second (p < 0.05)")
+    parser.option("--intervals", "show 95 %% confidence intervals over scenes")
+    parser.option("--truth-scores", "show the ground-truth ceiling")
+    parser.option("--scenes-count", "always show the number of scenes")
+    parser.option("--significant", "mark the best only if significantly better (p < 0.05)")
     parser.option(
-        "--published", "show what papers report beneath (default: with --table)", action=argparse.BooleanOptionalAction
+        "--published", "show published results (default: with --table)", action=argparse.BooleanOptionalAction
     )
-    parser.option("--out FILE", "write there instead of printing")
+    parser.option("--out FILE", "file to write (default: print)")
 
 
 def call_tables(arguments: argparse.Namespace) -> None:
-    """Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.
+    """Create tables from runs: tables of the OpenSU3D paper, or one per protocol.
 
     su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex
     su3d-bench report tables runs/my-run scores --table IV V --intervals
@@ -99,14 +97,14 @@ def _add_timing(verbs: Verbs) -> None:
     parser = add_verb(verbs, "timing", call_timing)
     parser.shared("runs")
     parser.shared("--methods")
-    parser.option("--warm-up N", "first updates of a scene that stand apart (default: 3)", type=index, default=3)
-    parser.option("--camera-rate HZ", "frames a second of the camera (default: 30)", type=positive, default=30.0)
-    parser.option("--out DIR", "write timing.md, timing.csv, methods.csv and the plots there")
+    parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
+    parser.option("--camera-rate HZ", "frame rate of the camera (default: 30)", type=positive, default=30.0)
+    parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots")
     parser.shared("--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> None:
-    """Say what an update costs, stage by stage, and whether it grows with the map.
+    """Report the time per update and stage, and whether it grows with the map.
 
     su3d-bench report timing runs/demo
     su3d-bench report timing runs/a runs/b --out timing --camera-rate 20
@@ -124,8 +122,8 @@ def call_timing(arguments: argparse.Namespace) -> None:
     times = [each for each in timed if each]
     if not times:
         are_elsewhere = any(run.made_elsewhere for run in runs)
-        why = "predictions made elsewhere bring no times" if are_elsewhere else "their methods look at no frame"
-        raise ConfigError(f"no update was timed in these runs: {why}")
+        why = "imported predictions have no timings" if are_elsewhere else "their methods process no frames"
+        raise ConfigError(f"no timings in these runs: {why}")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.record.hardware for run in runs}
@@ -134,7 +132,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
     output.answer_tables(arguments, value, tables)
     if arguments.out is None:
         return
-    output.show()  # the plots take longer than the tables
+    output.show()  # the plots are slower than the tables
     make_folder(arguments.out)
     write_text(arguments.out / "timing.md", markdown(tables))
     write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
@@ -151,14 +149,14 @@ def _add_samples(verbs: Verbs) -> None:
     parser = add_verb(verbs, "samples", call_samples)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
-    parser.option("--format", "of the rows (default: parquet where --out ends so, else csv)", choices=FORMATS)
-    parser.option("--out FILE", "write there instead of printing CSV")
-    parser.option("--columns", "say what each column holds, and list nothing")
+    parser.option("--format", "csv or parquet (default: by the suffix of --out, else csv)", choices=FORMATS)
+    parser.option("--out FILE", "file to write (default: print CSV)")
+    parser.option("--columns", "describe the columns and exit")
     parser.shared("--table-format")
 
 
 def call_samples(arguments: argparse.Namespace) -> None:
-    """List every instance of runs, predicted and true: class, confidence, best IoU, kind of error, box.
+    """List every predicted and ground-truth instance: class, confidence, best IoU, error type, box.
 
     su3d-bench report samples runs/my-run --out samples.csv
     su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
@@ -169,7 +167,7 @@ def call_samples(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.finished import read_run
 
     if arguments.columns == bool(arguments.runs):
-        raise ConfigError("report samples: name the folder of a run, such as runs/my-run; or --columns alone")
+        raise ConfigError("report samples: give a run folder, such as runs/my-run, or --columns")
     if arguments.columns:
         output.answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
         return
@@ -177,8 +175,8 @@ def call_samples(arguments: argparse.Namespace) -> None:
     form = arguments.format or ("parquet" if out is not None and out.suffix == ".parquet" else "csv")
     if form == "parquet":
         if out is None:
-            raise ConfigError("--format parquet: is no text; say where with --out samples.parquet")
-        parquet_of(())  # before minutes of work: is it installed?
+            raise ConfigError("--format parquet: is binary; name a file with --out samples.parquet")
+        parquet_of(())  # fail early if it is not installed
     chosen = Chosen(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
     with output.progress(n_scenes, is_quiet=arguments.quiet) as report:
@@ -194,20 +192,20 @@ def call_samples(arguments: argparse.Namespace) -> None:
     else:
         n_predicted = sum(row.kind == "predicted" for row in found.rows)
         n_true = len(found.rows) - n_predicted
-        output.answer(f"{out}: {counted(n_predicted, 'predicted instance')}, {n_true} true")
+        output.answer(f"{out}: {counted(n_predicted, 'predicted instance')}, {n_true} ground-truth")
 
 
 def _add_leaderboard(verbs: Verbs) -> None:
     parser = add_verb(verbs, "leaderboard", call_leaderboard)
-    parser.option("folder DIR", "a folder with runs anywhere below it")
+    parser.option("folder DIR", "folder to search for runs")
     parser.shared("--protocols")
-    parser.option("--intervals", "show 95 %% intervals: over scenes, and of ranks")
+    parser.option("--intervals", "show 95 %% confidence intervals of scores and ranks")
     parser.shared("--format")
-    parser.option("--out FILE", "write there instead of printing")
+    parser.option("--out FILE", "file to write (default: print)")
 
 
 def call_leaderboard(arguments: argparse.Namespace) -> None:
-    """Rank the runs below a folder that agree in protocol, data, counts and labels (one label or the top k).
+    """Rank all comparable runs in a folder.
 
     su3d-bench report leaderboard runs
     su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html
@@ -218,21 +216,21 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
     parts = tables(board, intervals=arguments.intervals)
     output.answer_or_write(arguments, asdict(board), parts)
     entries = f"{counted(sum(map(len, board.boards)), 'entry')} in {counted(len(board.boards), 'ranking')}"
-    remark(f"{entries}, {len(board.refused)} left out", quiet=arguments.quiet)
+    remark(f"{entries}, {len(board.refused)} excluded", quiet=arguments.quiet)
 
 
 def _add_attribution(verbs: Verbs) -> None:
     parser = add_verb(verbs, "attribution", call_attribution)
     parser.shared("run")
-    parser.option("--method METHOD", "whose predictions (default: the run's only method)")
+    parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
     parser.shared("--protocols")
-    parser.option("--oracle RUN", "the same run with --profile oracle: what perfect 2D masks give")
-    parser.option("--out PNG", "draw the plot to this file")
+    parser.option("--oracle RUN", "the same run with --profile oracle (perfect 2D masks)")
+    parser.option("--out PNG", "plot to write")
     parser.shared("--format")
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
-    """Show where a run loses its points: the gain when each kind of error alone is corrected.
+    """Attribute lost points to error types: the gain if each type were corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
     su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json
@@ -246,27 +244,29 @@ def call_attribution(arguments: argparse.Namespace) -> None:
     if arguments.out is not None:
         from su3d_bench.reports.pictures.plots import draw_attribution
 
-        output.show()  # the plot takes longer than the answer
+        output.show()  # the plot is slower than the answer
         draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 
 def _add_power(verbs: Verbs) -> None:
     parser = add_verb(verbs, "power", call_power)
-    parser.option("runs RUN...", "a finished run, and others that differ in --seed alone")
-    parser.option("--methods", "whose (default: the only two)", nargs=2, default=(), metavar=("A", "B"))
+    parser.option("runs RUN...", "finished run, and others that differ only in --seed")
+    parser.option(
+        "--methods", "the two methods to compare (default: the only two)", nargs=2, default=(), metavar=("A", "B")
+    )
     parser.option(
         "--points N...",
-        "differences to be found, in percentage points (default: 1 2 5)",
+        "differences to detect, in percentage points (default: 1 2 5)",
         type=float,
         default=[1.0, 2.0, 5.0],
     )
-    parser.option("--power P", "to find it (default: 0.8)", type=float, default=0.8)
+    parser.option("--power P", "statistical power (default: 0.8)", type=float, default=0.8)
     parser.shared("--protocols", "--format")
 
 
 def call_power(arguments: argparse.Namespace) -> None:
-    """Tell how many scenes and seeds show a difference of so many points between two methods.
+    """Power analysis: scenes and seeds needed to detect a difference between two methods.
 
     su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5
     su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json

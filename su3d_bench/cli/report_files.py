@@ -20,34 +20,34 @@ MEGABYTE = 10**6
 def add_pages(verbs: Verbs) -> None:
     parser = add_verb(verbs, "html", call_html, takes_up=True)
     parser.shared("runs")
-    parser.option("--out FILE", "the page (default: page.html)", default=Path("page.html"))
-    parser.option("--title TEXT", "of the page (default: the folders of the runs)")
-    parser.option("--queries TEXT...", "texts to which instances are compared (default: eight)")
-    parser.option("--no-maps", "leave the maps out")
-    parser.option("--no-errors", "leave out what errors cost, and their gallery (quicker)")
-    parser.option("--no-gallery", "leave out the single errors and their photos")
-    parser.option("--most-megabytes MB", "maps are thinned for it (default: 30)", type=float, default=30.0)
+    parser.option("--out FILE", "page to write (default: page.html)", default=Path("page.html"))
+    parser.option("--title TEXT", "title of the page (default: the run folders)")
+    parser.option("--queries TEXT...", "texts for the similarity view (default: eight)")
+    parser.option("--no-maps", "omit the maps")
+    parser.option("--no-errors", "omit the error analysis and the gallery (faster)")
+    parser.option("--no-gallery", "omit the gallery of errors")
+    parser.option(
+        "--most-megabytes MB", "maximum page size; maps are thinned to fit (default: 30)", type=float, default=30.0
+    )
     parser.shared("--jobs")
     parser = add_verb(verbs, "rerun", call_rerun)
     parser.shared("run", "--scenes", "--methods")
-    parser.option(
-        "--stride N", "every Nth of the frames that the methods were given (default: at most 60 of a scene)", type=count
-    )
-    parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
+    parser.option("--stride N", "use every Nth frame (default: at most 60 frames per scene)", type=count)
+    parser.option("--out FILE", ".rrd file to write", required=True)
 
 
 def add_archives(verbs: Verbs) -> None:
     parser = add_verb(verbs, "bundle", call_bundle)
     parser.shared("runs")
-    parser.option("--out FILE", "the archive (default: the first run's name.zip)")
-    parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
+    parser.option("--out FILE", "archive to write (default: name of the first run)")
+    parser.option("--trained-on TEXT", "training data of your weights, for a registry", default="")
     parser = add_verb(verbs, "verify", call_verify)
-    parser.option("files FILE...", "LaTeX by report tables, or around it; or bundle.zip of reproduce")
-    parser.option("--root DIR", "where the runs' folders are (default: here, then beside the file)")
+    parser.option("files FILE...", "LaTeX files with tables of report tables, or bundle.zip")
+    parser.option("--root DIR", "folder of the runs (default: current folder, then that of the file)")
 
 
 def call_html(arguments: argparse.Namespace) -> None:
-    """Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.
+    """Create a self-contained HTML report: scores, errors, timings, comparisons and 3D maps.
 
     su3d-bench report html runs/my-run --out page.html
     su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors
@@ -66,7 +66,7 @@ def call_html(arguments: argparse.Namespace) -> None:
         with_gallery=not (arguments.no_gallery or arguments.no_errors),
         jobs=arguments.jobs or 0,
     )
-    arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # else nothing is kept
+    arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # otherwise nothing is cached
     with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
         contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
@@ -85,7 +85,7 @@ def call_html(arguments: argparse.Namespace) -> None:
 
 
 def call_rerun(arguments: argparse.Namespace) -> None:
-    """Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.
+    """Export frames, masks, maps and ground truth of a run for the rerun viewer.
 
     su3d-bench report rerun runs/my-run --out my-run.rrd
     su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
@@ -120,12 +120,12 @@ def call_rerun(arguments: argparse.Namespace) -> None:
         "n_maps": n_maps, "scenes": list(scenes), "methods": list(methods),
     }  # fmt: skip
     shown = f"{counted(len(scenes), 'scene')}, {counted(n_maps, 'map')}, {counted(n_frames, 'frame')}"
-    how = f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)"
+    how = f"open it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)"
     answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}", how)
 
 
 def call_bundle(arguments: argparse.Namespace) -> None:
-    """Pack finished runs into one archive that report verify scores anew and a registry takes in.
+    """Pack finished runs into an archive that can be re-scored and added to a registry.
 
     su3d-bench report bundle runs/my-run --out my-run.zip
     su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip
@@ -140,7 +140,7 @@ def call_bundle(arguments: argparse.Namespace) -> None:
         refuse_own_truth(run)
     place = arguments.out or Path(f"{arguments.runs[0].resolve().name}.zip")
     if not is_bundle(place):
-        raise ConfigError(f"--out {place}: a bundle is called FILE.zip")
+        raise ConfigError(f"--out {place}: expected a file name that ends in .zip")
     bundle_runs(place, arguments.runs, arguments.trained_on)
     n_bytes = place.stat().st_size
     value = {"file": str(place), "bytes": n_bytes, "sha256": digest_file(place), "runs": len(arguments.runs)}
@@ -150,14 +150,14 @@ def call_bundle(arguments: argparse.Namespace) -> None:
 
 
 def call_verify(arguments: argparse.Namespace) -> int:
-    """Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.
+    """Recompute LaTeX tables from their runs, or re-score a bundle; exit code 1 if a value differs.
 
     su3d-bench report verify paper.tex
     su3d-bench report verify reproduced/opensu3d/bundle.zip --json
     """
     bundles = [file for file in arguments.files if file.suffix.lower() == ".zip"]
     if bundles and len(bundles) < len(arguments.files):
-        raise ConfigError("report verify: bundles and LaTeX are verified apart; name the one or the other")
+        raise ConfigError("report verify: give either bundles or LaTeX files, not both")
     return _verify_bundles(bundles, arguments) if bundles else _verify_papers(arguments)
 
 
@@ -165,15 +165,15 @@ def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.bundle import verify_bundle
 
     if arguments.root is not None:
-        raise ConfigError("--root: a bundle brings its runs; leave it out")
+        raise ConfigError("--root: not valid for bundles, which contain their runs")
     found = [verify_bundle(bundle) for bundle in bundles]
     lines = []
     for one in found:
         lines += [f"{one.bundle}: {fault}" for fault in one.faults]
-        how = "to the last bit" if one.is_to_the_bit else "integers the same, values within 1e-9"
-        verdict = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
+        how = "bit-exact" if one.is_to_the_bit else "integers equal, values within 1e-9"
+        verdict = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"verified ({how})"
         n_files, n_scores = counted(one.n_files, "file"), counted(one.n_scores, "score")
-        lines.append(f"{one.bundle}: {n_files}, {n_scores} made anew, {counted(one.n_cells, 'cell')}; {verdict}")
+        lines.append(f"{one.bundle}: {n_files}, {n_scores} recomputed, {counted(one.n_cells, 'cell')}; {verdict}")
     answer_either(arguments, {"bundles": [asdict(one) for one in found]}, *lines)
     return EXIT_CHECK_FAILED if any(one.faults for one in found) else EXIT_DONE
 

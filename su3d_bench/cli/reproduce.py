@@ -1,4 +1,4 @@
-"""``su3d-bench reproduce``: a paper's experiments: what they need, the runs, measured beside reported, the bundle."""
+"""``su3d-bench reproduce``: run the experiments of a paper and compare with its tables."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gp
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "reproduce", call, takes_up=True)
-    parser.option("recipe [RECIPE]", "its name, or a file of your own (default: list them)")
-    parser.option("--table NAME...", "these experiments alone (default: all)", default=[])
-    parser.option("--out DIR", "where all goes (default: reproduced/<recipe>)")
+    parser.option("recipe [RECIPE]", "recipe, or .toml file (default: list recipes)")
+    parser.option("--table NAME...", "experiments to run (default: all)", default=[])
+    parser.option("--out DIR", "output folder (default: reproduced/<recipe>)")
     parser.shared("--dry-run")
-    parser.option("--rehearse", "the same on rooms made in the same layouts, with embedded perception")
-    parser.option("--rooms ROOM...", "of a rehearsal (default: the recipe's)")
-    parser.option("--room-settings KEY=VALUE...", "options of the rooms, such as n_frames=80 width=160")
-    parser.option("--predictions METHOD=DIR...", "of methods that are none here, as evaluate takes", default=[])
+    parser.option("--rehearse", "run on synthetic rooms in the same layouts, with embedded perception")
+    parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
+    parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160")
+    parser.option("--predictions METHOD=DIR...", "predictions of methods that are not implemented here", default=[])
     parser.option(
         "--text-features METHOD=FILE...",
-        "what the encoder of its predictions makes of texts, as evaluate --text-features",
+        "text features for these predictions, as in evaluate",
         default=[],
     )
     parser.shared("--profile")
-    parser.option("--encoder ENCODER", "of all runs, such as embedded (default: the recipe's)")
+    parser.option("--encoder ENCODER", "encoder of all runs (default: set by the recipe)")
     parser.shared("--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
-    parser.option("--bundle FILE", "the archive (default: bundle.zip in the folder of --out)")
+    parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)")
     parser.shared("--format")
 
 
 def call(arguments: argparse.Namespace) -> int:
-    """Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.
+    """Reproduce the experiments of a paper: runs, tables next to the published ones, and an archive.
 
     su3d-bench reproduce opensu3d --table II III --dry-run
     su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse
@@ -56,7 +56,7 @@ def call(arguments: argparse.Namespace) -> int:
     experiments = recipe.chosen(arguments.table)
     rehearsal = [name for name in ("rooms", "room_settings") if getattr(arguments, name)]
     if rehearsal and not arguments.rehearse:
-        raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: belongs to --rehearse; leave it out, or rehearse")
+        raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: needs --rehearse")
     _check_device(arguments)
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
     if not arguments.rehearse:
@@ -70,7 +70,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise before anything is made or weighed where there is no such GPU; a cluster's machines have theirs."""
+    """Raise early if the GPU does not exist; machines of a cluster have their own."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
     from su3d_bench.runs.executors import ELSEWHERE
 
@@ -117,11 +117,11 @@ def _reproduce(
         first = known.missing[0]
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
         how = f"; get it with: {first.how}" if first.how else f"; {first.remark}" if first.remark else ""
-        ends = "" if arguments.rehearse else ", --rehearse does without"
+        ends = "" if arguments.rehearse else ", or use --rehearse"
         raise ConfigError(
             f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all{ends}"
         )
-    folders = evaluate_predictions(named, experiments, asked, out)  # first: it takes minutes, the runs hours
+    folders = evaluate_predictions(named, experiments, asked, out)  # first, because it is much faster than the runs
     failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]
     folders = [run.folder(out) for run in runs] + folders
     _answer(recipe, experiments, folders, out, arguments)
@@ -131,7 +131,7 @@ def _reproduce(
 
 
 def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
-    """Lines of what failed."""
+    """One line per failure."""
     from su3d_bench.reproducing.recipe import carry_out, plan_of
 
     plan = plan_of(run, out)
@@ -145,7 +145,7 @@ def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[
 def _answer(
     recipe: Recipe, experiments: Sequence[Experiment], folders: Sequence[Path], out: Path, arguments: argparse.Namespace
 ) -> None:
-    """The tables on stdout and in ``tables.md``, every cell in ``compared.json``, pictures, and the archive."""
+    """Write tables to stdout and ``tables.md``, cells to ``compared.json``, pictures and the archive."""
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
     from su3d_bench.reproducing.differences import Results, compared_all, compared_json, draw_queries, result_tables

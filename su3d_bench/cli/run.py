@@ -1,4 +1,4 @@
-"""``su3d-bench run`` and ``ablate``: methods over scenes, scored under all protocols that fit."""
+"""``su3d-bench run`` and ``ablate``: run methods on scenes and score them under all protocols that fit."""
 
 from __future__ import annotations
 
@@ -21,52 +21,52 @@ if TYPE_CHECKING:
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "run", call_run, takes_up=True)
-    parser.option("--methods METHOD...", "names, variants, file.py:Class, or all (default: opensu3d)")
+    parser.option("--methods METHOD...", "methods, variants, file.py:Class, or all (default: opensu3d)")
     _add_run_options(parser)
     parser = add_verb(verbs, "ablate", call_ablate, takes_up=True)
-    parser.option("--vary KEY=V1,V2...", "settings and their values", required=True)
-    parser.option("--method METHOD", "name or file.py:Class (default: opensu3d)", default="opensu3d")
-    parser.option("--beside METHOD...", "other methods in the same run, as run --methods takes", default=[])
-    parser.option("--grid", "every combination, instead of one setting at a time")
+    parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
+    parser.option("--method METHOD", "method to vary, or file.py:Class (default: opensu3d)", default="opensu3d")
+    parser.option("--beside METHOD...", "additional methods to run without variation", default=[])
+    parser.option("--grid", "run every combination instead of one setting at a time")
     _add_run_options(parser)
 
 
 def _add_run_options(parser: Parser) -> None:
-    """The options of both verbs; what is not given comes from ``--config`` or has its default."""
-    parser.option("scene [SCENE...]", "addresses or patterns, as --scenes takes them")
-    parser.option("--scenes SCENE...", "addresses or patterns (default: 'rooms/*')")
-    parser.option("--protocols PROTOCOL...", "evaluations (default: those of the dataset)")
+    """Add the options of both commands; values come from the flag, else ``--config``, else the default."""
+    parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
+    parser.option("--scenes SCENE...", "scenes or patterns (default: 'rooms/*')")
+    parser.option("--protocols PROTOCOL...", "protocols to score (default: those of the dataset)")
     parser.shared("--profile", "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
-    parser.option("--stride N", "frames between updates (default: the method's own)", type=int)
+    parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
         "--pictures", "draw the maps into the run folder (default: yes)", action=argparse.BooleanOptionalAction
     )
     parser.option(
         "--accept-poses",
-        "run recordings whose depth contradicts their poses all the same, with a warning (default: refuse them)",
+        "warn instead of failing if depth contradicts the poses",
         action=argparse.BooleanOptionalAction,
     )
-    parser.option("--anytime SHARE...", "score the map after these shares of the updates too", type=float)
+    parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option(
         "--out DIR",
-        "run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
+        "run folder or URL, such as s3://bucket/run (default: runs/<name>)",
         type=run_place,
     )
     into = parser.add_mutually_exclusive_group()
-    what = "add these scenes, methods and protocols to the run in --out, whose other values stay"
+    what = "add scenes, methods and protocols to the run in --out"
     parser.option("--extend", what, into)
-    parser.option("--replace", "put this run in the place of the one in --out", into)
+    parser.option("--replace", "overwrite the run in --out", into)
 
 
 def run_place(text: str) -> Path | str:
-    """A folder, or the text of a URL."""
+    """A path, or a URL as text."""
     return text if "://" in text else Path(text)
 
 
 def call_run(arguments: argparse.Namespace) -> int:
-    """Run methods over scenes and score them; the same command again resumes.
+    """Run methods on scenes and score them; the same command resumes an interrupted run.
 
     su3d-bench run rooms/living0 --methods opensu3d oracle
     su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run
@@ -75,7 +75,7 @@ def call_run(arguments: argparse.Namespace) -> int:
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
-    """The file's settings, then those of the flags, which win."""
+    """The settings of the file, overridden by those of the flags."""
     from su3d_bench.core.config import RunConfig
     from su3d_bench.runs.plan import asked_settings
 
@@ -87,7 +87,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
-    """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
+    """The plan of the requested run."""
     from su3d_bench.runs.plan import make_plan
 
     into: Into = "extend" if arguments.extend else "replace" if arguments.replace else "own"
@@ -97,7 +97,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
-    """Run what was planned, or with ``--dry-run`` tell what it takes."""
+    """Run the plan, or with ``--dry-run`` print what it takes."""
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.store.caches import why_slow
 
@@ -119,14 +119,14 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
 
 
 def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
-    """The tables, then where the run is, its pictures, and what can be done with it."""
+    """Print the tables, then the run folder, its pictures and commands for next steps."""
     from su3d_bench.reports.tables.run import run_tables
     from su3d_bench.runs.advice import next_commands, pictures_of
 
     found = {"found": [asdict(found) for found in result.found]} if result.found else {}
     output.answer_tables(arguments, result.metrics | found, run_tables(result.metrics, result.found))
     plan = result.plan
-    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (its small files: {plan.folder.path})"
+    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (small files: {plan.folder.path})"
     remark(*result.remarks, f"run folder: {place}", quiet=arguments.quiet)
     if arguments.quiet:
         return
@@ -143,7 +143,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
     rows = estimate(plan)
     lines = []
     for row in rows:
-        state = "done already" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
+        state = "already done" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
         lines.append(f"{row.scene:<24} {row.method:<12} {row.remark or state}")
     minutes = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers / 60
     source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
@@ -155,7 +155,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
 
 
 def call_ablate(arguments: argparse.Namespace) -> int:
-    """Vary settings of a method, each on its own, over scenes; perception is computed once.
+    """Run an ablation: vary settings of a method, one at a time, on the same scenes.
 
     su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep
     su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run

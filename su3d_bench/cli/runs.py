@@ -1,4 +1,4 @@
-"""``su3d-bench runs``: run folders listed, shown and removed, and labels n' made from their maps."""
+"""``su3d-bench runs``: list, show, remove, refine and export runs."""
 
 from __future__ import annotations
 
@@ -26,39 +26,38 @@ DEFAULT = Path("runs")
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List, show, remove, refine and export what runs leave.
+    """List, show, remove, refine and export runs.
 
     su3d-bench runs list
     su3d-bench runs show runs/demo
     """
     actions = add_group(verbs, "runs", add_parser, lists=True)
     parser = add_verb(actions, "list", call_list)
-    parser.option("folder [DIR]", "(default: runs)", default=DEFAULT)
+    parser.option("folder [DIR]", "folder to search (default: runs)", default=DEFAULT)
     parser.shared("--format")
     parser = add_verb(actions, "show", call_show)
     parser.shared("run")
     parser = add_verb(actions, "remove", call_remove)
     parser.option("runs RUN...", "run folders")
-    parser.option("--yes", "do not ask; needed where nobody sits at a terminal")
+    parser.option("--yes", "do not ask for confirmation")
     parser = add_verb(actions, "refine", call_refine)
     parser.shared("run")
     parser.shared("--method")
-    parser.option("--scenes SCENE...", "these scenes alone (default: all of the run)", default=[])
+    parser.option("--scenes SCENE...", "scenes to refine (default: all)", default=[])
     parser.option(
         "--refiner",
-        "vote: by the sum of the scores, without a model; model: a language model, as in the paper",
+        "vote (sum of scores) or model (language model, as in the paper)",
         choices=("vote", "model"),
         default="vote",
     )
-    parser.option("--top-m N", "views that have a say (default: 5)", type=count, default=5)
+    parser.option("--top-m N", "number of views used (default: 5)", type=count, default=5)
     parser.option(
         "--background-names [NAME...]",
-        "nouns of what label n' leaves out (default: those that the paper leaves out of images); none: nothing",
+        "names of background to exclude (default: those of the paper)",
     )
     parser.option(
         "--max-map-fraction SHARE",
-        "an instance whose box covers more of the map from above is left out (default: 0.95, the paper's share of "
-        "an image); 1: none is",
+        "maximum share of the map's area that an instance may cover (default: 0.95)",
         type=float,
     )
     options.add_language_options(parser)
@@ -66,7 +65,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List the runs below a folder: when they were written, how far they came, their first numbers.
+    """List runs with date, progress and headline scores.
 
     su3d-bench runs list
     su3d-bench runs list /shared/runs --json
@@ -74,16 +73,16 @@ def call_list(arguments: argparse.Namespace) -> None:
     from su3d_bench.analysis.leaderboard import list_runs, runs_table
 
     if not arguments.folder.is_dir() and arguments.folder != DEFAULT:
-        raise ConfigError(f"{arguments.folder}: there is no such folder; name one that holds runs")
+        raise ConfigError(f"{arguments.folder}: no such folder; name a folder of runs")
     entries = list_runs(arguments.folder) if arguments.folder.is_dir() else []
     if not entries:
-        remark(f"no run in {arguments.folder}; su3d-bench run rooms/living0 makes one", quiet=arguments.quiet)
+        remark(f"{arguments.folder}: no runs; create one with su3d-bench run rooms/living0", quiet=arguments.quiet)
     if entries or arguments.json:
         output.answer_tables(arguments, [asdict(entry) for entry in entries], [runs_table(entries)])
 
 
 def call_show(arguments: argparse.Namespace) -> None:
-    """Show what a run was asked for, how far it came, and the command that takes it up again.
+    """Show the settings and progress of a run, and the command that resumes it.
 
     su3d-bench runs show runs/demo
     su3d-bench runs show runs/demo --json
@@ -94,7 +93,7 @@ def call_show(arguments: argparse.Namespace) -> None:
 
     entry = run_entry(arguments.run)
     asked: dict[str, str] = {}
-    with suppress(StoreError):  # a damaged run.toml tells nothing
+    with suppress(StoreError):  # run.toml is damaged
         if (run := existing_run(arguments.run)) is not None:
             asked = {
                 ".".join(path): json.dumps(value, ensure_ascii=False, default=str)
@@ -109,22 +108,22 @@ def call_show(arguments: argparse.Namespace) -> None:
         f"scenes: {', '.join(entry.scenes) or 'not known'}",
         f"methods: {', '.join(entry.methods) or 'not known'}",
         *(f"  {one.method} under {one.protocol}: {one.metric} {percent(one.value)}" for one in entry.headlines),
-        "asked for:",
+        "settings:",
         *(f"  {printable(key, 120)} = {printable(text, 300)}" for key, text in asked.items()),
-        f"take it up again: {again}",
+        f"resume: {again}",
     ]
     output.answer_either(arguments, value, *lines)
 
 
 def call_remove(arguments: argparse.Namespace) -> None:
-    """Remove run folders, once it is known that they hold nothing but a run; asks before it does.
+    """Remove run folders after confirmation; folders with other files are kept.
 
     su3d-bench runs remove runs/demo
     su3d-bench runs remove runs/a runs/b --yes
     """
     from su3d_bench.analysis.leaderboard import removable, run_entry, size_bytes
 
-    folders = [removable(path) for path in dict.fromkeys(arguments.runs)]  # all of them, before the first goes
+    folders = [removable(path) for path in dict.fromkeys(arguments.runs)]  # check all before removing the first
     lines = []
     for folder, path in zip(folders, dict.fromkeys(arguments.runs), strict=True):
         entry = run_entry(folder.path, str(path))
@@ -140,16 +139,15 @@ def call_remove(arguments: argparse.Namespace) -> None:
 
 
 def _is_agreed(lines: list[str]) -> bool:
-    """Whether whoever sits at the terminal wants the runs of ``lines`` gone."""
+    """Ask at the terminal whether to remove the runs of ``lines``."""
     if not sys.stdin.isatty():
-        raise ConfigError("runs remove: nobody is there to be asked; add --yes to remove without a question")
-    remark(*lines, "remove for good? y or n")
+        raise ConfigError("runs remove: no terminal to ask for confirmation; add --yes")
+    remark(*lines, "remove permanently? [y/n]")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def call_refine(arguments: argparse.Namespace) -> None:
-    """Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what is
-    large background under it.
+    """Refine labels: choose one name per instance from its best views (label n'), and exclude large background.
 
     su3d-bench runs refine runs/my-run
     su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1
@@ -184,7 +182,7 @@ def call_refine(arguments: argparse.Namespace) -> None:
         kept = [name for name in records.names if name.source == "label"]
         reasons = ", ".join(dict.fromkeys(name.reason for name in kept))
         if kept and not arguments.json:
-            remark(f"{scene}: label n stays for {counted(len(kept), 'instance')}: {reasons}", quiet=arguments.quiet)
+            remark(f"{scene}: label n unchanged for {counted(len(kept), 'instance')}: {reasons}", quiet=arguments.quiet)
 
 
 def _filter(arguments: argparse.Namespace) -> FilterConfig:
@@ -192,24 +190,24 @@ def _filter(arguments: argparse.Namespace) -> FilterConfig:
 
     share = arguments.max_map_fraction
     if share is not None and not 0 < share <= 1:
-        raise ConfigError(f"--max-map-fraction {share}: expected a share above 0, 1 at most")
+        raise ConfigError(f"--max-map-fraction {share}: expected a share above 0 and at most 1")
     given = {"background_names": arguments.background_names, "max_map_fraction": share}
     return FilterConfig.model_validate({name: value for name, value in given.items() if value is not None})
 
 
 def _jobs(run: RunFolder, arguments: argparse.Namespace) -> dict[str, JobFolder]:
-    """Scene -> folder of its map, of the scenes asked for."""
+    """The folder of each requested scene."""
     from su3d_bench.store.records import RunRecord, read_record
 
     shown = printable(str(run.path), 200)
     known = [printable(scene, 200) for scene in read_record(RunRecord, run.path / "run.json", shown).scenes]
     for scene in arguments.scenes:
         if scene not in known:
-            raise ConfigError(f"{shown}: holds no scene '{scene}'{suggest(scene, known, 'it has')}")
+            raise ConfigError(f"{shown}: no scene '{scene}'{suggest(scene, known, 'it has')}")
     jobs = {scene: run.job(scene, arguments.method) for scene in arguments.scenes or known}
     mapped = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}
     if not mapped:
-        raise StoreError(f"{shown}: holds no map by '{arguments.method}'; name another with --method")
+        raise StoreError(f"{shown}: no map of method '{arguments.method}'; choose another with --method")
     return mapped
 
 
@@ -219,7 +217,7 @@ def _map(job: JobFolder) -> Instances:
 
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances) or prediction.view_names is None:
-        raise PredictionError(f"{job.prediction}: has no names of views to choose from; make the map with opensu3d")
+        raise PredictionError(f"{job.prediction}: no names of views; create the map with opensu3d")
     return prediction
 
 
@@ -228,5 +226,5 @@ def _refined_lines(scene: str, records: NameRecords) -> list[str]:
     return [
         f"{scene}: {counted(len(records.names), 'instance')}, {counted(len(changed), 'name')} changed",
         *(f"  {name.id:>4}  {name.label} -> {name.refined}" for name in changed),
-        *(f"  {name.id:>4}  left out: {name.left_out}" for name in records.names if name.left_out),
+        *(f"  {name.id:>4}  excluded: {name.left_out}" for name in records.names if name.left_out),
     ]

@@ -1,4 +1,4 @@
-"""``su3d-bench datasets check`` and ``show``; imported late, since much of it takes long to load."""
+"""``su3d-bench datasets check`` and ``show``; imported late, because it is slow to import."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.runs.trial import try_dataset
 
-MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
+MOST_OF_A_KIND = 10  # printed findings per kind; --json has all
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Look at every scene asked for; exit code 1 where one of them has errors."""
+    """Check every requested scene; exit code 1 if one has errors."""
     scenes = chosen_scenes(arguments.scenes, arguments.set, is_quiet=arguments.quiet)
     n_threads = arguments.jobs or os.cpu_count() or 1
     inspections = []
@@ -48,7 +48,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 def _inspect(dataset: Any, scene: str, n_threads: int, arguments: argparse.Namespace) -> Inspection:
     try_dataset(dataset, scene)
-    # A bar of its own for each scene: while a bar is drawn, what is printed would go where the bar goes.
+    # One bar per scene: printing while a bar is drawn would disturb it.
     with progress(1, is_quiet=arguments.quiet, last_step="ground truth") as report:
         return inspect(
             dataset,
@@ -60,7 +60,7 @@ def _inspect(dataset: Any, scene: str, n_threads: int, arguments: argparse.Names
 
 
 def chosen_scenes(addresses: Sequence[str], assignments: Sequence[str], *, is_quiet: bool) -> list[tuple[Any, str]]:
-    """(dataset, scene) of every address or pattern, with the options of ``--set``; a dataset is built once."""
+    """(dataset, scene) for every address or pattern, with the settings of ``--set``; datasets are built once."""
     targets = {str(registry.load("dataset", target).name): target for target in dataset_targets(addresses)}
     settings = read_assignments(assignments, (), tuple(targets))
     parts = {target: part_of("dataset", target, settings) for target in targets.values()}
@@ -72,14 +72,14 @@ def chosen_scenes(addresses: Sequence[str], assignments: Sequence[str], *, is_qu
 
 
 def as_json(inspection: Inspection) -> dict[str, Any]:
-    """All of an inspection as JSON has it, with its numbers of errors and warnings."""
+    """An inspection as JSON, with its numbers of errors and warnings."""
     counts = {"n_errors": inspection.count("error"), "n_warnings": inspection.count("warning")}
     table: dict[str, Any] = printable_json(asdict(inspection))
     return {"scene": table.pop("scene"), **counts, **table}
 
 
 def lines_of(inspection: Inspection) -> list[str]:
-    """The block of one scene: what is there, then what is wrong."""
+    """The lines of one scene: contents, then problems."""
     rows = [("frames", _frames_text(inspection))]
     if inspection.depth is not None:
         d = inspection.depth
@@ -99,7 +99,7 @@ def lines_of(inspection: Inspection) -> list[str]:
         lines += _finding_lines(list(group))
     n_errors, n_warnings = inspection.count("error"), inspection.count("warning")
     wrong = f"{counted(n_errors, 'error')}, {counted(n_warnings, 'warning')}"
-    verdict = wrong if inspection.findings else "nothing found wrong"
+    verdict = wrong if inspection.findings else "OK"
     return [*lines, f"  {'checked':<13} {inspection.elapsed_s:.1f} s: {verdict}"]
 
 
@@ -116,23 +116,23 @@ def _frames_text(inspection: Inspection) -> str:
         return "cannot be counted"
     read = "all read" if inspection.n_read == inspection.n_frames else f"{inspection.n_read} read"
     size = "" if inspection.size is None else f", {inspection.size[0]}x{inspection.size[1]}"
-    files = f", {counted(inspection.n_files, 'file')}" if inspection.n_files else ", made on demand"
+    files = f", {counted(inspection.n_files, 'file')}" if inspection.n_files else ", rendered on demand"
     return f"{inspection.n_frames} ({read}){size}{files}"
 
 
 def up_text(up: WorldUp) -> str:
-    """Which axis points up, who says so, and what becomes of it."""
+    """The up axis, how it is known, and whether the scene is rotated."""
     if up.axis is None:
-        return f"taken to be z; {up.reason}"
+        return f"assumed z; {up.reason}"
     if up.is_turned or up.axis == "z":
-        return f"{up.axis}, {up.reason}" + ("" if up.axis == "z" else "; turned to z")
-    return f"taken to be z; {up.axis} seems to be, {up.reason}"
+        return f"{up.axis}, {up.reason}" + ("" if up.axis == "z" else "; rotated to z")
+    return f"assumed z, but probably {up.axis}: {up.reason}"
 
 
 def _truth_text(variant: TruthVariant) -> str:
     if variant.reason is not None:
         reason = variant.reason.removeprefix(f"no ground truth '{variant.variant}'; ")
-        return f"{variant.variant}: not here; {reason}"
+        return f"{variant.variant}: not available; {reason}"
     return (
         f"{variant.variant}: {variant.n_points:,} points, {counted(variant.n_objects, 'object')}, "
         f"{variant.n_classes} {'class' if variant.n_classes == 1 else 'classes'}"
@@ -140,7 +140,7 @@ def _truth_text(variant: TruthVariant) -> str:
 
 
 def show(arguments: argparse.Namespace) -> None:
-    """Draw the scene and print its counts and where the picture is."""
+    """Draw the scene and print its counts and the path of the picture."""
     scenes = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)
     if len(scenes) > 1:
         names = ", ".join(f"{dataset.name}/{scene}" for dataset, scene in scenes[:3])
@@ -149,7 +149,7 @@ def show(arguments: argparse.Namespace) -> None:
     name = f"{dataset.name}/{scene}"
     path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
     if path.suffix.lower() != ".png" or path.is_dir():
-        raise ConfigError(f"--out {path}: the picture is a PNG; expected a file name that ends in .png")
+        raise ConfigError(f"--out {path}: expected a file name that ends in .png")
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
         draw_scene_picture(look, path)

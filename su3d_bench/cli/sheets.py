@@ -1,4 +1,4 @@
-"""``su3d-bench sheets``: sheets for people to judge a run, what their answers add up to, and figures for print."""
+"""``su3d-bench sheets``: annotation sheets for human evaluation, their scores, and figures."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from su3d_bench.core.errors import ConfigError, DataError, counted
 if TYPE_CHECKING:
     from su3d_bench.sheets.scores import Scores
 
-SHOWN_FAULTS = 200  # lines; the number of all is told
+SHOWN_FAULTS = 200  # lines; the total is printed
 
 
 def add_parser(verbs: Verbs) -> None:
-    """Make sheets for people to judge a run, score their answers, and draw figures.
+    """Human evaluation: create annotation sheets, score answers, and draw figures.
 
     su3d-bench sheets make runs/my-run --kind retrieval --out sheets
     su3d-bench sheets score ann.csv bob.xlsx --key key/key.json
@@ -32,22 +32,16 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option(
-        "files [FILE...]", "answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)"
-    )
-    parser.option("--key FILE", "key.json of the set, or its folder", required=True)
-    parser.option(
-        "--sheet FILE", "sheet.json of the set, or its folder (default: looked for around the key and the answers)"
-    )
-    parser.option("--out DIR", "write scores.json, tables and a list of what to look at again there")
-    parser.option(
-        "--disputed FILE", "sheets of questions: write those that not everybody calls right there, for --leave-out"
-    )
+    parser.option("files [FILE...]", "answers, .csv or .xlsx (default: score the ground truth only)")
+    parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
+    parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
+    parser.option("--out DIR", "folder for scores.json, tables and items to review")
+    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --leave-out")
     parser.shared("--format")
 
 
 def call_score(arguments: argparse.Namespace) -> None:
-    """Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.
+    """Score the answers of all annotators: accuracy, tests, agreement, comparison with the ground truth.
 
     su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores
     su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv
@@ -66,7 +60,7 @@ def call_score(arguments: argparse.Namespace) -> None:
     sheet = read_sheet(sheet_file)
     check_key(sheet, key)
     if arguments.disputed is not None and (sheet.kind != "questions" or not arguments.files):
-        raise ConfigError("--disputed: lists what people say of sheets of kind questions; give their key and answers")
+        raise ConfigError("--disputed: needs the key and answers of sheets of kind questions")
     rows, faults = [], []
     for file in dict.fromkeys(arguments.files):
         try:
@@ -78,12 +72,12 @@ def call_score(arguments: argparse.Namespace) -> None:
     if faults:
         _refuse(faults, arguments)
     if arguments.files and not checked.judgements:
-        raise DataError(f"{', '.join(map(str, arguments.files))}: no answer is in these files")
+        raise DataError(f"{', '.join(map(str, arguments.files))}: no answers in these files")
     if checked.silent and arguments.files:
         remark(f"no answers from {', '.join(checked.silent)}", quiet=arguments.quiet)
     scores = score(sheet, key, checked.judgements, checked.silent)
     if not scores.cells:
-        raise DataError(f"{key_file}: the ground truth answers none of its items; give files of people's answers")
+        raise DataError(f"{key_file}: the ground truth answers no item; give files of answers")
     content = asdict(scores)
     if arguments.out is not None:
         _write(arguments.out, scores, sheet_file.parent)
@@ -95,25 +89,25 @@ def call_score(arguments: argparse.Namespace) -> None:
 
 
 def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
-    """``sheet.json`` as given, or that of the key's set in the folders around the key and the answers."""
+    """``sheet.json`` as given, or searched near the key and the answers."""
     from su3d_bench.sheets.items import SHEET_FILE, read_sheet
 
     if arguments.sheet is not None:
         given: Path = arguments.sheet
         return given / SHEET_FILE if given.is_dir() else given
     own = key_file.resolve().parent
-    # sets of several kinds lie deeper: sheets/annotation and sheets-key/annotation
+    # several kinds: sheets/annotation and sheets-key/annotation
     folders = [key_file.parent, *sorted(own.parent.glob("*/")), *sorted(own.parent.parent.glob(f"*/{own.name}/"))]
     folders += [folder for file in arguments.files for folder in (file.parent, file.resolve().parent.parent)]
     for folder in dict.fromkeys(folders):
         file: Path = folder / SHEET_FILE
         if file.is_file() and read_sheet(file).id == sheet_id:
             return file
-    raise DataError(f"{SHEET_FILE} of the set is not around the key or the answers; give it with --sheet")
+    raise DataError(f"{SHEET_FILE} not found near the key or the answers; name it with --sheet")
 
 
 def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
-    """Tell all faults, then raise."""
+    """Print all faults, then raise."""
     if arguments.json:
         output.answer_json(arguments, {"faults": list(faults)})
     else:
@@ -121,7 +115,7 @@ def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
         if len(faults) > SHOWN_FAULTS:
             remark(f"... and {len(faults) - SHOWN_FAULTS} more")
     n = len(faults)
-    raise DataError(f"answers: {counted(n, 'fault')}, listed above; nothing was scored; mend them first")
+    raise DataError(f"answers: {counted(n, 'fault')}, listed above; nothing was scored; fix them first")
 
 
 def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
@@ -148,8 +142,8 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 def _looks_line(scores: Scores) -> str:
     n_disagree = sum(look.reason == "annotators disagree" for look in scores.second_looks)
     n_others = len(scores.second_looks) - n_disagree
-    others = "that nobody calls right" if scores.kind == "questions" else "against the ground truth"
-    return f"To look at again: {n_disagree} where annotators disagree, {n_others} {others}."
+    others = "that no annotator calls right" if scores.kind == "questions" else "against the ground truth"
+    return f"To review: {n_disagree} where annotators disagree, {n_others} {others}."
 
 
 SUBJECTS = ("similarity", "labels", "reasoning")
@@ -160,21 +154,19 @@ FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has
 def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
-    parser.option("--out FILE", "a .pdf, .png or .svg file", required=True)
-    parser.option("--what", "what is drawn (default: similarity)", choices=SUBJECTS, default="similarity")
-    parser.option("--queries TEXT...", "texts, or questions to be answered", default=[])
-    parser.option(
-        "--figure", "the texts of the paper's figure, or of its page's teaser, before --queries", choices=FIGURES
-    )
+    parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
+    parser.option("--what", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
+    parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
+    parser.option("--figure", "add the texts of a figure of the paper or its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
-    parser.option("--photo", "a first column with the colours that the frames saw")
-    parser.option("--view", "from where (default: a corner)", choices=("corner", "above"), default="corner")
-    parser.option("--colours", "of similarity", choices=("paper", "cividis"), default="paper")
+    parser.option("--photo", "add a column with the colours of the scene")
+    parser.option("--view", "viewpoint (default: corner)", choices=("corner", "above"), default="corner")
+    parser.option("--colours", "colour map (default: paper)", choices=("paper", "cividis"), default="paper")
     parser.shared("--device")
 
 
 def call_pictures(arguments: argparse.Namespace) -> None:
-    """Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.
+    """Draw a figure of a run: similarity to texts, labels n and n', or answers with their objects.
 
     su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
     su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf

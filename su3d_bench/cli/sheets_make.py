@@ -25,45 +25,46 @@ if TYPE_CHECKING:
 
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
 KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
-# A person judges some hundred items without a break: so many of each kind of question and scene, instances a scene,
-# or questions of each template and scene.
+# An annotator rates about a hundred items without a break: questions per kind and scene, instances per scene, or
+# questions per template and scene.
 
 PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call)
+    parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
     parser.option(
-        "run [RUN]", "the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)"
+        "--kind ...", "what annotators rate; several kinds give one folder each in DIR", choices=KINDS, required=True
     )
-    parser.option("--kind ...", "what is judged; several give a folder each in DIR", choices=KINDS, required=True)
-    parser.option("--out DIR", "where the sheets go", required=True)
-    parser.option("--key DIR", "where the key goes (default: DIR-key)")
+    parser.option("--out DIR", "folder for the sheets", required=True)
+    parser.option("--key DIR", "folder for the key (default: DIR-key)")
     parser.option(
         "--questions FILE",
-        "a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
+        "question file, paper, or generated (default: generated)",
         default="generated",
         type=str,
     )
     parser.shared("--methods")
     parser.option(
         "--scenes S...",
-        "these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
+        "scenes of the run (default: all), or patterns without RUN",
         default=[],
     )
     parser.shared("--leave-out")
     parser.option(
         "--per-kind N",
-        "most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
-        "in sheets of questions 2 of each kind and template",
+        "maximum number of items per kind and scene (default: depends on the kind)",
         type=count,
     )
-    parser.option("--annotators N", "people who share the work", type=int, default=1)
-    parser.option("--overlap SHARE", "of all items that everybody gets (default: 0.25)", type=float, default=0.25)
+    parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
+    parser.option(
+        "--overlap SHARE", "share of items that all annotators rate (default: 0.25)", type=float, default=0.25
+    )
     parser.shared("--seed", "--jobs", "--device")
     parser.option(
         "--solver",
-        "who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
+        "how to answer questions: built-in (geometry) or llm (default: built-in)",
         choices=("built-in", "llm"),
         default="built-in",
     )
@@ -71,7 +72,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.
+    """Create annotation sheets for a run or for questions: an offline page, a workbook and a CSV.
 
     su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
     su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
@@ -115,51 +116,49 @@ def call(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Refuse what could not be done, or would be done without being asked for."""
+    """Raise ``ConfigError`` for options that do not fit together."""
     kinds = set(arguments.kind)
     if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
-        raise ConfigError(
-            "RUN: name the folder of a run; only --kind questions can do without, and needs --scenes then"
-        )
+        raise ConfigError("RUN: name a run folder; only --kind questions works without one, with --scenes")
     has_questions = arguments.questions != "generated"
     if kinds == {"annotation"} and (has_questions or arguments.leave_out is not None):
-        raise ConfigError("--questions, --leave-out: annotation sheets ask about labels and masks; leave it out")
+        raise ConfigError("--questions, --leave-out: not valid for annotation sheets, which have no questions")
     if kinds == {QUESTIONS} and (has_questions or arguments.methods):
         raise ConfigError(
-            "--questions, --methods: sheets of kind questions judge those made from the ground truth; leave it out"
+            "--questions, --methods: not valid for --kind questions, which uses questions from the ground truth"
         )
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
-        raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
+        raise ConfigError("--solver llm: needs --kind reasoning")
     if arguments.solver != "llm" and (given := options.given_language_option(arguments)):
-        raise ConfigError(f"{given}: is for --solver llm alone; the built-in solver asks nobody")
+        raise ConfigError(f"{given}: only valid with --solver llm")
 
 
 def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
-    """The run without the methods whose maps hold nothing that sheets of a kind judge; it is said which.
+    """The run without the methods whose maps have nothing to rate in sheets of a kind, with a warning.
 
-    Texts are compared with features, of instances or of points; labels, masks and answers are of instances.
+    Retrieval needs features of instances or points; the other kinds need instances.
     """
-    is_able, lacks, wanted = source.has_instances, "has no instances to judge", "instances that people could judge"
+    is_able, lacks, wanted = source.has_instances, "has no instances to rate", "instances to rate"
     if kind == "retrieval":
-        is_able, lacks = source.has_features, "keeps no features to rank by"
-        wanted = "features that a text could be compared with"
+        is_able, lacks = source.has_features, "has no features to rank by"
+        wanted = "features to compare with texts"
     kept = tuple(method for method in source.methods if is_able(source.scenes[0], method))
     if not kept:
         raise ConfigError(
-            f"{source.run.name}: {', '.join(source.methods)}: no map has {wanted}; give the run a method that makes "
+            f"{source.run.name}: {', '.join(source.methods)}: no map has {wanted}; use a method that has "
             "them, such as opensu3d"
         )
     if kept == source.methods:
         return source
     left_out = [method for method in source.methods if method not in kept]
-    remark(f"{kind}: left out {', '.join(left_out)}, which {lacks}", quiet=is_quiet)
+    remark(f"{kind}: excluded {', '.join(left_out)}, which {lacks}", quiet=is_quiet)
     return source.of_methods(kept)
 
 
 def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Key]:
-    """The questions that people judge, and where they come from; what is counted together stands for methods."""
+    """The questions to rate and their origin; kinds take the place of methods."""
     from su3d_bench.sheets.drafts import question_drafts
     from su3d_bench.sheets.items import Key
     from su3d_bench.sheets.scores import OF_ALL_KINDS
@@ -175,9 +174,8 @@ def _questions(
 def _drafts(
     sources: Mapping[SheetKind, RunSource], left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], dict[SheetKind, str]]:
-    """What is judged, and who answered the questions of reasoning sheets or made labels n'.
-
-    Of retrieval sheets: what must be said of the encoder that compared the texts.
+    """The items to rate, and per kind the solver (reasoning), the source of labels n' (annotation), or a remark on the
+    encoder (retrieval).
     """
     import numpy as np
 
@@ -197,7 +195,7 @@ def _drafts(
         client, config = options.chat_client(arguments, source.run.folder)
         ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}
-    for scene in source.scenes:  # all kinds of one scene together, for they share its truth
+    for scene in source.scenes:  # all kinds of one scene together: they share its ground truth
         for kind, mine in sources.items():
             n_most = arguments.per_kind or PER_KIND[kind]
             if kind == "annotation":
@@ -208,7 +206,7 @@ def _drafts(
                 drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
             else:
                 assert encoder is not None
-                # A file is asked as it stands, unless --per-kind limits it.
+                # Use all questions of a file, unless --per-kind limits them.
                 questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind, left_out)
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
@@ -218,7 +216,7 @@ def _drafts(
 
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
-    """Tell what asking the language model would cost at the most."""
+    """Print the maximum cost of the language model."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
     client, config = options.chat_client(arguments, source.run.folder)
@@ -231,7 +229,7 @@ def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.
 
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
-    """The questions of a file or of the paper; None where they are made from the ground truth."""
+    """The questions of a file or of the paper; None if they are generated."""
     from su3d_bench.questions.question_files import paper_queries, read_questions
 
     if arguments.questions == "generated":
@@ -242,7 +240,7 @@ def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Questio
     else:
         given = read_questions(Path(arguments.questions), datasets.pop() if len(datasets) == 1 else None)
     if not any(question.scene in source.scenes for question in given):
-        raise ConfigError(f"--questions {arguments.questions}: asks nothing of a scene of this run")
+        raise ConfigError(f"--questions {arguments.questions}: no question about a scene of this run")
     return given
 
 
@@ -293,7 +291,7 @@ def _write(
     drawn: Mapping[SheetKind, Sequence[bytes]],
     arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
-    """Write a set of each kind, several of them each into a folder of its name; what was written."""
+    """Write one set per kind, several into a folder each; returns what was written."""
     from su3d_bench.sheets.sets import make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
