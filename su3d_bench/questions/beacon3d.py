@@ -220,7 +220,9 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
 def _answers(path: Path, kind: type[Answer], n: int) -> list[Answer]:
     rows: list[Answer] = validated(list[kind], read_metadata(path), shown(path))  # type: ignore[valid-type]
     if len(rows) != n:
-        raise DataError(f"{shown(path)}: {len(rows)} answers for {n} questions; give one answer per question, in the order of the file")
+        raise DataError(
+            f"{shown(path)}: {len(rows)} answers for {n} questions; give one answer per question, in the order of the file"
+        )
     return rows
 
 
@@ -427,9 +429,7 @@ def _kind_of(asked: Path) -> tuple[str, Any]:
     content = read_metadata(asked)
     kind = kind_of_metadata(content)
     if kind is None:
-        raise DataError(
-            f"{shown(asked)}: not a Beacon3D metadata_*_grounding.json or metadata_*_qa.json; see {PAGE}"
-        )
+        raise DataError(f"{shown(asked)}: not a Beacon3D metadata_*_grounding.json or metadata_*_qa.json; see {PAGE}")
     return kind, content
 
 

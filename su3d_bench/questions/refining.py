@@ -288,9 +288,7 @@ def read_records(job: JobFolder) -> NameRecords | None:
     except (ValidationError, RecursionError) as error:
         raise StoreError(f"{path}: invalid file; run su3d-bench runs refine again") from error
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
-        raise StoreError(
-            f"{path}: does not belong to the map {job.prediction.name}; run su3d-bench runs refine again"
-        )
+        raise StoreError(f"{path}: does not belong to the map {job.prediction.name}; run su3d-bench runs refine again")
     return records
 
 

@@ -42,7 +42,8 @@ PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chos
 
 @dataclass(frozen=True)
 class Region:
-    """Location of an instance: ``is_member`` (N,) of the room's points; ``points`` (M, 3) are these in world coordinates.
+    """Location of an instance: ``is_member`` (N,) of the room's points; ``points`` (M, 3) are these in world
+    coordinates.
 
     If no frame sees it, ``is_member`` is all false and ``points`` are those of its map.
     """
@@ -405,7 +406,8 @@ class Figures:
         return [drawn_map(self._source.instances(scene, method)) for method in self._source.methods]
 
     def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
-        """One camera for all ``maps``, chosen in the first: from above or from the corner that shows most of ``wanted``."""
+        """One camera for all ``maps``, chosen in the first: from above or from the corner that shows most of
+        ``wanted``."""
         first = maps[0]
         place = 0
         if self._view == "corner":

@@ -213,14 +213,17 @@ def write_record(path: Path, record: DataclassInstance) -> Path:
 
 
 def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> Record:
-    """The record of a JSON file written by the command ``maker``; ``DataError`` if it is another file or was changed."""
+    """The record of a JSON file written by the command ``maker``; ``DataError`` if it is another file or was
+    changed."""
     where = printable(str(path), 200)
     content = parsed_json(read_bytes(path, where, f"pass a file written by su3d-bench {maker}", MOST_BYTES), where)
     if not isinstance(content, dict) or "digest" not in content:
         raise DataError(f"{where}: not a file written by su3d-bench {maker}")
     digest, schema = content.pop("digest"), content.pop("schema_version", None)
     if schema != SCHEMA:
-        raise DataError(f"{where}: schema {printable(str(schema), 20)} is not supported (expected {SCHEMA}); create it again")
+        raise DataError(
+            f"{where}: schema {printable(str(schema), 20)} is not supported (expected {SCHEMA}); create it again"
+        )
     if digest != digest_json(content):
         raise DataError(f"{where}: changed since su3d-bench {maker} wrote it; restore it or create it again")
     try:
