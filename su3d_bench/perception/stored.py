@@ -224,7 +224,7 @@ def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
     n_features = len(set(_FEATURES) & set(arrays))
     if not {*_REQUIRED} <= set(arrays) <= {*_REQUIRED, *_OPTIONAL} or n_features not in (0, len(_FEATURES)):
         raise DataError(
-            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, optionally captions, and all or none of "
+            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, optional captions, all or none of "
             f"{', '.join(_FEATURES)}"
         )
 

@@ -220,9 +220,7 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
 def _answers(path: Path, kind: type[Answer], n: int) -> list[Answer]:
     rows: list[Answer] = validated(list[kind], read_metadata(path), shown(path))  # type: ignore[valid-type]
     if len(rows) != n:
-        raise DataError(
-            f"{shown(path)}: {len(rows)} answers for {n} questions; give one answer per question, in the order of the file"
-        )
+        raise DataError(f"{shown(path)}: {len(rows)} answers for {n} questions; give one per question, in file order")
     return rows
 
 

@@ -308,7 +308,7 @@ def read_left_out(path: Path) -> frozenset[str]:
         question = row[place].strip() if place < len(row) else ""
         if any(row) and not _ID.fullmatch(question):
             raise DataError(
-                f"{where}: row {number}: '{printable(question, 40)}' is not a question id; use the unchanged file of sheets "
+                f"{where}: row {number}: '{printable(question, 40)}' is not a question id; use the file of sheets "
                 "score --disputed"
             )
         found |= {question} if any(row) else set()

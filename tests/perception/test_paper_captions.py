@@ -134,7 +134,7 @@ def test_offline_a_fresh_folder_with_the_replies_gives_the_same_numbers_and_asks
 ) -> None:
     n_asked = made.server.n_asked
     assert made.run("again", "--offline") == 2
-    assert "holds no reply to this caption request" in capsys.readouterr().err
+    assert "no stored reply to this caption request" in capsys.readouterr().err
     shutil.copytree(made.root / "first" / "language", made.root / "again" / "language")
     assert made.run("again", "--offline") == 0
     assert made.server.n_asked == n_asked

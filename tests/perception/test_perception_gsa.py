@@ -112,7 +112,7 @@ def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_m
     [
         ({"mask": masks()[:, :-1]}, r"masks are \(3, 119, 160\), the frame has height 120 and width 160"),
         ({"class_id": np.array([0, 2, 0])}, "class number 2; 'classes' has 2 names"),
-        ({"classes": "item"}, "'classes' is no list of names"),
+        ({"classes": "item"}, "'classes' is not a list of names"),
         ({"xyxy": np.zeros((2, 4))}, r"xyxy is \(2, 4\)"),
         ({"confidence": np.array([np.nan, 1, 1])}, "a confidence is not finite"),
         ({"confidence": np.ones(2001)}, "has 2001 regions"),

@@ -100,8 +100,8 @@ def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> Non
     ("file", "text", "message"),
     [
         ("names.toml", "48", "not a TOML or JSON table of names by value"),
-        ("names.toml", 'book = "48"', "'book' is no value of a label image; expected 1 to 65535"),
-        ("names.toml", '70000 = "book"', "'70000' is no value of a label image"),
+        ("names.toml", 'book = "48"', "'book' is not a label value; expected 1 to 65535"),
+        ("names.toml", '70000 = "book"', "'70000' is not a label value"),
         ("names.json", '{"48": "a\\nb"}', "the name of 48 is"),
     ],
 )

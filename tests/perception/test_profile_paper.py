@@ -137,17 +137,17 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
-        "names and captions: the tagger's names and a template stand in for the paper's vision model"
+        "names and captions: the tagger's names and a template replace the paper's vision model"
     ]
     other = PaperConfig.model_validate(
         {"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}, "stop_words": ["room"]}}
     )
     encoder.name, captioner.vision_model = "ViT-L-14/openai", "some-model"
     assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
-        "masks: sam-vit-b stands in for the paper's sam-vit-h",
-        "named masks: boxes.box_threshold, stop_words set otherwise than OpenSU3D's",
-        "features: ViT-L-14/openai stands in for the paper's clip-vit-h-14",
-        "names and captions: some-model stands in for the paper's gpt-4-vision-preview",
+        "masks: sam-vit-b replaces the paper's sam-vit-h",
+        "named masks: boxes.box_threshold, stop_words differ from OpenSU3D's settings",
+        "features: ViT-L-14/openai replaces the paper's clip-vit-h-14",
+        "names and captions: some-model replaces the paper's gpt-4-vision-preview",
     ]
 
 
@@ -183,4 +183,4 @@ def test_a_room_runs_end_to_end(
         assert isinstance(found, Instances) and len(found) > 0
         sealed = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
         assert {"packages.torch", "packages.transformers"} <= sealed["steps"]["predict"]["key"].keys()
-    assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
+    assert "RAM++ is not installed" in str(read_json(tmp_path / "out" / "metrics.json"))

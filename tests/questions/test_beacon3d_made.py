@@ -160,7 +160,7 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     assert main([*words, *server]) == 0
     said = capsys.readouterr()
     assert "judge: gpt-4o-2024-08-06, asked for 2 answers" in said.out
-    assert "it gave 1 of them no score, for which the least and the most stand" in said.out
+    assert "1 replies without a score" in said.out
     assert chat.n_asked == 2 and {body["model"] for body in chat.bodies} == {"gpt-4o-2024-08-06"}
     (system, user) = next(body["messages"] for body in chat.bodies if "mauve" in str(body))
     assert (
@@ -175,4 +175,4 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     assert KEY not in said.out + said.err + stored
     Path("qa.json").write_text(json.dumps([{"pred": "teal"}, *rows[1:]]))
     assert main([*words, "--offline"]) == 2
-    assert "holds no reply to this judge request" in capsys.readouterr().err
+    assert "no stored reply to this judge request" in capsys.readouterr().err

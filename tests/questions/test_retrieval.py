@@ -45,7 +45,7 @@ def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None
 def test_retrieval_without_comparable_features_is_refused() -> None:
     with pytest.raises(PredictionError, match="no features"):
         rank(instances_with(None), "east", TwoWords())
-    with pytest.raises(PredictionError, match="3 dimensions and encoder 'two-words' gives 2"):
+    with pytest.raises(PredictionError, match="3 dimensions, encoder 'two-words' has 2"):
         rank(instances_with(np.ones((1, 3))), "east", TwoWords())
 
 

@@ -26,7 +26,7 @@ def small() -> tuple[Sheet, Key]:
 def test_answered_twice_names_both_places(small: tuple[Sheet, Key]) -> None:
     rows = [*both(small), replace(both(small)[0], at="again.csv: row 9")]
     (fault,) = check_answers(small[0], rows).faults
-    assert fault == "again.csv: row 9: is answered a second time, first at ann.csv: row 2; keep one of the two"
+    assert fault == "again.csv: row 9: duplicate answer, first at ann.csv: row 2; remove one of them"
 
 
 @pytest.mark.parametrize("change", [{"sheet_id": "retrieval-other"}, {"kind": "annotation"}, {"items": ()}])

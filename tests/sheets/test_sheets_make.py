@@ -47,7 +47,7 @@ def test_what_annotators_get_names_no_method_no_scene_and_no_truth(tmp_path: Pat
 
 def test_the_key_may_not_lie_among_the_sheets(tmp_path: Path) -> None:
     for key in (tmp_path / "out", tmp_path / "out" / "deeper"):
-        with pytest.raises(ConfigError, match="keep the key apart"):
+        with pytest.raises(ConfigError, match="choose a separate folder"):
             write_sheets(made("retrieval", TEXTS), tmp_path / "out", key)
 
 
@@ -160,7 +160,7 @@ def test_sheets_are_made_from_the_command_line(
     assert all((painted_folder / "out" / "pictures" / item.pictures[0]).is_file() for item in sheet.items)
     assert main(["sheets", "make", "run", "--kind", "annotation", "--out", "labels", "--quiet"]) == 0
     for wrong, line in (
-        (words, "painted/a: has no ground truth that questions could be made from"),
+        (words, "painted/a: no ground truth to generate questions from"),
         ([*words, "--questions", "paper"], "asks nothing of a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
         (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "leave it out"),
@@ -180,11 +180,11 @@ def test_a_folder_of_another_set_and_one_with_answers_are_refused_and_stay(tmp_p
     write_sheets(made("retrieval", TEXTS), out, key)
     assert files() == before
     for folders in ((out, key), (out, tmp_path / "other"), (tmp_path / "other", key)):
-        with pytest.raises(ConfigError, match=r"holds the sheets retrieval-\w+; name another folder"):
+        with pytest.raises(ConfigError, match=r"contains the sheets retrieval-\w+; choose another folder"):
             write_sheets(made("retrieval", TEXTS[:2]), *folders)
     table = out / "annotator-1/sheet.csv"
     table.write_text(table.read_text().replace(",,", ",right,", 1))
     answered = files()
-    with pytest.raises(ConfigError, match=r"sheet\.csv holds answers, or another set; name another folder"):
+    with pytest.raises(ConfigError, match=r"sheet\.csv contains answers or another set; choose another folder"):
         write_sheets(made("retrieval", TEXTS), out, key)
     assert files() == answered

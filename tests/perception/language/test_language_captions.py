@@ -130,7 +130,7 @@ def test_the_paper_s_prompt_goes_with_each_crop() -> None:
     ("model", "reason"),
     [
         (Spoken("I'm sorry, I can't help with that."), "the model refused"),
-        (Spoken("???"), "the answer cannot be read"),
+        (Spoken("???"), "the answer cannot be parsed"),
         (Spoken(""), "an empty answer (no reason given)"),
         (Spoken("", failure="status 500: down"), "status 500: down"),
     ],

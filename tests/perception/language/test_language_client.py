@@ -69,7 +69,7 @@ def test_offline_replays_without_key_and_package_and_names_what_is_missing(
     monkeypatch.setitem(sys.modules, "openai", None)
     offline = ChatClient(LanguageConfig(), ReplyStore(tmp_path), offline=True)
     assert offline.ask(ask("known")).text == "ok"
-    with pytest.raises(StoreError, match=r"holds no reply to this ask request of model 'tiny-model'.*--offline"):
+    with pytest.raises(StoreError, match=r"no stored reply to this ask request of model 'tiny-model'.*--offline"):
         offline.ask(ask("unknown"))
     assert server.n_asked == 1
 
@@ -120,7 +120,7 @@ def test_a_failure_for_good_is_stored_and_asked_again_on_demand_only(server: Cha
 
 def test_a_server_that_fails_again_and_again_ends_the_command(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: error(500)
-    with pytest.raises(ModelMissing, match="3 requests failed one after the other"):
+    with pytest.raises(ModelMissing, match="3 consecutive requests failed"):
         client(server, tmp_path, max_retries=0, max_failures_in_a_row=3, max_concurrent=1).ask_all(
             [ask(str(k)) for k in range(9)]
         )
@@ -265,5 +265,5 @@ def test_pictures_are_keyed_by_their_pixels_and_counted_by_the_rule_of_the_model
 
 @pytest.mark.parametrize("address", ["ftp://x", "http://user:secret@host/v1", "localhost:8000", "http://h/v1?key=1"])
 def test_an_address_that_is_none_or_holds_a_secret_is_refused(address: str) -> None:
-    with pytest.raises(ValueError, match=r"expected an http|keys belong in the environment"):
+    with pytest.raises(ValueError, match=r"expected an http|set keys in the environment"):
         LanguageConfig(base_url=address)

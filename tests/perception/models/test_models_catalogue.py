@@ -109,7 +109,7 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
         locate("clip-vit-b-32", path=mine)
     with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench models fetch"):
         locate("clip-vit-b-32", path=home / "absent")
-    with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
+    with pytest.raises(ConfigError, match=r"is not a supported file; use a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
     renamed = fill(home / "other", ("my_sam.pth",)) / "my_sam.pth"
     assert locate("sam-vit-h", path=renamed).weights == renamed

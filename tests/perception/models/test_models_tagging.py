@@ -54,7 +54,7 @@ def test_the_likeliest_words_are_those_that_some_part_of_the_image_shows() -> No
     # Most of the image is red and three quarters are nothing else; one is blue: both 1, in the order of the list.
     assert tagger.tags(image) == ("blue", "red")
     assert WordTagger(ByColour(), ("green", "blue", "red"), n_tags=9).tags(image) == ("blue", "red", "green")
-    assert tagger.caveat is not None and "RAM++ is not here" in tagger.caveat
+    assert tagger.caveat is not None and "RAM++ is not installed" in tagger.caveat
 
 
 def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
@@ -68,7 +68,7 @@ def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\xff\xfe", "is no UTF-8 text"),
+        (b"\xff\xfe", "is not UTF-8 text"),
         (b"a" * 101, "is no word"),
         (b"ab\n" * 20_001, "has 20001 words"),
         (b"a" * (2**21 + 1), "bytes; expected a list of words"),
