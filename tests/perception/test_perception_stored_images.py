@@ -81,14 +81,14 @@ def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others
         ),
     ],
 )
-def test_what_is_no_label_image_is_said(tmp_path: Path, image: np.ndarray, message: str) -> None:
+def test_invalid_label_image_fails(tmp_path: Path, image: np.ndarray, message: str) -> None:
     write_image(tmp_path, image)
     with pytest.raises(DataError) as caught:
         images(tmp_path).frame(still_life(40))
     assert str(caught.value).startswith("rgbd/desk: frame-0040.segm.png") and message in str(caught.value)
 
 
-def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+def test_image_link_outside_the_folder_fails(tmp_path: Path) -> None:
     outside = write_image(tmp_path / "outside")
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels/frame-0040.segm.png").symlink_to(outside)
@@ -105,7 +105,7 @@ def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> Non
         ("names.json", '{"48": "a\\nb"}', "the name of 48 is"),
     ],
 )
-def test_what_is_wrong_with_the_names_is_said(tmp_path: Path, file: str, text: str, message: str) -> None:
+def test_invalid_names_file_fails(tmp_path: Path, file: str, text: str, message: str) -> None:
     (tmp_path / file).write_text(text)
     with pytest.raises(DataError) as caught:
         read_names(tmp_path / file, "rgbd/desk")

@@ -131,7 +131,7 @@ def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(mode
         assert answer.names == answers[0].names
 
 
-def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:
+def test_profile_reports_exactly_the_deviations_from_the_paper() -> None:
     ram = SimpleNamespace(tagger=SimpleNamespace(caveat=None))
     encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
@@ -151,7 +151,7 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     ]
 
 
-def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_models: Path) -> None:
+def test_auto_selects_paper_on_camera_images_if_models_exist(models: Path, no_models: Path) -> None:
     here, away = config_of(models), config_of(no_models)
     assert resolve_profile("auto", "camera", here) == "paper"
     assert resolve_profile("auto", "rendered-rooms", here) == "embedded"
@@ -161,7 +161,7 @@ def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_mo
     assert caveat is not None and "rendered rooms only" in caveat
 
 
-def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:
+def test_missing_requested_tagger_fails_before_any_frame(models: Path, no_models: Path) -> None:
     check_models("paper", config_of(models))
     with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found .*run: python tools/export_onnx\.py ram-plus"):
         check_models("paper", config_of(models, tagger="ram-onnx"))

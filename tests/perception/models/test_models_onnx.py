@@ -94,7 +94,7 @@ def test_a_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file
         (("spec", "dim"), 10**9, "is no manifest of an exported model"),
     ],
 )
-def test_a_manifest_without_sense_is_one_line(
+def test_invalid_manifest_gives_one_line_error(
     folder: Path, tmp_path: Path, path: tuple[str, ...], value: Any, said: str
 ) -> None:
     content = json.loads((folder / f"{CLIP}-onnx/manifest.json").read_text())
@@ -107,7 +107,7 @@ def test_a_manifest_without_sense_is_one_line(
         EncoderManifest.read(tmp_path / "manifest.json")
 
 
-def test_a_provider_that_is_not_here_and_a_damaged_file_are_one_line(folder: Path, tmp_path: Path) -> None:
+def test_missing_provider_and_damaged_file_give_one_line_errors(folder: Path, tmp_path: Path) -> None:
     import onnxruntime
 
     providers: tuple[Provider, ...] = ("cuda", "tensorrt")
