@@ -136,5 +136,5 @@ def test_pickle_that_executes_code_fails(tmp_path: Path) -> None:
     with pytest.raises(PredictionError, match="exec"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
     write(tmp_path, [1, 2])
-    with pytest.raises(DataError, match="holds a list"):
+    with pytest.raises(DataError, match="contains a list"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

@@ -77,7 +77,7 @@ def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others
         (np.zeros((120, 160, 3), np.uint8), "not a label image: 8 bits, PNG colour type 2; expected one grey channel"),
         (
             np.arange(120 * 160, dtype=np.uint16).reshape(120, 160),
-            "has 19199 regions of 160x120 pixels; expected one a thing",
+            "has 19199 regions of 160x120 pixels; expected one region per object",
         ),
     ],
 )
@@ -92,7 +92,7 @@ def test_image_link_outside_the_folder_fails(tmp_path: Path) -> None:
     outside = write_image(tmp_path / "outside")
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels/frame-0040.segm.png").symlink_to(outside)
-    with pytest.raises(ConfigError, match="leads out of"):
+    with pytest.raises(ConfigError, match="is outside"):
         images(tmp_path / "labels")
 
 

@@ -172,7 +172,7 @@ def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
     sound = replace(made, boxes=np.zeros((2, 2, 3), np.float32))
     assert [one.name for one in map_of(sound).objects] == ["lamp", "couch"]
     assert [one.name for one in map_of(sound, RefinedNames(("a", "b"), "test")).objects] == ["a", "b"]
-    with pytest.raises(PredictionError, match="two instances of one id"):
+    with pytest.raises(PredictionError, match="duplicate instance ids"):
         map_of(replace(sound, ids=np.array([3, 3], np.int32)))
 
 

@@ -166,7 +166,7 @@ def test_top_m_names_are_sorted_by_score_then_order() -> None:
         TopNames("sofa", ("sofa", "couch", "Couches"), (0.9, 0.5, 0.5)),
         TopNames("thing", (), ()),
     ]
-    with pytest.raises(PredictionError, match="keeps no names of its views"):
+    with pytest.raises(PredictionError, match="has no per-view names"):
         top_names(replace(seen(), view_names=None), 3)
 
 

@@ -130,8 +130,8 @@ def test_repeated_server_failures_end_the_command(server: ChatServer, tmp_path: 
 @pytest.mark.parametrize(
     ("trouble", "line"),
     [
-        (error(401, f"Incorrect API key provided: {KEY}"), r"refuses the key in \$SU3D_TEST_KEY"),
-        (error(404, "model 'tiny-model' not found"), "knows no such model or address"),
+        (error(401, f"Incorrect API key provided: {KEY}"), r"rejects the key in \$SU3D_TEST_KEY"),
+        (error(404, "model 'tiny-model' not found"), "unknown model or address"),
         (error(429, "pay", "insufficient_quota"), "no quota left"),
     ],
 )

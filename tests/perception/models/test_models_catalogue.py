@@ -107,7 +107,7 @@ def test_configured_path_is_the_only_one_used(home: Path) -> None:
         ModelMissing, match=r"mine lacks config\.json; run: su3d-bench models fetch clip-vit-b-32 \(0\.6 GB\)"
     ):
         locate("clip-vit-b-32", path=mine)
-    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench models fetch"):
+    with pytest.raises(ModelMissing, match=r"missing .*absent; correct the path, or run: su3d-bench models fetch"):
         locate("clip-vit-b-32", path=home / "absent")
     with pytest.raises(ConfigError, match=r"is not a supported file; use a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")

@@ -156,7 +156,7 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
     [
         ({"model_type": "bert"}, "an encoder is 'clip' or 'siglip'"),
         ({"vision_config": {"num_hidden_layers": 10**6}}, "num_hidden_layers is 1000000"),
-        ({"vision_config": [1]}, "vision_config is no table"),
+        ({"vision_config": [1]}, "vision_config is not a table"),
         ({"quantization_config": {}}, "the weights are quantised"),
         ({"vision_config": {"image_size": 64}}, "the image tower takes 64 px"),
     ],

@@ -91,7 +91,7 @@ def test_a_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file
     [
         (("format",), "x", "format is 'x'"),
         (("files", "../x.onnx"), "0", "files must be names inside the folder"),
-        (("spec", "dim"), 10**9, "is no manifest of an exported model"),
+        (("spec", "dim"), 10**9, "is not the manifest of an exported model"),
     ],
 )
 def test_invalid_manifest_gives_one_line_error(

@@ -69,7 +69,7 @@ def test_stop_word_tags_are_removed_and_added_tags_come_last() -> None:
     ("content", "message"),
     [
         (b"\xff\xfe", "is not UTF-8 text"),
-        (b"a" * 101, "is no word"),
+        (b"a" * 101, "is not a word"),
         (b"ab\n" * 20_001, "has 20001 words"),
         (b"a" * (2**21 + 1), "bytes; expected a list of words"),
     ],
@@ -80,7 +80,7 @@ def test_invalid_word_list_gives_one_line_error(tmp_path: Path, content: bytes, 
     with pytest.raises(DataError, match=message) as caught:
         read_word_list(path)
     assert str(caught.value).isprintable()
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="cannot read the list of words"):
         read_word_list(tmp_path / "absent.txt")
 
 
