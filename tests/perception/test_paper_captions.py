@@ -107,7 +107,7 @@ def test_map_has_model_captions_with_tagger_fallback(made: Finished) -> None:
 
 def test_fallbacks_and_reasons_are_logged_and_recorded(made: Finished) -> None:
     log, record = made.file("log.txt").read_text(), (made.root / "first" / "run.json").read_text()
-    for reason in ("the model refused", "is no chat completion", "status 500: out of order", "no answer within"):
+    for reason in ("the model refused", "is not a chat completion", "status 500: out of order", "no answer within"):
         assert reason in log, reason
         assert reason in record, reason
 
