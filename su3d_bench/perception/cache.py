@@ -1,8 +1,8 @@
-"""What perception computed for a frame, kept on disk under a key of everything that moves it.
+"""On-disk cache of the perception results of a frame, keyed by everything that affects them.
 
 An entry is an npz file without pickled objects that carries a checksum of its arrays. Entries are written under a
-temporary name and renamed, so that concurrent processes see whole entries only; a damaged entry counts as absent
-and is made anew.
+temporary name and renamed, so that concurrent processes see complete entries only; a damaged entry is treated
+as missing and recomputed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ Computed = TypeVar("Computed")
 def cached_regions(
     segmenter: Segmenter, frame: Frame, cache: FrameCache, with_pose: bool, timer: StageTimer
 ) -> Regions:
-    """The regions that ``segmenter`` finds in ``frame``, from the cache where they are known.
+    """The regions that ``segmenter`` finds in ``frame``, cached.
 
     ``with_pose``: they depend on the camera's pose, and on the index of the frame, which seeds the oracle's noise.
     """
@@ -109,7 +109,7 @@ def region_under(masks: BoolArray, points: Int64Array) -> tuple[int, float]:
 
 
 class OfLastFrame(Generic[Computed]):
-    """What ``compute`` makes of a frame, kept while it is asked for that one frame."""
+    """The result of ``compute`` for a frame, stored for the most recent frame."""
 
     def __init__(self, compute: Callable[[Frame], Computed]) -> None:
         self._compute = compute
@@ -123,7 +123,7 @@ class OfLastFrame(Generic[Computed]):
 
 
 class CropsOnDemand:
-    """The half of a ``RegionPerception`` that encodes."""
+    """The encoding part of a ``RegionPerception``."""
 
     def __init__(self, encoder: Encoder) -> None:
         self.dim = encoder.dim
@@ -132,7 +132,7 @@ class CropsOnDemand:
     def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
         """Features (B, dim) of the crops ``boxes`` (B, 4), none of them empty, whatever the mask.
 
-        What surrounds a region tells of it too.
+        The context of a region is informative too.
         """
         if not len(boxes):
             return np.zeros((0, self.dim), np.float32)
@@ -140,16 +140,16 @@ class CropsOnDemand:
 
 
 class RegionsOnDemand(CropsOnDemand):
-    """``RegionPerception`` over the regions of a frame: the one that lies under the points."""
+    """``RegionPerception`` that selects the region of a frame under the points."""
 
     def __init__(self, regions_of: Callable[[Frame], Regions], encoder: Encoder) -> None:
         super().__init__(encoder)
         self._regions = OfLastFrame(regions_of)
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
-        """The mask of the region that holds most of ``points``; empty and 0 where none does.
+        """The mask and score of the region that contains most of ``points``; an empty mask and 0 if there is none.
 
-        How sure it is: the region's score times the share of the points that lie in it.
+        The score is the region's score times the share of points inside it.
         """
         regions = self._regions(frame)
         best, share = region_under(regions.masks, points)
@@ -159,7 +159,7 @@ class RegionsOnDemand(CropsOnDemand):
 
 
 class CropEncoder:
-    """Crop and whole-image features of frames, kept in the cache one table a ratio."""
+    """Crop and image features of frames, cached as one table per ratio."""
 
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
@@ -198,7 +198,7 @@ class CropEncoder:
         return features
 
     def whole(self, frame: Frame, timer: StageTimer) -> Float32Array:
-        """The feature (D,) of the whole image."""
+        """The feature (D,) of the complete image."""
 
         def compute(_: NDArray[np.intp]) -> Float32Array:
             with timer.stage("encode"):
@@ -271,7 +271,7 @@ class FrameCache:
 
     @property
     def is_on(self) -> bool:
-        """Whether entries are kept at all; where not, keys need not be made."""
+        """Whether the cache is enabled; if not, no keys are needed."""
         return self._root is not None
 
     def image_digest(self, rgb: UInt8Array) -> str:
@@ -287,11 +287,11 @@ class FrameCache:
         return self.image_digest(frame.rgb) + array_digest(frame.depth_m, frame.intrinsics, *pose)
 
     def path(self, key: str) -> Path | None:
-        """Where the entry of ``key`` lies, whether or not it is there."""
+        """The path of the entry of ``key``, whether or not it exists."""
         return None if self._root is None else self._root / key[:2] / f"{key}.npz"
 
     def load(self, key: str) -> Arrays | None:
-        """The arrays stored under ``key``, or None where there is no whole entry."""
+        """The arrays stored under ``key``, or None if there is no valid entry."""
         path = self.path(key)
         if path is None or not path.is_file():
             return None
@@ -305,7 +305,7 @@ class FrameCache:
         return arrays
 
     def save(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Store ``arrays`` under ``key`` in one step; raises ``StoreError`` where the disk refuses."""
+        """Store ``arrays`` under ``key`` atomically; raises ``StoreError`` if writing fails."""
         path = self.path(key)
         if path is None:
             return
@@ -314,7 +314,7 @@ class FrameCache:
                 np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
         except OSError as error:
             raise StoreError(
-                f"{path.parent}: the perception cache cannot be written ({error.strerror or error}); "
+                f"{path.parent}: cannot write the perception cache ({error.strerror or error}); "
                 "free space, choose another cache folder, or set perception.cache = false"
             ) from error
 
@@ -327,7 +327,7 @@ def _checksum(arrays: Mapping[str, NDArray[Any]]) -> UInt8Array:
 
 
 def pack_masks(masks: BoolArray) -> Arrays:
-    """``masks`` (K, H, W) as arrays that take little room: the bits of each mask inside its own box, end to end."""
+    """``masks`` (K, H, W) as compact arrays: the bits of each mask inside its own box, end to end."""
     windows = mask_boxes(masks).astype(np.int32)
     bits = [np.packbits(mask[y0:y1, x0:x1]) for mask, (x0, y0, x1, y1) in zip(masks, windows.tolist(), strict=True)]
     return {
@@ -338,7 +338,7 @@ def pack_masks(masks: BoolArray) -> Arrays:
 
 
 def unpack_masks(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
-    """The masks (K, H, W) that ``pack_masks`` took."""
+    """The masks (K, H, W) packed by ``pack_masks``."""
     windows = arrays["mask_windows"]
     height, width = (int(size) for size in arrays["mask_shape"])
     masks = np.zeros((len(windows), height, width), bool)

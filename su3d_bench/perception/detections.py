@@ -1,4 +1,4 @@
-"""How every profile puts the detections of a frame together out of the regions that it has."""
+"""Assemble the detections of a frame from its regions, for all profiles."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def captioned_by_colour(frame: Frame, regions: Regions, timer: StageTimer) -> Re
 
 
 class Assembler:
-    """Detections out of named regions: which are kept, their captions, their features and those of the image."""
+    """Builds detections from named regions: filtering, captions, crop features and the image feature."""
 
     def __init__(
         self, encoder: Encoder, cache: FrameCache, score_scale: Literal["published", "own"] = "published"

@@ -40,7 +40,7 @@ from su3d_bench.perception.detections import Assembler
 
 
 class OracleNoise(BaseModel):
-    """How far the oracle's masks and names are spoilt; every value is 0 by default: none.
+    """Noise added to the oracle's masks and names; all values are 0 (no noise) by default.
 
     Applied in this order: drop a mask; merge it with a touching one; split it by a line through its centre; erode or
     dilate what is left by whole pixels (a grown mask may overlap its neighbour); flip its name to another class of the
@@ -64,7 +64,7 @@ Region = tuple[BoolArray, str]
 def disturb(
     masks: list[BoolArray], names: list[str], known: list[str], noise: OracleNoise, frame_index: int
 ) -> tuple[list[BoolArray], list[str]]:
-    """``masks`` and ``names`` with the faults of ``noise``; ``known`` are the names that a flip may give."""
+    """``masks`` and ``names`` with ``noise`` applied; ``known`` are the candidate names of a flip."""
     generator = np.random.default_rng([noise.seed, frame_index])
     regions = list(zip(masks, names, strict=True))
     is_kept = generator.random(len(regions)) >= noise.drop_probability
@@ -139,7 +139,7 @@ if TYPE_CHECKING:
 
 
 class OracleConfig(BaseModel):
-    """How the truth is projected into a frame.
+    """Parameters for projecting the ground truth into a frame.
 
     A pixel takes the instance of the surface that its ray hits where that surface lies within ``depth_tolerance_m`` of
     the measured depth. Pixels that hit nothing, or another surface, take the instance of the nearest labelled pixel
@@ -243,7 +243,7 @@ def _digest_of_boxes(truth: ObjectBoxes) -> str:
 
 
 class OracleSegmenter:
-    """Regions that are the visible parts of the true instances, named by their class, all scored 1."""
+    """Regions of the visible parts of the ground-truth instances, named by class, with score 1."""
 
     name = "oracle"
 
@@ -281,7 +281,7 @@ class OracleSegmenter:
         return Regions(stacked, mask_boxes(stacked), np.ones(len(pairs), np.float32), tuple(n for _, n in pairs))
 
 
-ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; a ceiling, not a result"
+ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; an upper bound, not a result"
 
 
 class OraclePerception:

@@ -1,4 +1,4 @@
-"""The paper's own front end: RAM++, GroundingDINO, SAM and CLIP; captions by a vision model where asked for."""
+"""The paper's own front end: RAM++, GroundingDINO, SAM and CLIP; captions by a vision model on request."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def stand_ins(config: PaperConfig, networks: Networks, encoder: Encoder, caption
     """What is computed here otherwise than in OpenSU3D's paper, a sentence each; nothing where all is the paper's."""
     said = [networks.tagger.caveat] if networks.tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
-        said.append(f"masks: {config.segmenter} stands in for the paper's {PAPER_SEGMENTER}")
+        said.append(f"masks: {config.segmenter} replaces the paper's {PAPER_SEGMENTER}")
     if others := _settings_besides_the_papers(config.grounded):
-        said.append(f"named masks: {', '.join(others)} set otherwise than OpenSU3D's")
+        said.append(f"named masks: {', '.join(others)} differ from OpenSU3D's settings")
     if encoder.name != MODELS[PAPER_ENCODER].known_as:
-        said.append(f"features: {encoder.name} stands in for the paper's {PAPER_ENCODER}")
+        said.append(f"features: {encoder.name} replaces the paper's {PAPER_ENCODER}")
     if captioner is None:
-        said.append("names and captions: the tagger's names and a template stand in for the paper's vision model")
+        said.append("names and captions: the tagger's names and a template replace the paper's vision model")
     elif captioner.vision_model != PAPER_VISION_MODEL:
-        said.append(f"names and captions: {captioner.vision_model} stands in for the paper's {PAPER_VISION_MODEL}")
+        said.append(f"names and captions: {captioner.vision_model} replaces the paper's {PAPER_VISION_MODEL}")
     return said
 
 
@@ -104,6 +104,6 @@ class PaperPerception:
         if kind not in known:
             hint = suggest(kind, known)
             raise ConfigError(
-                f"profile 'paper': the method asks for {needs.masks} masks '{kind}', there are none{hint}"
+                f"profile 'paper': the method asks for {needs.masks} masks '{kind}', which are not available{hint}"
             )
         return known[kind]

@@ -1,4 +1,4 @@
-"""Who supplies perception: the profiles that a run chooses among by name, and all their parameters."""
+"""The perception backends that a run selects by profile name, and their parameters."""
 
 from __future__ import annotations
 
@@ -161,7 +161,9 @@ def build_perception(
         encoder = load_encoder(config.models, default=own, cache=cache, job_index=job_index)
     if resolved == "oracle":
         if mesh is None:
-            raise ConfigError(f"{scene.dataset}/{scene.scene}: profile 'oracle' needs an annotated mesh, there is none")
+            raise ConfigError(
+                f"{scene.dataset}/{scene.scene}: profile 'oracle' needs an annotated mesh, but there is none"
+            )
         return OraclePerception(config.oracle, mesh, encoder, cache)
     assert mesh is None, "ground truth may reach the oracle only"
     if resolved == "stored":
@@ -174,7 +176,7 @@ def build_perception(
 def _stored(config: PerceptionConfig, scene: SceneInfo, encoder: Encoder, cache: FrameCache) -> Perception:
     stored = config.stored
     if stored.folder is None:
-        raise ConfigError("profile 'stored': perception.stored.folder is not set; name the folder of detections")
+        raise ConfigError("profile 'stored': perception.stored.folder is not set; set it to the folder of detections")
     if stored.images is not None:
         images = LabelImages(stored.folder, stored.images, stored.names, scene)
         return StoredPerception(images, encoder, cache, Namer(config.naming, encoder))

@@ -1,4 +1,4 @@
-"""Detections made elsewhere: the profile ``stored``, and its own format of one npz file a frame.
+"""Precomputed detections: the profile ``stored`` and its format of one npz file per frame.
 
 ``<folder>/<dataset>.<scene>/frame000040.npz`` holds the K regions of the frame with index 40:
 
@@ -43,7 +43,9 @@ MOST_MASK_BYTES = 512 << 20  # of all masks of an image, a byte a pixel: 400 of 
 def check_masks(n: int, shape: tuple[int, ...], where: str) -> None:
     """Refuses more masks (H, W) than any image has, which take far more memory than their file, before they do."""
     if n > MOST_REGIONS or n * shape[0] * shape[1] > MOST_MASK_BYTES:
-        raise DataError(f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one a thing in the image")
+        raise DataError(
+            f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one region per object in the image"
+        )
 
 
 class StoredConfig(BaseModel):
@@ -64,9 +66,9 @@ class StoredConfig(BaseModel):
     @model_validator(mode="after")
     def _names_are_of_images(self) -> StoredConfig:
         if self.names is not None and self.images is None:
-            raise ValueError("names are given to the values of label images; set stored.images too")
+            raise ValueError("stored.names needs label images; set stored.images too")
         if self.images is not None and self.detections is not None:
-            raise ValueError("stored.images and stored.detections name two makers of masks; set one of them")
+            raise ValueError("stored.images and stored.detections are mutually exclusive; set one of them")
         return self
 
 
@@ -110,7 +112,7 @@ def _inside(folder: Path, name: str, where: str, key: str) -> Path:
             return path
     except (OSError, RuntimeError):  # a name too long for the file system, or links in a circle
         pass
-    raise ConfigError(f"{where}: {key}: {name[:80]!r} leads out of {folder}; name files inside it")
+    raise ConfigError(f"{where}: {key}: {name[:80]!r} is outside {folder}; use files inside it")
 
 
 def numbered_files(
@@ -135,7 +137,7 @@ def numbered_files(
                 number = int(match[1])
                 if number in files:
                     raise DataError(
-                        f"{where}: {files[number].name} and {path.name} are of one frame; expected one file"
+                        f"{where}: {files[number].name} and {path.name} belong to the same frame; expected one file"
                     )
                 files[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
     except OSError as error:
@@ -213,9 +215,7 @@ def _load(path: Path, where: str) -> dict[str, NDArray[Any]]:
     try:
         return read_arrays(path)
     except FileNotFoundError:
-        raise DataError(
-            f"{where}: there is no file {path}; a frame without detections has a file with 0 rows"
-        ) from None
+        raise DataError(f"{where}: missing file {path}; a frame without detections needs a file with 0 rows") from None
     except DAMAGE as error:
         raise DataError(f"{where}: {path} is not an npz file of plain arrays ({error})") from error
 
@@ -224,7 +224,7 @@ def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
     n_features = len(set(_FEATURES) & set(arrays))
     if not {*_REQUIRED} <= set(arrays) <= {*_REQUIRED, *_OPTIONAL} or n_features not in (0, len(_FEATURES)):
         raise DataError(
-            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, captions or not, and all or none of "
+            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, optional captions, all or none of "
             f"{', '.join(_FEATURES)}"
         )
 
@@ -252,7 +252,7 @@ def _masks(arrays: Mapping[str, NDArray[Any]], frame: Frame, n: int, where: str)
     masks = np.unpackbits(packed, axis=1, count=height * width).view(bool).reshape(n, height, width)
     empty = np.flatnonzero(~masks.any(axis=(1, 2)))
     if len(empty):
-        raise DataError(f"{where}, region {int(empty[0])}: the mask is empty; leave the region out")
+        raise DataError(f"{where}, region {int(empty[0])}: the mask is empty; remove the region")
     return masks
 
 
@@ -268,7 +268,7 @@ def _boxes(arrays: Mapping[str, NDArray[Any]], frame: Frame, where: str) -> Floa
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
         raise DataError(
-            f"{where}, region {k}: box {boxes[k].tolist()} is turned round or outside the {width}x{height} image"
+            f"{where}, region {k}: box {boxes[k].tolist()} is inverted or outside the {width}x{height} image"
         )
     return boxes
 
@@ -302,7 +302,7 @@ def _features(
     if made_by != encoder.digest:
         raise DataError(
             f"{where}: features were made by encoder {made_by[:12]}, the run uses {encoder.name} "
-            f"{encoder.digest[:12]}; leave the features out to have them computed"
+            f"{encoder.digest[:12]}; remove the features to recompute them"
         )
     ratios, crops, whole = (arrays[key] for key in ("crop_ratios", "crop_features", "global_feature"))
     expected = (n, ratios.size, encoder.dim)
@@ -320,7 +320,7 @@ def _features(
     return of_ratio, whole.astype(np.float32)
 
 
-STORED_CAVEAT = "stored perception: masks and names were made elsewhere and are taken as they are"
+STORED_CAVEAT = "stored perception: masks and names are precomputed and used unchanged"
 
 
 class StoredPerception:

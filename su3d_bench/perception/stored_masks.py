@@ -1,4 +1,4 @@
-"""Stored detections in the formats of others: label images, and ConceptGraphs' detections.
+"""Stored detections in external formats: label images and ConceptGraphs detections.
 
 A label image is a PNG with one channel of 8 or 16 bits and the frame's size; each value above 0 is one region.
 ``pattern`` names the image of a frame below ``folder``: ``{index}`` stands for the frame's number with any zeros before
@@ -105,7 +105,7 @@ def read_names(path: Path, where: str) -> dict[int, str]:
     names: dict[int, str] = {}
     for key, name in table.items():
         if not re.fullmatch(r"[0-9]{1,5}", key) or not 0 < int(key) < 1 << 16:
-            raise DataError(f"{where}: {key[:20]!r} is no value of a label image; expected 1 to 65535")
+            raise DataError(f"{where}: {key[:20]!r} is not a label value; expected 1 to 65535")
         if not (isinstance(name, str) and name.strip() and name.isprintable() and len(name) <= MAX_NAME_LENGTH):
             raise DataError(f"{where}: the name of {key} is {str(name)[:40]!r}; expected a short text")
         names[int(key)] = name.strip()
@@ -132,13 +132,13 @@ class GsaFiles:
         path = self._paths.get(frame.index)
         if path is None:
             raise DataError(
-                f"{self._where}: there are no detections of frame {frame.index}; run ConceptGraphs' "
+                f"{self._where}: missing detections of frame {frame.index}; run ConceptGraphs' "
                 "generate_gsa_results.py with the stride of this run, or with 1"
             )
         where = f"{self._where}: {path.name}"
         content = read_pickle_file(path, forget=_SKIPPED)
         if not isinstance(content, dict):
-            raise DataError(f"{where}: holds a {type(content).__name__}, expected a table of detections")
+            raise DataError(f"{where}: contains a {type(content).__name__}; expected a dict of detections")
         return _frame(content, frame, where)
 
 
@@ -173,7 +173,7 @@ def _numbers(content: Mapping[object, object], key: str, where: str) -> NDArray[
         return value
     if isinstance(value, list) and not value:
         return np.zeros(0)
-    raise DataError(f"{where}: '{key}' is no array of numbers; it is written by generate_gsa_results.py")
+    raise DataError(f"{where}: '{key}' is not a numeric array; write it with generate_gsa_results.py")
 
 
 def _masks(content: Mapping[object, object], n: int, shape: tuple[int, int], where: str) -> BoolArray:
@@ -183,7 +183,7 @@ def _masks(content: Mapping[object, object], n: int, shape: tuple[int, int], whe
     if masks.shape != (n, *shape):
         raise DataError(
             f"{where}: masks are {masks.shape}, the frame has height {shape[0]} and width {shape[1]} and {n} "
-            "detections; they must be made from the images of the dataset at their own size"
+            "detections; compute them from the dataset images at full resolution"
         )
     return masks.astype(bool, copy=False)
 
@@ -191,7 +191,7 @@ def _masks(content: Mapping[object, object], n: int, shape: tuple[int, int], whe
 def _names(content: Mapping[object, object], n: int, where: str) -> tuple[str, ...]:
     classes, chosen = content.get("classes"), _numbers(content, "class_id", where).reshape(-1)
     if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-        raise DataError(f"{where}: 'classes' is no list of names")
+        raise DataError(f"{where}: 'classes' is not a list of names")
     if len(chosen) != n or (chosen.dtype.kind not in "iu" and n):
         raise DataError(f"{where}: {len(chosen)} class numbers of type {chosen.dtype} for {n} detections")
     outside = chosen[(chosen < 0) | (chosen >= len(classes))]

@@ -1,1 +1,1 @@
-"""Questions about a scene: what people and programs are asked, and the answers where somebody knows them."""
+"""Questions about a scene and their answers where known."""

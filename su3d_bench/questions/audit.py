@@ -1,4 +1,4 @@
-"""A sample of the questions that are made of scenes, with everything that one must see to judge them."""
+"""Sample generated questions together with the objects needed to judge them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Things = tuple[MapObject, ...]
 
 @dataclass(frozen=True, eq=False)
 class AuditedQuestion:
-    """A question with its answer in words: what is right, what it was held against, and what else is called so.
+    """A question with its answer in words, its answer objects, reference objects and other objects of the same name.
 
     ``kind`` is one of ``MADE_KINDS``, or a template of the reasoning questions. No object is in two of the three;
     ``room`` has all objects of the scene.
@@ -44,7 +44,7 @@ class AuditedQuestion:
 def audited_questions(
     dataset: Any, scene: str, *, n_each: int = LEAST_EACH, seed: int = 0
 ) -> Iterator[AuditedQuestion]:
-    """All queries of a scene, and ``n_each`` questions at most of each reasoning template."""
+    """All queries of a scene and at most ``n_each`` questions of each reasoning template."""
     address = f"{dataset.name}/{scene}"
     objects = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
     for query in questions_of(dataset, scene):
@@ -65,7 +65,7 @@ def audited_questions(
 
 
 def held_against(question: GeneratedQuestion, objects: SceneMap) -> Things:
-    """What an answer was held against; what is not the case, against what the text ends with."""
+    """The reference objects of an answer; for negative answers, the object at the end of the text."""
     held = _of_ids(objects, question.answer.reference_ids)
     if not held and question.answer.value is False and (mentioned := _mentioned(question.text, objects)):
         held = mentioned[-1]
@@ -73,9 +73,9 @@ def held_against(question: GeneratedQuestion, objects: SceneMap) -> Things:
 
 
 def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list[AuditedQuestion]:
-    """The questions of some kinds, ``retrieval`` and ``reasoning`` standing for all of theirs; all where none is named.
+    """The questions of some kinds (all by default); ``retrieval`` and ``reasoning`` select all of their kinds.
 
-    Raises ``ConfigError`` for a kind that none of the questions is of.
+    Raises ``ConfigError`` for a kind without questions.
     """
     known = list(dict.fromkeys(question.kind for question in questions))
     wanted: set[str] = set()
@@ -84,13 +84,13 @@ def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list
         named = {one for one in known if one == kind or (one in MADE_KINDS) is is_query}
         if not named:
             hint = suggest(kind, (*known, RETRIEVAL, REASONING), "there are:")
-            raise ConfigError(f"questions audit: these scenes have no questions of kind '{printable(kind, 40)}'{hint}")
+            raise ConfigError(f"questions audit: no questions of kind '{printable(kind, 40)}'{hint}")
         wanted |= named
     return [question for question in questions if not kinds or question.kind in wanted]
 
 
 def sample(questions: Sequence[AuditedQuestion], n: int, seed: int) -> list[AuditedQuestion]:
-    """``n`` of the questions, or all, by scene: kinds take turns, each draws from the scene that it has drawn least."""
+    """At most ``n`` questions by scene: kinds take turns, each draws from its least sampled scene."""
     random = np.random.default_rng(seed)
     waiting: dict[str, dict[str, list[AuditedQuestion]]] = {}
     for k in random.permutation(len(questions)).tolist():
@@ -109,7 +109,7 @@ def sample(questions: Sequence[AuditedQuestion], n: int, seed: int) -> list[Audi
 
 
 def n_of_each(n: int, n_scenes: int) -> int:
-    """Of how many questions of a template and scene ``n`` are to be drawn, where one template may have to give all."""
+    """The pool size per template and scene for drawing ``n`` questions, which may all come from one template."""
     return max(LEAST_EACH, math.ceil(n / max(1, n_scenes)))
 
 
@@ -133,7 +133,7 @@ def _called_as(things: Sequence[MapObject], objects: SceneMap) -> Things:
 
 
 def _related(query: Question, right: Things, objects: SceneMap) -> Things:
-    """What the relation of a query leads to: those of the name to which an answer stands so, or else all of it."""
+    """The reference objects of a relation query: those related to an answer, or else all of the name."""
     first, _, second = query.text.partition(" between the ")[2].partition(" and the ")
     if first and second:
         return tuple(thing for thing in objects.objects if thing.name in (first, second))
@@ -147,7 +147,7 @@ def _related(query: Question, right: Things, objects: SceneMap) -> Things:
 
 
 def _mentioned(text: str, objects: SceneMap) -> list[Things]:
-    """The objects of each name in a text, in the order of the names; "coffee table" mentions no table."""
+    """The objects of each name in a text, in the order of the names; "coffee table" does not match "table"."""
     at: dict[int, Things] = {}
     left = text.lower()
     for name in sorted({thing.name for thing in objects.objects if thing.name}, key=lambda name: (-len(name), name)):
@@ -159,7 +159,7 @@ def _mentioned(text: str, objects: SceneMap) -> list[Things]:
 
 
 def _listed(ids: Iterable[int], objects: SceneMap) -> str:
-    """Names and ids of objects; those that questions are not made from have no name."""
+    """Names and ids of objects; objects excluded from questions have no name."""
     shown = {thing.id: thing.shown for thing in objects.objects}
     return ", ".join(shown.get(one, f"object #{one}") for one in ids) or "nothing"
 

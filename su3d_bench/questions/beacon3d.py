@@ -1,4 +1,4 @@
-"""Beacon3D: its files, its numbers of what a system answered, and a language model as judge of answers in words.
+"""Beacon3D: file formats, metrics and an LLM judge for free-form answers.
 
 A metadata file (``metadata_*.json``) has scenes, in these classes, in these objects by their numbers. Of grounding an
 object has three chains of ``text``, ``obj_id`` and ``tag``, the finest text first; of question answering it has ``qa``,
@@ -45,7 +45,7 @@ ANSWER_KEYS = ("response_pred", "answer_pred", "text", "answer_top10", "pred_res
 
 @dataclass(frozen=True)
 class AskedOfObject:
-    """A question of an object with its right answer in words, and of what sort it is."""
+    """A question about an object with its correct answer and its type."""
 
     scene: str
     question: str
@@ -63,7 +63,7 @@ class Chains:
 
 @dataclass(frozen=True)
 class Reply:
-    """What was answered, what is right, and the score of a judge, 1 to 5, where there is one."""
+    """The given and the correct answer, and the judge's score (1 to 5) if available."""
 
     given: str
     right: str
@@ -90,9 +90,9 @@ def kind_of_metadata(content: Any) -> str | None:
 
 
 def read_metadata(path: Path) -> Any:
-    """The content of a file; a ``DataError`` of one line where it is no JSON."""
+    """The content of a JSON file; ``DataError`` if it is not valid."""
     where = shown(path)
-    advice = f"get Beacon3D's files by {PAGE}, data/<domain>/"
+    advice = f"download the Beacon3D files from {PAGE}, data/<domain>/"
     return parsed_json(read_bytes(path, where, advice, MOST_BYTES), where)
 
 
@@ -163,7 +163,7 @@ def chains_of(content: Any, where: str) -> Chains:
 
 
 def questions_of_objects(content: Any, where: str) -> Questions:
-    """Every question in the order of the objects."""
+    """All questions in the order of the objects."""
     asked: list[AskedOfObject] = []
     entries: dict[tuple[str, str], AskedOfObject] = {}
     tags: dict[tuple[str, str], str] = {}
@@ -174,12 +174,12 @@ def questions_of_objects(content: Any, where: str) -> Questions:
             asked.append(AskedOfObject(scene, row.question, row.answer, row.tag.lower()))
             entries.setdefault((scene, row.question), asked[-1])
     if not asked:
-        raise DataError(f"{where}: has no objects")
+        raise DataError(f"{where}: contains no objects")
     return Questions(tuple(asked), tuple(entries.values()))
 
 
 def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
-    """Whether each case of each scene is right, from answers in the order of the list.
+    """Correctness of each case per scene, from answers in the order of the list.
 
     An answer says ``correct``, or ``object_id``, which is right where the text means that object.
     """
@@ -187,7 +187,7 @@ def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
     right: dict[str, dict[int, bool]] = {}
     for number, (answer, (scene, case)) in enumerate(zip(found, chains.entries, strict=True), 1):
         if answer.correct is None and answer.object_id is None:
-            fault = "needs 'correct', true or false, or 'object_id', a whole number"
+            fault = "expected 'correct' (true or false) or 'object_id' (integer)"
             raise DataError(f"{shown(path)}: answer {number}: {fault}")
         object_id = -1 if answer.object_id is None else answer.object_id + 1
         is_right = object_id in chains.cases[scene][case].object_ids
@@ -196,7 +196,7 @@ def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
 
 
 def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Reply]:
-    """What was answered to each question of a scene, by the question in lower case.
+    """The answers of each scene, keyed by the lower-case question.
 
     Where the first answer is of another scene than the first question, answers come in the order of the scenes' names,
     as the original takes them.
@@ -211,7 +211,7 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
         value = next((given[key] for key in ANSWER_KEYS if key in given), None)
         value = value[0] if isinstance(value, list) and value else value
         if not isinstance(value, str) or len(value) > MOST_CHARACTERS:
-            fault = f"needs an answer in words under one of {', '.join(ANSWER_KEYS)}"
+            fault = f"expected an answer text under one of {', '.join(ANSWER_KEYS)}"
             raise DataError(f"{shown(path)}: answer {number}: {fault}")
         replies[entry.scene, entry.question.lower()] = Reply(value, entry.answer, answer.score)
     return replies
@@ -220,13 +220,13 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
 def _answers(path: Path, kind: type[Answer], n: int) -> list[Answer]:
     rows: list[Answer] = validated(list[kind], read_metadata(path), shown(path))  # type: ignore[valid-type]
     if len(rows) != n:
-        raise DataError(f"{shown(path)}: has {len(rows)} answers, the file asks {n}; answer every one, in its order")
+        raise DataError(f"{shown(path)}: {len(rows)} answers for {n} questions; give one per question, in file order")
     return rows
 
 
 @cache
 def _judging() -> dict[str, Any]:
-    """The ``rules`` by which answers are cleaned, and the ``prompt`` of a judge."""
+    """The ``rules`` for normalizing answers and the ``prompt`` of the judge."""
     return parse_toml(file_text(Path(__file__).with_suffix(".toml")))
 
 
@@ -258,7 +258,7 @@ def match(given: str, right: Sequence[str]) -> tuple[bool, bool]:
 
 
 def is_yes_or_no(right: Sequence[str]) -> bool:
-    """Whether a right answer holds "yes" or "no"."""
+    """Whether a correct answer contains "yes" or "no"."""
     return any(word in one.lower() for one in right for word in ("yes", "no"))
 
 
@@ -337,7 +337,7 @@ Key = tuple[str, str]  # of a question: its scene, and its text in lower case
 
 @dataclass(frozen=True)
 class Judged:
-    """Answers with the scores of a judge: how many it was asked, and how many of these it gave no score."""
+    """Answers with judge scores, the number of judge requests and the number of replies without a score."""
 
     replies: Mapping[Key, Reply]
     model: str
@@ -346,13 +346,13 @@ class Judged:
 
 
 def is_open(reply: Reply) -> bool:
-    """Whether an answer matches no right one and has no score yet."""
+    """Whether an answer matches no correct one and has no score yet."""
     _, _, least, most = scored(reply)
     return least < most
 
 
 def judge_requests(replies: Mapping[Key, Reply], config: LanguageConfig) -> dict[Key, ChatRequest]:
-    """What is asked of the judge, for each answer that is open."""
+    """The judge request for each unscored answer."""
     return {
         key: ChatRequest(
             "judge",
@@ -369,7 +369,7 @@ def judge_requests(replies: Mapping[Key, Reply], config: LanguageConfig) -> dict
 
 
 def judged(replies: Mapping[Key, Reply], model: LanguageModel, config: LanguageConfig) -> Judged:
-    """The answers, those that were open with the scores that the judge gave."""
+    """The answers, with judge scores filled in."""
     requests = judge_requests(replies, config)
     said = model.ask_all(list(requests.values()))
     scores = {key: score_of(reply) for key, reply in zip(requests, said, strict=True)}
@@ -378,7 +378,7 @@ def judged(replies: Mapping[Key, Reply], model: LanguageModel, config: LanguageC
 
 
 def score_of(reply: ModelReply) -> float | None:
-    """The first number of a reply, where it is a score.
+    """The first number of a reply if it is a valid score, else None.
 
     >>> score_of(ModelReply("Score: 4")), score_of(ModelReply("10")), score_of(ModelReply("good"))
     (4.0, None, None)
@@ -389,14 +389,14 @@ def score_of(reply: ModelReply) -> float | None:
 
 
 NO_JUDGE = (
-    "where two numbers stand, answers wait for a judge: the least and the most that one can make of them; name a "
+    "ranges are the minimum and maximum over unscored answers; pass a "
     "language model with --judge, or give each answer its 'score', 1 to 5"
 )
 
 
 @dataclass(frozen=True)
 class Answered:
-    """The numbers of answers to a file of Beacon3D, ``grounding`` or ``qa``, and what a judge did for them."""
+    """Metrics for a Beacon3D file (``grounding`` or ``qa``) and the judge's contribution."""
 
     kind: str
     numbers: tuple[Number, ...]
@@ -404,11 +404,11 @@ class Answered:
 
 
 def answered_file(asked: Path, answers: Path, judge: Callable[[Mapping[Key, Reply]], Judged] | None = None) -> Answered:
-    """The numbers of the answers in a file to ``asked``, a metadata file of Beacon3D."""
+    """Metrics of an answers file for ``asked``, a Beacon3D metadata file."""
     kind, content = _kind_of(asked)
     if kind == "grounding":
         if judge is not None:
-            raise ConfigError(f"{shown(asked)}: is of grounding, whose answers are right or not; --judge is for qa")
+            raise ConfigError(f"{shown(asked)}: grounding answers need no judge; use --judge with qa files only")
         chains = chains_of(content, shown(asked))
         return Answered(kind, tuple(grounding_numbers(chains, read_found(answers, chains))))
     questions = questions_of_objects(content, shown(asked))
@@ -418,7 +418,7 @@ def answered_file(asked: Path, answers: Path, judge: Callable[[Mapping[Key, Repl
 
 
 def answers_to_questions(asked: Path, answers: Path) -> Mapping[Key, Reply]:
-    """The answers in a file to a metadata file of questions; none where that is of grounding."""
+    """The answers to a metadata file of questions; empty for grounding."""
     kind, content = _kind_of(asked)
     return read_replies(answers, questions_of_objects(content, shown(asked))) if kind == "qa" else {}
 
@@ -427,14 +427,12 @@ def _kind_of(asked: Path) -> tuple[str, Any]:
     content = read_metadata(asked)
     kind = kind_of_metadata(content)
     if kind is None:
-        raise DataError(
-            f"{shown(asked)}: is no metadata_*_grounding.json or metadata_*_qa.json of Beacon3D, see {PAGE}"
-        )
+        raise DataError(f"{shown(asked)}: not a Beacon3D metadata_*_grounding.json or metadata_*_qa.json; see {PAGE}")
     return kind, content
 
 
 def answered_table(answered: Answered) -> Table:
-    """A row a number, in per cent."""
+    """One row per metric, in percent."""
     is_open = any(one.least < one.most for one in answered.numbers)
     rows = tuple(TableRow(one.name, (Cell(_shown_share(one)), Cell(f"{one.n:,}"))) for one in answered.numbers)
     caption = "Beacon3D's grounding." if answered.kind == "grounding" else "Beacon3D's question answering."
@@ -449,11 +447,11 @@ def _what_was_judged(judged: Judged) -> str:
     line = f"judge: {model}, asked for {asked} that match no right one, with a prompt of this program's own"
     if not judged.n_open:
         return line
-    return f"{line}; it gave {judged.n_open} of them no score, for which the least and the most stand"
+    return f"{line}; {judged.n_open} replies without a score, shown as a range"
 
 
 def answered_json(answered: Answered) -> dict[str, Any]:
-    """The same for programs, as fractions."""
+    """The same as JSON-compatible data, as fractions."""
     judged = answered.judged
     known = None
     if judged is not None:

@@ -1,4 +1,4 @@
-"""Chains of texts that lead to an object, and questions of single objects, as Beacon3D has them, made from a truth.
+"""Text chains and questions about single objects in the style of Beacon3D, generated from ground truth.
 
 The finest text of a chain means one object alone: by a property, by where it is, or by its name. Before it comes the
 name, which means every thing so called. An object has three chains; one with fewer such texts is not asked for.
@@ -36,7 +36,7 @@ FORMS = SHAPES | {word for more, less, _ in SIZES for word in (more, less) if wo
 
 
 def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, most_objects: int | None = None) -> QueryTruth:
-    """The texts of a scene in chains of objects, ``most_objects`` at most, over the instances of its truth."""
+    """The text chains of at most ``most_objects`` objects of a scene, over its ground-truth instances."""
     owner = truth.instance.astype(np.int64)
     owner[owner <= 0] = -1
     cases = chains_of(generate(scene, objects), objects, most_objects)
@@ -47,7 +47,7 @@ def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, most_objects:
 def chains_of(
     questions: Sequence[Question], objects: SceneMap, most_objects: int | None = None
 ) -> tuple[ChainedText, ...]:
-    """Every text of the chains, once, in the order of the objects.
+    """All distinct texts of the chains, in the order of the objects.
 
     Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
     """
@@ -61,7 +61,7 @@ def chains_of(
 
 
 def _chains(questions: Sequence[Question], objects: SceneMap) -> Iterator[tuple[MapObject, list[list[Question]]]]:
-    """Each object that has three chains, and these, each with its finest text first."""
+    """Each object with three chains, and the chains with the most specific text first."""
     name_of = {question.text: question for question in questions if question.kind == INSTANCE}
     for thing in objects.objects:
         coarse = name_of.get(thing.name)
@@ -149,7 +149,7 @@ def made_files(scenes: Mapping[str, SceneMap], per_scene: int | None = None) -> 
         if questions:
             grounding[scene], asked[scene] = chains, questions
     if not asked:
-        raise DataError("no object of these scenes has three texts that mean it alone and three questions; name others")
+        raise DataError("no object has three unambiguous texts and three questions; choose other scenes")
     return grounding, asked
 
 
@@ -181,7 +181,7 @@ def _digest(text: str) -> bytes:
 
 
 def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
-    """Every question that can be asked of an object under a text that means it alone."""
+    """All questions about an object referred to by an unambiguous text."""
     it = f"the {text}" if len(text.split()) <= MOST_PLAIN else f"'the {text}'"
     colours = sorted(set(thing.caption.split()) & COLOURS)
     if len(colours) == 1:
@@ -198,18 +198,18 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
 
 
 def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
-    """Whether a thing is the only one that its name means, and is plain to see."""
+    """Whether an object is the only one of its name and clearly visible."""
     return thing.is_asked and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
 
 
 def _called(name: str, objects: SceneMap) -> list[MapObject]:
-    """What is called so, or something that ends or begins so."""
+    """The objects whose name equals, starts or ends with the given one."""
     wanted = set(words(name))
     return [other for other in objects.objects if wanted <= set(words(other.name)) or set(words(other.name)) <= wanted]
 
 
 def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
-    """What an object stands on, where it is one thing."""
+    """The supporting object, if there is exactly one."""
     others = [other for other in objects.objects if other.id != thing.id]
     under = [other for other in others if objects.holds("on", thing, other)]
     is_sure = not any(objects.is_doubtful("on", thing, other) for other in others)
@@ -218,7 +218,7 @@ def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestio
 
 
 def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[MadeQuestion]:
-    """Whether an object is taller, or larger, than another, where it is by far; of whole things alone."""
+    """Height and size comparisons with a clear margin, between completely observed objects."""
     ways = 0
     for other in sorted(alone, key=lambda other: _digest(f"{it} {other.name}")):
         if ways == MOST_WAYS or not (thing.is_whole and other.is_whole):
@@ -238,7 +238,7 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator
 
 
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[MadeQuestion]:
-    """Whether an object is next to another, and which of two is closer to it by far."""
+    """Whether an object is next to another, and which of two is closer by a clear margin."""
     for other in alone:
         if objects.is_doubtful("next to", thing, other):
             continue

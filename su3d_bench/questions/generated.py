@@ -1,4 +1,4 @@
-"""Questions about a scene made from templates, with the answers that geometry gives them.
+"""Questions about a scene generated from templates, with answers computed from geometry.
 
 Each question is about names that stand in the scene, asked so that the answer is one and that nobody would dispute it:
 what is closest leads by a margin, references are single objects, pairs near a threshold are left out, yes and no are
@@ -46,7 +46,7 @@ Random = np.random.Generator
 
 @dataclass(frozen=True)
 class GeneratedQuestion:
-    """A question with its true answer; ``kind`` names the template.
+    """A question with its ground-truth answer; ``kind`` names the template.
 
     ``by_chance``: how often a guess among what could be answered is right; ``by_name``: how often one is who knows what
     each object is called and nothing else.
@@ -101,7 +101,7 @@ def _drawn(drafts: Sequence[_Draft], n: int, random: Random) -> list[_Draft]:
 
 
 class _Drafts:
-    """The texts of each kind on one scene."""
+    """The texts of each kind for one scene."""
 
     def __init__(self, scene: SceneMap, random: Random, *, with_sides: bool) -> None:
         self._scene = scene
@@ -134,7 +134,7 @@ class _Drafts:
         return {kind: list(drafts()) for kind, drafts in kinds.items()}
 
     def _extreme(self, sign: int) -> Iterator[_Draft]:
-        """Which of several is nearest to (``sign`` 1) or farthest from (-1) a reference."""
+        """Which of several objects is nearest to (``sign`` 1) or farthest from (-1) a reference."""
         of_two, of_more = ("closer to", "closest to") if sign > 0 else ("farther from", "farthest from")
         for reference in self._single:
             for name, n in self._n_of.items():
@@ -160,7 +160,7 @@ class _Drafts:
             yield _Draft(f"What is the distance between the centres of the {a.name} and the {b.name}?", share, share)
 
     def _counts(self) -> Iterator[_Draft]:
-        """How many there are of every name, and of as many names of which there is none."""
+        """Counts for every name, and for equally many absent names."""
         counted = {name: len(meant_by(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
         absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
         absent = [name for name in absent if _is_counted(name) and not meant_by(name, self._scene).objects]
@@ -206,7 +206,7 @@ class _Drafts:
                 yield _Draft(f"What is {relation} the {reference.name}?", share, share)
 
     def _is(self, relation: Relation) -> Iterator[_Draft]:
-        """Whether something called so stands in a relation; the answer is no for things that are far."""
+        """Whether an object of a name is in a relation; negative examples are far away."""
         subjects = {
             a.name for a in self._things if any(self._holds(relation, a, b) for b in self._single if a is not b)
         }
@@ -246,7 +246,7 @@ def _away_m(a: MapObject, b: MapObject) -> float:
 
 
 def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
-    """Whether the first by distance (the last, ``sign`` -1) leads by what anybody sees, all on one level."""
+    """Whether the nearest object (farthest, ``sign`` -1) leads by a clear margin, all at a similar height."""
     heights = [thing.centroid[2] for thing in (*things, reference)]
     if any(thing.is_cut for thing in things):
         return False
@@ -341,12 +341,12 @@ def _listed(name: str, listed: Sequence[str]) -> str | None:
 
 
 def _often(rooms: Rooms) -> list[str]:
-    """What stands in rooms, in falling number of these."""
+    """Object names by decreasing number of rooms that contain them."""
     return [name for name, _ in Counter(name for room in rooms for name in room).most_common()]
 
 
 def _often_with(name: str | None, rooms: Rooms) -> list[str]:
-    """What stands in rooms that have ``name``, in falling number of these."""
+    """Object names by decreasing number of rooms that contain them together with ``name``."""
     return [] if name is None else [one for one in _often([room for room in rooms if name in room]) if one != name]
 
 

@@ -1,4 +1,4 @@
-"""What people, or a program, are asked of a scene, where they are known the objects that answer it, and an answer."""
+"""Data model of questions, their ground-truth answers, and the answers to score."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def question_id(scene: str, kind: str, text: str) -> str:
 
 @dataclass(frozen=True)
 class Question:
-    """One question to one scene.
+    """One question about one scene.
 
     ``scene``: ``<dataset>/<scene>``; ``kind``: one of ``KINDS``, or ``reasoning``; ``answers``: ids of all instances
     of the ground truth that are right, ascending, None where nobody knows; ``source``: where the question comes from.
@@ -57,14 +57,14 @@ class Question:
 
     @property
     def is_known(self) -> bool:
-        """Whether an object is known that answers it."""
+        """Whether answer objects are known."""
         return bool(self.answers)
 
 
 def new_question(
     scene: str, kind: str, text: str, answers: tuple[int, ...] | None, source: str, reply: str = ""
 ) -> Question:
-    """A question with the id that its scene, kind and text give it."""
+    """A question with its id computed from scene, kind and text."""
     ascending = None if answers is None else tuple(sorted(set(answers)))
     return Question(question_id(scene, kind, text), scene, kind, text, ascending, source, reply)
 
@@ -103,7 +103,7 @@ class Answer:
 
 
 def unsettled(reason: str, notes: tuple[str, ...] = ()) -> Answer:
-    """The honest answer where geometry does not settle the question."""
+    """The answer if geometry does not settle the question."""
     return Answer(f"I cannot settle this: {reason}", notes=notes, is_settled=False)
 
 
@@ -126,9 +126,9 @@ def rank(instances: Instances, text: str, encoder: Encoder) -> Ranking:
 
 
 def rank_all(instances: Instances, texts: Sequence[str], encoder: Encoder) -> tuple[Ranking, ...]:
-    """One ranking a text; an instance whose feature is zero has similarity 0."""
+    """One ranking per text; an instance with a zero feature has similarity 0."""
     if instances.features is None:
-        raise PredictionError("query: this map has no features to compare a text with; choose a method that makes them")
+        raise PredictionError("query: the map has no features to compare with text; choose a method that computes them")
     features = instances.features.astype(np.float64)
     encoded = _encoded(texts, encoder, features.shape[1] if len(features) else None)
     rankings = []
@@ -169,7 +169,7 @@ def _encoded(texts: Sequence[str], encoder: Encoder, n_dimensions: int | None) -
     encoded: Float64Array = encoder.encode_texts(list(texts)).astype(np.float64)
     if n_dimensions is not None and encoded.shape[1] != n_dimensions:
         raise PredictionError(
-            f"query: the map's features have {n_dimensions} dimensions and encoder '{encoder.name}' gives "
-            f"{encoded.shape[1]}; use the encoder that the map was made with"
+            f"query: the map's features have {n_dimensions} dimensions, encoder '{encoder.name}' has "
+            f"{encoded.shape[1]}; use the encoder of the map"
         )
     return encoded

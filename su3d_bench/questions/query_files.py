@@ -31,7 +31,7 @@ from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
 MOST_OBJECTS_ID = 2**31 - 1
-ADVICE = "name a file of queries, TOML or CSV, such as su3d-bench query make --out queries.toml writes"
+ADVICE = "pass a TOML or CSV query file, e.g. from su3d-bench query make --out queries.toml"
 MOST_BYTES = 16 << 20  # some hundred thousand queries
 MOST_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"
@@ -48,7 +48,7 @@ def is_text(value: str) -> bool:
 
 def only_words(text: str) -> str:
     if not text.strip() or not is_text(text):
-        raise ValueError("words are expected, without control characters")
+        raise ValueError("expected text without control characters")
     return text.strip()
 
 
@@ -73,7 +73,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 class QueryRow(BaseModel):
-    """One query as a file has it; ``objects`` is empty where nobody knows them."""
+    """One query of a file; ``objects`` is empty if unknown."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -91,27 +91,27 @@ class _Queries(BaseModel):
 
 
 def read_query_rows(path: Path) -> list[tuple[str, QueryRow]]:
-    """Every query of a file in its order, with where it stands, for messages."""
+    """All queries of a file, in order, with their location for messages."""
     where = printable(str(path), 200)
     text = read_text(path, where, ADVICE, MOST_BYTES)
     rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
     for at, row in rows:
         if len(set(row.objects)) != len(row.objects):
-            raise DataError(f"{at}: an object stands there twice; name each once")
+            raise DataError(f"{at}: duplicate object; list each object once")
     if not rows:
-        raise DataError(f"{where}: holds no query; expected {', '.join(COLUMNS)}")
+        raise DataError(f"{where}: contains no queries; expected {', '.join(COLUMNS)}")
     return rows
 
 
 def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
-    """The queries of each scene, in the order of the file; scenes are called without the dataset."""
+    """The queries of each scene, in the order of the file; scene names without the dataset."""
     queries_of_scene: dict[str, list[TextQuery]] = {}
     for at, row in read_query_rows(path):
         if not row.objects:
             raise DataError(f"{at}: 'objects' must name at least one instance id above 0")
         queries = queries_of_scene.setdefault(row.scene.rpartition("/")[2], [])
         if any(query.text == row.text for query in queries):
-            raise DataError(f"{at}: '{printable(row.text, 60)}' stands there twice for {printable(row.scene, 60)}")
+            raise DataError(f"{at}: '{printable(row.text, 60)}' is a duplicate for {printable(row.scene, 60)}")
         queries.append(TextQuery(row.text, row.objects))
     return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
@@ -123,7 +123,7 @@ def query_truth(
     class_of: ClassOfName | None = None,
     alignment: Float64Array | None = None,
 ) -> QueryTruth:
-    """The queries of a scene over the instances of its ground truth; an object that is not there is an error.
+    """The queries of a scene over its ground-truth instances; unknown objects are an error.
 
     Their groups are those of the file, by ``class_of`` where it names objects, and else by the classes of the truth.
     """
@@ -297,7 +297,7 @@ _ID = re.compile(r"[0-9a-f]{12}")
 def read_left_out(path: Path) -> frozenset[str]:
     """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
     where = printable(str(path), 200)
-    text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes", MOST_BYTES)
+    text = read_text(path, where, "pass a CSV file written by sheets score --disputed", MOST_BYTES)
     rows = csv_rows(text, where, ",;\t")
     header = [word.strip() for word in rows[0]] if rows else []
     if header.count(COLUMN) != 1:
@@ -308,8 +308,8 @@ def read_left_out(path: Path) -> frozenset[str]:
         question = row[place].strip() if place < len(row) else ""
         if any(row) and not _ID.fullmatch(question):
             raise DataError(
-                f"{where}: row {number}: '{printable(question, 40)}' is no id of a question; give the file as sheets "
-                "score --disputed wrote it"
+                f"{where}: row {number}: '{printable(question, 40)}' is not a question id; use the file of sheets "
+                "score --disputed"
             )
         found |= {question} if any(row) else set()
     return frozenset(found)

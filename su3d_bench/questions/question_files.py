@@ -53,12 +53,12 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
         if kind not in ALL_KINDS:
             raise DataError(f"{at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
         if "/" not in row.scene and dataset is None:
-            raise DataError(f"{at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+            raise DataError(f"{at}: the dataset of scene '{printable(row.scene, 60)}' is missing; write dataset/scene")
         scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
         source = row.source or printable(path.name, 100)
         question = new_question(scene, kind, row.text, row.objects or None, source)
         if question.id in questions:
-            raise DataError(f"{at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+            raise DataError(f"{at}: '{printable(row.text, 60)}' is a duplicate for {printable(scene, 60)}")
         questions[question.id] = question
     return tuple(questions.values())
 
@@ -112,7 +112,7 @@ def _paper() -> dict[str, Any]:
 def check_form(path: Path) -> None:
     """``DataError`` where the name of a file to be written says no form."""
     if path.suffix.lower() not in (".toml", ".csv"):
-        raise DataError(f"{printable(str(path), 200)}: is neither .toml nor .csv; name the file so")
+        raise DataError(f"{printable(str(path), 200)}: unsupported file type; use .toml or .csv")
 
 
 def write_questions(path: Path, questions: Sequence[Question]) -> None:
@@ -148,7 +148,7 @@ DATASET = "scannet"
 MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
 ADVICE = (
-    "give ScanRefer_filtered_*.json, nr3d.csv or sr3d.csv, SQA3D's v1_balanced_questions_*.json or Beacon3D's "
+    "pass ScanRefer_filtered_*.json, nr3d.csv or sr3d.csv, SQA3D's v1_balanced_questions_*.json or Beacon3D's "
     "metadata_*.json as released, or write scene, text and objects as CSV or TOML"
 )
 _FIRST_BYTES = 65536
@@ -213,7 +213,7 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
         return tuple(_scanrefer(content, where))
     if isinstance(content, dict) and isinstance(content.get("questions"), list):
         return tuple(_situated(content["questions"], _replies(path), where))
-    raise DataError(f"{where}: holds no questions that can be read; {ADVICE}")
+    raise DataError(f"{where}: contains no readable questions; {ADVICE}")
 
 
 def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
@@ -224,7 +224,7 @@ def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     for question in read_foreign(path):
         if not question.is_known:
             raise DataError(
-                f"{printable(str(path), 200)}: {question.source} names no objects; nothing can be scored by it"
+                f"{printable(str(path), 200)}: {question.source} has no answer objects and cannot be scored"
             )
         scene = question.scene.rpartition("/")[2]
         query = TextQuery(question.text, question.answers or (), question.groups, question.name)
@@ -283,7 +283,7 @@ def _replies(path: Path) -> dict[str, str]:
     content = parsed_json(read_text(beside, where, ADVICE, MOST_BYTES), where, ADVICE)
     rows = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(rows, list):
-        raise DataError(f"{where}: has no 'annotations'")
+        raise DataError(f"{where}: missing key 'annotations'")
     known = _rows(_Reply, rows, where, "annotation")
     return {str(row.question_id): row.answers[0].answer for row in known}
 

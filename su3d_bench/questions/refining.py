@@ -47,7 +47,7 @@ class FilterConfig(BaseModel):
 
 
 def undesired(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
-    """Why each instance is left out under its label n' in ``names``; '' where it stays."""
+    """The reason for excluding each instance under its label n' in ``names``; '' if not excluded."""
     reasons = []
     for name, fraction in zip(names, _map_fractions(instances).tolist(), strict=True):
         reason = f"its box has {100 * fraction:.0f} % of the map's area from above"
@@ -99,7 +99,7 @@ class RefinedName:
 def top_names(instances: Instances, m: int) -> list[TopNames]:
     """Names of the ``m`` views of highest prediction score of each instance; ties: the earlier view."""
     if instances.view_names is None or instances.view_scores is None:
-        raise PredictionError("this map keeps no names of its views; make it anew with a method that does (opensu3d)")
+        raise PredictionError("the map has no per-view names; run a method that stores them (opensu3d)")
     tops = []
     for k, label in enumerate(instances.names):
         first, last = int(instances.view_indptr[k]), int(instances.view_indptr[k + 1])
@@ -140,7 +140,7 @@ class ModelRefiner:
         self._config = config
 
     def requests(self, tops: Sequence[TopNames]) -> list[ChatRequest]:
-        """One request for each instance that has a name."""
+        """One request per named instance."""
         config = self._config
         return [
             ChatRequest(
@@ -157,7 +157,7 @@ class ModelRefiner:
         ]
 
     def refine(self, tops: Sequence[TopNames]) -> list[RefinedName]:
-        """n' of each instance: the model's name where it can be used, else n with the reason."""
+        """n' of each instance: the model's name if usable, else n with the reason."""
         requests = self.requests(tops)
         answers = iter(zip(requests, self._model.ask_all(requests), strict=True))
         return [_chosen(top, *next(answers)) if top.names else _unnamed(top) for top in tops]
@@ -268,7 +268,7 @@ def records_of(
 
 
 def write_records(job: JobFolder, records: NameRecords) -> Path:
-    """Write the file beside the map; its path."""
+    """Write the file next to the map; returns its path."""
     job.prepare()
     path = job.path / FILE_NAME
     write_json(path, records.model_dump(mode="json"))
@@ -276,21 +276,19 @@ def write_records(job: JobFolder, records: NameRecords) -> Path:
 
 
 def read_records(job: JobFolder) -> NameRecords | None:
-    """Labels n' of the map; None where there are none, a ``StoreError`` where they belong to another map."""
+    """Labels n' of the map, or None; ``StoreError`` if they belong to another map."""
     path = job.path / FILE_NAME
     if not path.is_file():
         return None
     try:
         content = read_json(path)
         if isinstance(content, dict) and content.get("schema_version") == 1:
-            raise StoreError(f"{path}: knows no filter of large background yet; give su3d-bench runs refine again")
+            raise StoreError(f"{path}: has no filter of large background; run su3d-bench runs refine again")
         records = NameRecords.model_validate(content)
     except (ValidationError, RecursionError) as error:
-        raise StoreError(f"{path}: is not as su3d-bench runs refine writes it; give that command again") from error
+        raise StoreError(f"{path}: invalid file; run su3d-bench runs refine again") from error
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
-        raise StoreError(
-            f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench runs refine again"
-        )
+        raise StoreError(f"{path}: does not belong to the map {job.prediction.name}; run su3d-bench runs refine again")
     return records
 
 
@@ -301,11 +299,11 @@ def refined_digest(job: JobFolder) -> dict[str, str]:
 
 
 def refined_names(job: JobFolder, instances: Instances) -> RefinedNames | None:
-    """Labels n' of the map in ``job``; a file that belongs to another map is passed over with a warning."""
+    """Labels n' of the map in ``job``; a file of another map is ignored with a warning."""
     try:
         records = read_records(job)
     except StoreError as error:
-        log.warning("%s; n' is the vote until then", error)
+        log.warning("%s; until then, n' is the vote", error)
         records = None
     if records is None or len(records.names) != len(instances):
         return voted_names(instances)

@@ -85,7 +85,7 @@ class SceneMap:
         return {thing.id: row for row, thing in enumerate(self.objects)}
 
     def holds(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether one object of the map stands in ``relation`` to another."""
+        """Whether one object of the map is in ``relation`` to another."""
         return bool(self.relations.of(relation)[self._row_of[subject.id], self._row_of[other.id]])
 
     def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
@@ -132,7 +132,7 @@ class SceneMap:
 
     @property
     def middle(self) -> Float64Array:
-        """The middle of the box around all objects."""
+        """The centre of the box around all objects."""
         if not self.objects:
             return np.zeros(3)
         low = np.min([thing.box[0] for thing in self.objects], axis=0)
@@ -154,7 +154,7 @@ def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMa
     if boxes.shape != (k, 2, 3) or centroids.shape != (k, 3) or len(ids) != k:
         raise PredictionError(f"this map has boxes {boxes.shape} and centroids {centroids.shape} for {k} instances")
     if len(set(ids.tolist())) != k:
-        raise PredictionError("this map has two instances of one id, so an answer could name neither")
+        raise PredictionError("the map has duplicate instance ids")
     is_sound = np.isfinite(boxes).all(axis=(1, 2)) & np.isfinite(centroids).all(axis=1)
     is_sound &= True if refined is None else refined.is_kept
     return SceneMap(
@@ -195,7 +195,7 @@ class Meant:
 
 @cache
 def _class_of_words() -> dict[Words, str]:
-    """Every known name -> the class that it names."""
+    """Known name -> class."""
     class_of = {words(name): name for name in vocabulary()}
     for name, others in SYNONYMS.items():
         for other in (name, *others):
@@ -367,7 +367,7 @@ def _without_strays(truth: GroundTruth, rows: Int64Array) -> Float64Array:
 
 
 def plain_name(name: str) -> str:
-    """A class name as people say it.
+    """A class name in plain English.
 
     >>> plain_name("indoor-plant")
     'indoor plant'

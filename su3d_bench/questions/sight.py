@@ -61,7 +61,7 @@ class Sight:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it can be seen well enough to be asked about."""
+        """Whether it is visible enough to ask about."""
         return self.share >= LEAST_SHARE
 
 
@@ -238,7 +238,7 @@ class Looks:
 
     @property
     def is_flat(self) -> bool:
-        """Whether nobody speaks of its volume."""
+        """Whether its volume is not a meaningful size."""
         least, middle, _ = sorted(self.sides.tolist())
         return bool(least < FLAT_SHARE * middle)
 

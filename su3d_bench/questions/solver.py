@@ -1,4 +1,4 @@
-"""The built-in solver: English questions that boxes and centroids settle, answered without any model.
+"""The built-in solver: answers English questions from boxes and centroids without a model.
 
 A small grammar reads a question: closer and farther, distances, counts, presence, relations, between, sizes, places.
 Distances are Euclidean between centroids, as in the paper's prompting strategy; "next to" and "near" go by the gap
@@ -197,7 +197,7 @@ _MEASURES: dict[Size, tuple[str, Callable[[MapObject], float], bool]] = {
 
 
 class _Unsettled(Exception):
-    """The question cannot be settled, for the reason given."""
+    """The question cannot be settled; the message is the reason."""
 
 
 class Solver:
@@ -540,7 +540,7 @@ class LanguageSolver:
         self._config = config
 
     def request(self, question: str) -> ChatRequest:
-        """What is asked of the model."""
+        """The request to the model."""
         return ask_request(context_for(self._scene, question, self._config), question, self._config)
 
     def answer(self, question: str) -> Answer:
@@ -578,14 +578,14 @@ BUILT_IN = "the built-in solver"
 
 @dataclass(frozen=True)
 class MapSolver:
-    """Who answers questions about a map, by name."""
+    """A named question solver for maps."""
 
     name: str
     ask: AskMap
 
 
 def built_in(encoder: Encoder | None) -> AskMap:
-    """Answers by geometry alone; ``encoder`` finds the nearest name."""
+    """Answers from geometry; ``encoder`` finds the nearest name."""
 
     def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
         solver = Solver(scene, None, None if encoder is None else scene_map.nearest_by(encoder))
@@ -595,7 +595,7 @@ def built_in(encoder: Encoder | None) -> AskMap:
 
 
 def by_language_model(model: LanguageModel, config: LanguageConfig) -> MapSolver:
-    """Answers of a language model, several questions at once."""
+    """Answers of a language model, several questions in parallel."""
     name = f"the language model {printable(config.text_model, 100)}"
     return MapSolver(name, lambda scene, questions: LanguageSolver(scene, model, config).answers(questions))
 

@@ -1,4 +1,4 @@
-"""The questions of a scene: a dataset's own, or made from its ground truth, and what the truth says to a protocol's."""
+"""Questions of a scene, from the dataset or generated from its ground truth, and the ground truth of protocols."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _KEPT: _Kept = OrderedDict()
 
 
 def has_own_queries(dataset: Any) -> bool:
-    """Whether a dataset (class or object) knows questions and answers itself."""
+    """Whether a dataset (class or object) provides questions and answers."""
     return isinstance(dataset, HasQueries)
 
 
 def own_questions(dataset: Any, scene: str) -> tuple[Question, ...]:
-    """The questions that the dataset itself knows of a scene, with all right answers."""
+    """The dataset's own questions about a scene, with all correct answers."""
     address = f"{dataset.name}/{scene}"
     return tuple(
         new_question(address, query.kind, query.text, query.answers, f"{dataset.name} truth")
@@ -87,7 +87,7 @@ def question_truth(
 
 
 def _query_truth(questions: Sequence[Question], truth: GroundTruth) -> QueryTruth:
-    """The texts with the objects that answer them, over the labelled points; each text once."""
+    """The distinct texts with their answer objects, over the labelled points."""
     answers: dict[str, set[int]] = {}
     for question in questions:
         answers.setdefault(question.text, set()).update(question.answers or ())
@@ -149,7 +149,7 @@ def _reasoning_truth(
 
 
 def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:
-    """The questions of a scene, ``per_kind`` at most of each kind.
+    """The questions of a scene, at most ``per_kind`` of each kind.
 
     Raises ``GroundTruthMissing`` where the scene has no truth to make them from.
     """
@@ -160,9 +160,9 @@ def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: 
 
 
 def fullest_truth(dataset: Any, scene: str) -> GroundTruth:
-    """The truth of a scene with the most classes; ``GroundTruthMissing`` where the dataset has none."""
+    """The ground truth with the most classes; ``GroundTruthMissing`` if the dataset has none."""
     if not dataset.variants:
-        raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
+        raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to generate questions from")
     variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])
     try:
         truth: GroundTruth = dataset.ground_truth(scene, variant)

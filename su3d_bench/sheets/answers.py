@@ -1,6 +1,6 @@
-"""Answers of annotators, from CSV files and workbooks, and how far annotators agree.
+"""Read the answers of annotators from CSV files and workbooks, and measure inter-annotator agreement.
 
-Formulas are never evaluated: one that stands in the place of an answer is read as its text, which is no answer.
+Formulas are never evaluated: a formula in an answer cell is read as its text, which is not a valid answer.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
 MOST_TEXT_BYTES = 32 << 20  # of a CSV file: some hundred thousand answers
-ADVICE = "give the files that annotators sent back, tables as 'CSV UTF-8'"
+ADVICE = "pass the files returned by the annotators, tables saved as 'CSV UTF-8'"
 MOST_CHARACTERS = 1000  # of one cell that is read
 HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
 
 
 @dataclass(frozen=True)
 class AnswerRow:
-    """One answer as it stands in a file, nothing checked but that all is text; ``at`` names file and row."""
+    """One unvalidated answer of a file; ``at`` names file and row."""
 
     at: str
     sheet_id: str
@@ -43,14 +43,14 @@ class AnswerRow:
 
 
 def read_answers(path: Path) -> list[AnswerRow]:
-    """Every row of a CSV file or XLSX workbook in its order; ``DataError`` where it is no file of answers."""
+    """All rows of a CSV file or XLSX workbook, in order; ``DataError`` if it is not an answers file."""
     told = [name for name in ANSWER_COLUMNS if name != "annotator"]
     rows = rows_of_file(path, ANSWER_COLUMNS)
     return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in told)]
 
 
 def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Place and texts of each row that is not empty, of a CSV file or of every worksheet that has the ``columns``."""
+    """Location and texts of each non-empty row of a CSV file or of each worksheet that has the ``columns``."""
     where = printable(str(path), 200)
     pages: list[tuple[str, Iterable[tuple[int, Sequence[str | None]]]]]
     if path.suffix.lower() == ".csv":
@@ -60,7 +60,7 @@ def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str
         book = read_workbook(read_bytes(path, where, ADVICE, MOST_BYTES), where)
         pages = [(f"{where}: {printable(page.name, 60)}", page.rows) for page in book]
     else:
-        raise DataError(f"{where}: is neither .csv nor .xlsx; export a CSV from the page or save an .xlsx workbook")
+        raise DataError(f"{where}: not a .csv or .xlsx file; export a CSV from the page or save an .xlsx workbook")
     found, has_columns = [], False
     for place, page in pages:
         rows = iter(page)
@@ -72,18 +72,18 @@ def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str
             if any(cells.values()):
                 found.append((at, cells))
     if not has_columns:
-        raise DataError(f"{where}: lacks the columns {', '.join(columns)}, once each; put their names back")
+        raise DataError(f"{where}: missing or duplicate columns ({', '.join(columns)}); restore the header row")
     return found
 
 
 def _places(row: Sequence[str | None], columns: Sequence[str]) -> dict[str, int] | None:
-    """Where each column stands; None where the row is not their header."""
+    """Index of each column; None if the row is not the header."""
     names = [(cell or "").strip().lower() for cell in row]
     return {name: names.index(name) for name in columns} if all(names.count(name) == 1 for name in columns) else None
 
 
 def _text(value: str | None, name: str, at: str) -> str:
-    """The text of a cell, without the mark that keeps a text from being a formula."""
+    """Text of a cell without the leading mark that prevents evaluation as a formula."""
     text = meant((value or "").strip())
     if len(text) > MOST_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
@@ -96,7 +96,7 @@ SHOWN_ITEMS = 5  # of many that are missing
 
 @dataclass(frozen=True)
 class Judgement:
-    """What one annotator said of one item to one of its questions."""
+    """The answer of one annotator to one question about an item."""
 
     item_id: str
     annotator: str
@@ -106,9 +106,9 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Checked:
-    """``judgements`` in the order of the sheet, and in ``faults`` one line each for what must be mended first.
+    """``judgements`` in the order of the sheet; ``faults`` has one line for each problem that must be fixed first.
 
-    ``silent``: annotators of the set of whom no answer is there.
+    ``silent``: annotators of the set without any answer.
     """
 
     judgements: tuple[Judgement, ...]
@@ -117,18 +117,18 @@ class Checked:
 
 
 def check_key(sheet: Sheet, key: Key) -> None:
-    """Raise ``DataError`` where the key is not that of the sheet."""
+    """Raise ``DataError`` if the key does not belong to the sheet."""
     if (sheet.id, sheet.kind) != (key.sheet_id, key.kind) or {one.id for one in sheet.items} != {
         one.id for one in key.items
     }:
         raise DataError(
-            f"key: is of the set '{printable(key.sheet_id, 60)}', the sheet is '{printable(sheet.id, 60)}'; give the "
-            f"key that was made with it"
+            f"key: belongs to the set '{printable(key.sheet_id, 60)}', not '{printable(sheet.id, 60)}'; pass the "
+            f"key created with the sheet"
         )
 
 
 def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
-    """Every row compared with the sheet, then what each annotator who answered has left out."""
+    """Check every row against the sheet, then list the missing answers of each annotator."""
     items = {item.id: item for item in sheet.items}
     shares = {share.name: share.item_ids for share in sheet.annotators}
     first: dict[tuple[str, str, str], str] = {}
@@ -137,7 +137,7 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
         place = (row.annotator, row.item_id, row.question)
         fault = _fault(sheet, row, items, shares)
         if fault is None and place in first:
-            fault = f"is answered a second time, first at {first[place]}; keep one of the two"
+            fault = f"duplicate answer, first at {first[place]}; remove one of them"
         first.setdefault(place, row.at)
         if fault is None:
             judgements.append(Judgement(row.item_id, row.annotator, row.question, _plain(row.answer)))
@@ -148,8 +148,8 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
         missing = [item_id for item_id in share for ask in items[item_id].asks if (name, item_id, ask) not in first]
         if name in answered and missing:
             faults.append(
-                f"annotator '{printable(name, 40)}': {len(missing)} answers are not there "
-                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); answer them, or give the rest of the files"
+                f"annotator '{printable(name, 40)}': {len(missing)} answers are missing "
+                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); complete them or pass the remaining files"
             )
     order = {item.id: k for k, item in enumerate(sheet.items)}
     names = [ask.name for ask in sheet.asks]
@@ -158,30 +158,30 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
 
 
 def _plain(answer: str) -> str:
-    """An answer as choices are spelt, whatever its capitals and blanks."""
+    """The answer normalized to the spelling of a choice, ignoring case and whitespace."""
     return " ".join(answer.split()).casefold()
 
 
 def _fault(
     sheet: Sheet, row: AnswerRow, items: Mapping[str, SheetItem], shares: Mapping[str, Sequence[str]]
 ) -> str | None:
-    """What is wrong with a row, and what to do about it."""
+    """The problem of a row and how to fix it."""
     item = items.get(row.item_id)
     if row.sheet_id != sheet.id:
-        return f"belongs to the set '{printable(row.sheet_id, 60)}', not to '{sheet.id}'; give the key of its own set"
+        return f"belongs to the set '{printable(row.sheet_id, 60)}', not to '{sheet.id}'; use the key of that set"
     if item is None:
         near = nearest(row.item_id, items)
-        return f"item '{printable(row.item_id, 40)}' is not in this set{near or '; put its id back'}"
+        return f"item '{printable(row.item_id, 40)}' is not in this set{near or '; restore its id'}"
     if row.check != item.check:
-        return f"cells of item '{item.id}' were changed ('check' does not fit); put back what stood there"
+        return f"item '{item.id}': cells were changed ('check' does not match); restore the original cells"
     if row.question not in item.asks:
         known = ", ".join(item.asks)
-        return f"question '{printable(row.question, 40)}' is not asked of item '{item.id}', but {known}; put it back"
+        return f"question '{printable(row.question, 40)}' does not apply to item '{item.id}': {known}; restore it"
     if row.item_id not in shares.get(row.annotator, ()):
         hint = suggest(row.annotator, sorted(shares), "it has")
-        return f"item '{item.id}' is not in the share of annotator '{printable(row.annotator, 40)}'{hint}"
+        return f"item '{item.id}' is not assigned to annotator '{printable(row.annotator, 40)}'{hint}"
     if not row.answer:
-        return f"no answer (item '{item.id}', question '{row.question}'); answer, and export again"
+        return f"missing answer (item '{item.id}', question '{row.question}'); answer it and export again"
     choices = sheet.ask(row.question).choices
     if _plain(row.answer) not in choices:
         hint = suggest(row.answer, choices, "choose one of")
@@ -194,7 +194,7 @@ Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer
 
 @dataclass(frozen=True)
 class PairAgreement:
-    """Cohen's kappa of two annotators over the ``n`` items that both answered; None where it is undefined."""
+    """Cohen's kappa of two annotators over the ``n`` items that both answered; None if undefined."""
 
     left: str
     right: str
@@ -205,11 +205,11 @@ class PairAgreement:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What can be said of one question: its items with two answers or more, and the coefficients over them.
+    """Agreement coefficients of one question over its items with at least two answers.
 
-    ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the number that most of them have. ``alpha``
-    is Krippendorff's for nominal data, of all; its ``interval`` is over items, of at least ten. None: undefined, for
-    want of items or because nobody ever chose a second answer.
+    ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the most common number. ``alpha``
+    is Krippendorff's for nominal data over all items; its ``interval`` is over items and needs at least ten. None:
+    undefined, because there are no items or only one answer occurs.
     """
 
     n_annotators: int
@@ -224,7 +224,7 @@ class Agreement:
 
 
 def agreement(ratings: Ratings) -> Agreement:
-    """All coefficients for one question; ``ratings`` may hold items with a single answer, which say nothing."""
+    """All coefficients for one question; items of ``ratings`` with a single answer are ignored."""
     answers = sorted({answer for item in ratings.values() for answer in item.values()})
     annotators = sorted({annotator for item in ratings.values() for annotator in item})
     given = [list(item.values()) for item in ratings.values()]
@@ -262,7 +262,7 @@ def _pair(ratings: Ratings, left: str, right: str) -> PairAgreement:
 def cohen_kappa(left: Sequence[str], right: Sequence[str]) -> float | None:
     """Cohen's kappa [Cohen 1960] of two annotators' answers to the same items, in the same order.
 
-    None without items, and where both gave one and the same answer throughout: chance alone would agree so.
+    None without items, or if both annotators always gave the same single answer (expected agreement is 1).
     """
     if len(set(left) | set(right)) < 2:
         return None
@@ -274,7 +274,7 @@ def cohen_kappa(left: Sequence[str], right: Sequence[str]) -> float | None:
 def fleiss_kappa(counts: Int64Array) -> float | None:
     """Fleiss' kappa [Fleiss 1971, equation 7] of items (rows) by answers (columns); all rows have the same sum >= 2.
 
-    None without items, and where only one answer was ever given.
+    None without items, or if only one answer occurs.
 
     >>> round(fleiss_kappa(np.array([[2, 0], [0, 2], [1, 1], [2, 0]])), 4)
     0.4667
@@ -292,8 +292,8 @@ def fleiss_kappa(counts: Int64Array) -> float | None:
 def krippendorff_alpha(counts: Int64Array) -> float | None:
     """Krippendorff's alpha for nominal data [Krippendorff 2011, section D] of items (rows) by answers (columns).
 
-    Items may have any number of answers; those with fewer than two have no part in it. None without such items, and
-    where only one answer was ever given.
+    Items may have any number of answers; those with fewer than two are ignored. None without such items, or
+    if only one answer occurs.
 
     >>> round(krippendorff_alpha(np.array([[2, 0], [0, 2], [1, 1], [2, 0]])), 4)
     0.5333
@@ -305,7 +305,7 @@ def krippendorff_alpha(counts: Int64Array) -> float | None:
 
 
 def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array:
-    """Alpha for each row of how often each item is drawn (R, N); NaN where only one answer is left."""
+    """Alpha for each row of item counts (R, N) of a resample; NaN if only one answer is left."""
     sizes = counts.sum(axis=1)
     # o_cc, the diagonal of the coincidence matrix: ordered pairs of equal answers in an item, over its size less one
     equal = (counts * (counts - 1)).sum(axis=1) / (sizes - 1)

@@ -1,4 +1,4 @@
-"""A sample of questions with a picture each, on which people say whether they and their answers are right."""
+"""A sample of illustrated questions for a manual check of questions and answers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Verdict:
-    """A line of the table; ``verdict`` is empty where nobody has judged yet."""
+    """A row of the table; ``verdict`` is empty until judged."""
 
     number: str
     scene: str
@@ -39,30 +39,32 @@ class Verdict:
 
     @property
     def line(self) -> str:
-        """The question in one line."""
+        """The question on one line."""
         ends = f"; {self.remark}" if self.remark else ""
         return f"{self.verdict}: {self.number} {self.scene}, {self.kind}: {self.text} -> {self.answer}{ends}"
 
 
 def read_verdicts(path: Path) -> list[Verdict]:
-    """Every question of the file in its order; ``DataError`` for a missing column or an unknown verdict."""
+    """All questions of the file, in order; ``DataError`` for a missing column or an unknown verdict."""
     verdicts = []
     for at, cells in rows_of_file(path, COLUMNS):
         one = Verdict(**cells | {"verdict": cells["verdict"].lower()})
         if one.verdict and one.verdict not in VERDICTS:
-            hint = suggest(one.verdict, VERDICTS, "write nothing, or one of")
+            hint = suggest(one.verdict, VERDICTS, "leave it empty or use one of")
             raise DataError(f"{at}: unknown verdict '{printable(one.verdict, 40)}'{hint}")
         verdicts.append(one)
     if not verdicts:
-        raise DataError(f"{printable(str(path), 200)}: holds no question")
+        raise DataError(f"{printable(str(path), 200)}: contains no questions")
     return verdicts
 
 
 def audit_table(verdicts: Sequence[Verdict]) -> Table:
-    """How many of each kind are right, and below it what is not; ``DataError`` where nothing is judged."""
+    """Share of correct questions for each kind, followed by the incorrect ones; ``DataError`` if none is judged."""
     judged = [one for one in verdicts if one.verdict]
     if not judged:
-        raise DataError(f"none of {len(verdicts)} questions is judged; write {', '.join(VERDICTS)} into 'verdict'")
+        raise DataError(
+            f"none of the {len(verdicts)} questions is judged; fill the column 'verdict' with {', '.join(VERDICTS)}"
+        )
     kinds = [ALL, *sorted({one.kind for one in judged})]
     of_kind = {kind: [one.verdict for one in judged if kind in (ALL, one.kind)] for kind in kinds}
     faults = [one for verdict in (WRONG, ARGUABLE) for one in judged if one.verdict == verdict]
@@ -82,7 +84,7 @@ def audit_table(verdicts: Sequence[Verdict]) -> Table:
 
 
 def audit_json(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """The same for programs."""
+    """The same as JSON-compatible data."""
     judged = [one for one in verdicts if one.verdict]
     counts = {
         kind: {verdict: sum(one.verdict == verdict and one.kind == kind for one in judged) for verdict in VERDICTS}
@@ -111,12 +113,12 @@ def make_audit(
 ) -> Path:
     """Write pictures, a page and a table of ``questions`` into ``out``; the path of the page.
 
-    ``dataset_of`` leads from the address of a scene to its dataset. Raises ``StoreError`` where verdicts stand in the
-    table that would be replaced.
+    ``dataset_of`` returns the dataset of a scene address. Raises ``StoreError`` instead of overwriting a table that
+    contains verdicts.
     """
     table = out / FILE
     if table.is_file() and any(row.verdict for row in read_verdicts(table)):
-        raise StoreError(f"{printable(str(table), 200)}: holds verdicts; choose another --out, or remove it")
+        raise StoreError(f"{printable(str(table), 200)}: contains verdicts; choose another --out or remove it")
     make_folder(out / PICTURES)
     source = TruthSource(list(dict.fromkeys(one.scene for one in questions)), dataset_of)
     artist, drawn = Artist(source), ""
@@ -132,13 +134,13 @@ def make_audit(
         rows.append((number, *(printable(cell, MOST_CHARACTERS) for cell in cells), "", ""))
         entries.append(Entry(f"{number}, {one.scene}, {one.kind}", one.text, _lines(one), (name,)))
     write_text(table, csv_lines(rows))
-    note = "Red: what answers. Blue: what that was compared with."
-    write_text(out / "index.html", list_page(f"Questions to look at: {len(entries)}", note, entries, PICTURES))
+    note = "Red: answer objects. Blue: reference objects."
+    write_text(out / "index.html", list_page(f"Questions to check: {len(entries)}", note, entries, PICTURES))
     return out / "index.html"
 
 
 def _draft(question: AuditedQuestion, source: TruthSource) -> Draft:
-    """What is drawn of a question: its answer and what that was compared with, by their ids."""
+    """The ids of the answer objects and reference objects to draw."""
     row_of = {instance: row for row, instance in enumerate(source.instances(question.scene).ids.tolist())}
     draft = Draft(kind="questions", scene=question.scene, methods=("",), instance_ids=(-1,))
     right, held = ([thing.id for thing in things] for things in (question.right, question.held))

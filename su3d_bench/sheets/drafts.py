@@ -1,6 +1,6 @@
-"""What is put before people, before it is shuffled and drawn: one draft for all schemes that give the same.
+"""Drafts of the items to judge, before shuffling and rendering; methods with the same result share one draft.
 
-Texts and names do not tell whose map they are of: letters stand in place of its ids.
+Texts and names do not reveal the method: letters replace the ids of its map.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ UNKNOWN = "something unknown"  # what stands in place of an id that the map does
 
 
 def without_ids(text: str, scene: SceneMap, spoken_of: Sequence[int]) -> tuple[str, dict[int, str]]:
-    """``text`` with a name for each thing that it calls by its id, and these names, also of the ids ``spoken_of``.
+    """``text`` with object ids replaced by names, and the names, including those of the ids ``spoken_of``.
 
-    Things of one name are told apart by letters, in the order in which the text comes to them.
+    Objects with the same name get letters in order of appearance.
     """
     numbers = {int(digits) for digits in re.findall(r"\d{1,18}", text)}
     written = [thing for thing in scene.objects if thing.id in numbers]
@@ -66,7 +66,7 @@ def _called(number: str) -> str:
 
 
 def _names(things: Sequence[MapObject]) -> dict[int, str]:
-    """A name for each thing by its id."""
+    """Object id -> name."""
     plain = {thing.id: _plain(thing) for thing in things}
     shared = {name for name, n in Counter(plain.values()).items() if n > 1}
     n_before: Counter[str] = Counter()
@@ -93,11 +93,11 @@ HINT = re.compile(r"; did you mean '[^']*'\?")  # for who can ask again
 
 @dataclass(frozen=True)
 class Draft:
-    """An item without number and picture. ``rows`` of the map of ``methods[0]`` are outlined, ``others`` drawn too.
+    """An item without number and picture; ``rows`` of the map of ``methods[0]`` are outlined, ``others`` drawn too.
 
-    ``title``: lines of the picture; ``text``: what the sheet shows; ``names`` (K) of the map's instances as the answer
-    calls them, '' of those that it does not speak of. ``points`` (M, 3) m are what was found in a map that has no
-    instances, and then row 0.
+    ``title``: lines of the picture; ``text``: text on the sheet; ``names`` (K): names of the map's instances in the
+    answer, '' if not mentioned. ``points`` (M, 3) m: the retrieved points of a map without instances, used as
+    row 0.
     """
 
     kind: SheetKind
@@ -128,9 +128,9 @@ def questions_of(
     per_kind: int | None,
     left_out: Collection[str] = (),
 ) -> list[Question]:
-    """The questions of four kinds to a scene: those ``given``, else the ones that its ground truth answers.
+    """The questions of four kinds for a scene: those ``given``, else questions generated from its ground truth.
 
-    Those whose ids are ``left_out`` make room for others.
+    Questions whose ids are ``left_out`` are replaced by others.
     """
     if given is None:
         rules, truth = _known_truth(source, scene, "retrieval")
@@ -145,21 +145,21 @@ def questions_of(
 
 
 def _known_truth(source: RunSource, scene: str, kind: str) -> tuple[ProtocolRules, GroundTruth]:
-    """The ground truth that questions of a kind are made from, and its rules."""
+    """The ground truth from which questions of a kind are generated, and its rules."""
     rules = source.rules(scene, kind)
     truth = source.truth(scene, rules)
     if rules is None or truth is None:
         raise ConfigError(
-            f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file of "
-            "questions with --questions FILE, or --questions paper"
+            f"{printable(scene, 100)}: no ground truth to generate questions from; pass a question "
+            "file with --questions FILE or use --questions paper"
         )
     return rules, truth
 
 
 def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
-    """For each question one draft for everything that some method finds first, with all methods that do.
+    """For each question, one draft per distinct top-ranked result, with all methods that return it.
 
-    Of instances that is the most similar one, of features alone the points that ``points_found`` says.
+    The result is the most similar instance or, for a map of features only, the points of ``points_found``.
     """
     rules = source.rules(scene, "retrieval")
     texts = [question.text for question in questions]
@@ -200,19 +200,19 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
 
 @dataclass(frozen=True)
 class _Firsts:
-    """What a map gives for some questions: the row of ``a_map`` for each; of features alone that is what is found."""
+    """Results of a map: the row of ``a_map`` for each question, or the retrieved points if it has features only."""
 
     a_map: Instances
     rows: tuple[int, ...]
     is_of_points: bool
 
     def id_at(self, place: int) -> int:
-        """The number of the instance that answers a question; -1 of points, which are none."""
+        """The id of the instance that answers a question; -1 for points."""
         return -1 if self.is_of_points else id_of(self.a_map, self.rows[place])
 
 
 def _firsts(prediction: Prediction, texts: Sequence[str], encoder: Encoder) -> _Firsts | None:
-    """What a map gives for each text; None of an empty one."""
+    """The result of a map for each text; None for an empty map."""
     if not len(prediction.points):
         return None
     if isinstance(prediction, DenseFeatures):
@@ -225,9 +225,10 @@ def _firsts(prediction: Prediction, texts: Sequence[str], encoder: Encoder) -> _
 
 
 def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.random.Generator) -> list[Draft]:
-    """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order.
+    """At most ``n_most`` instances per scene, sampled with ``random``, with labels n and n' in random order.
 
-    Methods take turns, however many instances each has. What the filter of labels n' leaves out has label n alone.
+    Methods take turns regardless of their instance counts. Instances excluded by the filter of labels n' only have
+    label n.
     """
     rules = source.rules(scene, "annotation")
     truth = source.truth(scene, rules)
@@ -258,7 +259,7 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
 
 
 def _in_turn(drafts: Sequence[Draft], methods: Sequence[str], order: Sequence[int]) -> list[int]:
-    """``order`` so that each method in turn has a part in the next draft, as long as it has one left."""
+    """``order`` rearranged so that methods contribute drafts in turn while they have any left."""
     mine = {method: deque(k for k in order if method in drafts[k].methods) for method in methods}
     taken: dict[int, None] = {}
     while any(mine.values()):
@@ -271,7 +272,7 @@ def _in_turn(drafts: Sequence[Draft], methods: Sequence[str], order: Sequence[in
 
 
 def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
-    """The draft with label n and label n' as labels 1 and 2 in drawn order; as one where they are equal."""
+    """The draft with labels n and n' as labels 1 and 2 in random order; equal labels are shown once."""
     meant: dict[str, list[str]] = {}
     for name, what in zip(draft.title, LABELS, strict=False):
         meant.setdefault(name, []).append(what)
@@ -292,7 +293,7 @@ Judge = Callable[[int, Sequence[str]], Mapping[str, str]]
 def _annotation_judge(
     source: RunSource, scene: str, rules: ProtocolRules | None, truth: GroundTruth | None, instances: Instances
 ) -> Judge:
-    """What the truth says of an instance and its labels: ``n``, ``n'`` and ``merging``; nothing where it is silent."""
+    """Ground-truth judgements ``n``, ``n'`` and ``merging`` of an instance; those without ground truth are omitted."""
     covered = source.covered(scene, rules, instances)
     if covered is None or rules is None or truth is None or rules.merging is None:
         return lambda row, names: {}
@@ -310,7 +311,7 @@ def _annotation_judge(
 
 
 def also(draft: Draft, method: str, instance_id: int) -> Draft:
-    """The draft, said by one more method; that of a method said twice stays as it is."""
+    """The draft with one more method; unchanged if the method is already listed."""
     if method in draft.methods:
         return draft
     return replace(draft, methods=(*draft.methods, method), instance_ids=(*draft.instance_ids, instance_id))
@@ -321,7 +322,7 @@ def id_of(instances: Instances, row: int) -> int:
 
 
 def requests_into(requests: list[ChatRequest], client: LanguageModel, config: LanguageConfig) -> AskMap:
-    """Puts what a language model would be asked into ``requests`` and asks nobody."""
+    """Collect the requests to a language model in ``requests`` without sending them."""
 
     def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
         solver = LanguageSolver(scene, client, config)
@@ -339,10 +340,10 @@ def reasoning_drafts(
     ask: AskMap,
     left_out: Collection[str] = (),
 ) -> list[Draft]:
-    """The answers about each map, one draft for all maps of which the same is said.
+    """The answers about each map; maps with the same answer share one draft.
 
-    Asked are the questions of kind ``reasoning`` that are ``given``, else ``per_kind`` of each template, made from the
-    ground truth; without those whose ids are ``left_out``.
+    Uses the ``given`` questions of kind ``reasoning``, else ``per_kind`` generated from the ground truth for each
+    template; without those whose ids are ``left_out``.
     """
 
     rules = source.rules(scene, "reasoning")
@@ -386,7 +387,7 @@ def reasoning_drafts(
 
 
 def _known(source: RunSource, scene: str, per_kind: int) -> Sequence[TrueAnswer]:
-    """Questions made from the ground truth of a scene, with their answers."""
+    """Questions generated from the ground truth of a scene, with their answers."""
     rules, truth = _known_truth(source, scene, "reasoning")
     with_fewer = rules.model_copy(update={"per_kind": per_kind})
     made: Any = truths.question_truth(with_fewer, source.run.dataset(scene), scene.partition("/")[2], truth)
@@ -402,9 +403,9 @@ def with_answer(
     names: Mapping[int, str],
     row_of: Mapping[int, int],
 ) -> Draft:
-    """The draft with a question and its answer as title, and what they speak of outlined and named.
+    """The draft with question and answer as title; the objects they mention are outlined and named.
 
-    ``ids`` of the objects that answer and of those that they were compared with, as ``names`` and ``row_of`` have them.
+    ``ids``: the answer objects and the reference objects, as in ``names`` and ``row_of``.
     """
     rows, others = (tuple(row_of[one] for one in of_part if one in row_of) for of_part in ids)
     name_of = {row_of[one]: name for one, name in names.items() if one in row_of}
@@ -418,9 +419,9 @@ def with_answer(
 
 
 def told(answer: Answer) -> str:
-    """The answer as people see it: why a language model gave none names the model, which they must not see.
+    """The answer as shown to annotators, without the name of the language model in failure reasons.
 
-    Nor does the word that the map has instead, which is no part of the answer.
+    Suggestions of other words of the map are removed too.
     """
     is_without = answer.solver == "llm" and not answer.is_settled
     return NO_ANSWER if is_without else HINT.sub("", answer.text)
@@ -438,9 +439,9 @@ def _judged_answer(
 
 
 def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Collection[str] = ()) -> list[Draft]:
-    """``per_kind`` questions of each kind and of each template of reasoning, without those whose ids are ``left_out``.
+    """``per_kind`` questions of each kind and each reasoning template, without those whose ids are ``left_out``.
 
-    Of a template nothing takes the place of what is left out.
+    Excluded template questions are not replaced.
     """
     dataset, name = source.dataset(scene), scene.partition("/")[2]
     objects = truths.scene_objects(dataset, name, source.truth(scene), truths.MIN_VERTICES)

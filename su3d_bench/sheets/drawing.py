@@ -1,8 +1,7 @@
-"""Pictures of drafts (the best frame of the object and its place in the room), and figures of a run for print.
+"""Pictures of drafts (the best frame of the object and its position in the room), and printable figures of a run.
 
-Of a map nothing is drawn but what is judged: the rest of it would give its method away. An instance becomes points of
-the room, by one reach for all maps, and from then on its map has no part in the picture: how dense, how rough and how
-complete the map around it is cannot be seen.
+Only the judged part of a map is drawn, since the rest would reveal its method. An instance is transferred to points of
+the room with one distance for all maps, so density, noise and completeness of the map are not visible.
 """
 
 from __future__ import annotations
@@ -43,9 +42,10 @@ PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chos
 
 @dataclass(frozen=True)
 class Region:
-    """Where an instance lies: ``is_member`` (N,) of the room's points; ``points`` (M, 3) are these, in the world.
+    """Location of an instance: ``is_member`` (N,) of the room's points; ``points`` (M, 3) are these in world
+    coordinates.
 
-    Where the frames saw nothing of it ``is_member`` is false throughout, and ``points`` are those of its map.
+    If no frame sees it, ``is_member`` is all false and ``points`` are those of its map.
     """
 
     is_member: BoolArray
@@ -53,7 +53,7 @@ class Region:
 
     @property
     def centre(self) -> Float64Array:
-        """The middle (3,) of what is shown; NaN without a point."""
+        """The centre (3,) of the points; NaN without points."""
         if not len(self.points):
             return np.full(3, np.nan)
         middle: Float64Array = self.points.mean(axis=0, dtype=np.float64)
@@ -61,7 +61,7 @@ class Region:
 
 
 class ShownRoom:
-    """A scene in the colours that its frames saw, from above and from two corners: the same for every method."""
+    """A scene in the colours of its frames, from above and from two corners; identical for all methods."""
 
     def __init__(self, scene: str, frames: Sequence[Frame]) -> None:
         from scipy.spatial import KDTree
@@ -77,7 +77,7 @@ class ShownRoom:
 
     @cached_property
     def palette(self) -> UInt8Array:
-        """The colours (n, 3) of all pictures of the scene, whatever is outlined in them."""
+        """The palette (n, 3) shared by all pictures of the scene."""
         photos = [self.frames[k].rgb for k in evenly(len(self.frames), PALETTE_FRAMES)]
         views = [
             colour(view.shown, pale(self.colours, share))
@@ -86,7 +86,7 @@ class ShownRoom:
         return items.palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
 
     def region(self, points: Float32Array) -> Region:
-        """Where an instance of these ``points`` (M, 3) lies, however many and in whatever order they are."""
+        """The region of an instance with these ``points`` (M, 3), independent of their number and order."""
         is_member = np.zeros(len(self.points), np.bool_)
         if len(points) and len(self.points):
             margin = REACH_M + BACK_M
@@ -98,7 +98,7 @@ class ShownRoom:
         return Region(is_member, self.points[is_member] if is_member.any() else points)
 
     def union(self, regions: Sequence[Region]) -> Region:
-        """All of ``regions`` as one."""
+        """The union of ``regions``."""
         is_member = np.zeros(len(self.points), np.bool_)
         for region in regions:
             is_member |= region.is_member
@@ -106,7 +106,7 @@ class ShownRoom:
         return Region(is_member, self.points[is_member] if is_member.any() else points)
 
     def photo(self, region: Region) -> tuple[Frame, BoolArray] | None:
-        """The frame that shows the region best, and where (h, w); None where none shows it."""
+        """The frame that shows the region best, and its mask (h, w); None if no frame shows it."""
         if not region.is_member.any():
             return None
         view = items.best_view(self.frames, region.points)
@@ -118,7 +118,7 @@ class ShownRoom:
 
 
 def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArray:
-    """Which points of ``of`` (N, 3) have one of ``these`` within ``distance_m``."""
+    """Whether each point of ``of`` (N, 3) has one of ``these`` within ``distance_m``."""
     from scipy.spatial import KDTree
 
     if not len(these) or not len(of):
@@ -130,7 +130,7 @@ def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArr
 
 
 def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
-    """The mask at the size of the colour image ``rgb``, gaps of less than 3 of its pixels closed."""
+    """The mask resized to the colour image ``rgb``, with gaps of less than 3 pixels closed."""
     import cv2
 
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
@@ -146,7 +146,7 @@ PictureSource = RunSource | TruthSource
 
 
 class Artist:
-    """Draws the items of a run, one scene after another; what a scene's items share is made once."""
+    """Draw the items of a run scene by scene; data shared by the items of a scene is computed once."""
 
     def __init__(self, source: PictureSource) -> None:
         self._source = source
@@ -159,7 +159,7 @@ class Artist:
         return items.png_bytes(items.compose(self.parts(draft)), palette=self.room(draft.scene).palette)
 
     def parts(self, draft: Draft) -> ItemParts:
-        """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
+        """The content of the picture of a draft: only the regions of ``rows`` and ``others`` of its map."""
         room = self.room(draft.scene)
         answer, other = (room.union([self._region(draft, row) for row in rows]) for rows in (draft.rows, draft.others))
         photo, eye = self._photo(draft, room)
@@ -175,7 +175,7 @@ class Artist:
         stands_at = None if eye is None else _inside(room.above.project(eye[None])[0])
         has_arrow = ring is not None and stands_at is not None
         place = Panel(
-            ("its place, from above" if draft.rows else "from above")
+            ("position, from above" if draft.rows else "from above")
             + (" (arrow: from the camera)" if has_arrow else ""),
             colour(room.above.shown, _coloured(room, answer, other, PLACE_SHARE)),
             tags=self._tags(draft, room.above),
@@ -186,7 +186,7 @@ class Artist:
         return ItemParts(draft.title, photo, room_view, place, photos)
 
     def room(self, scene: str) -> ShownRoom:
-        """The scene as its frames show it."""
+        """The scene as seen in its frames."""
         if self._room is None or self._room.scene != scene:
             self._room = ShownRoom(scene, self._source.frames(scene))
             self._regions.clear()
@@ -194,7 +194,7 @@ class Artist:
         return self._room
 
     def _region(self, draft: Draft, row: int) -> Region:
-        """Where an instance of the draft's map lies; that of another map where it has the same mask."""
+        """The region of an instance of the draft's map; equal masks share one region."""
         instances = self._map(draft)
         key = mask_digest(instances, (row,))
         if key not in self._regions:
@@ -208,14 +208,14 @@ class Artist:
         return self._source.instances(draft.scene, draft.methods[0])
 
     def _room_photos(self, draft: Draft) -> tuple[UInt8Array, ...]:
-        """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
+        """Frames spread over the sequence, for answers without objects to outline."""
         if draft.rows:
             return ()
         frames = self._source.frames(draft.scene)
         return tuple(frames[k].rgb for k in evenly(len(frames), ROOM_PHOTOS))
 
     def _photo(self, draft: Draft, room: ShownRoom) -> tuple[Panel | None, Float64Array | None]:
-        """The frame that shows the object best, and where its camera was."""
+        """The frame that shows the object best, and its camera position."""
         wanted = draft.rows or draft.others
         if not wanted:
             return None, None
@@ -226,11 +226,11 @@ class Artist:
         if shown is None:
             return None, None
         frame, mask = shown
-        title = KINDS_OF_SHEETS[draft.kind].outlined if draft.rows else "what the answer was held against"
+        title = KINDS_OF_SHEETS[draft.kind].outlined if draft.rows else "reference objects"
         return Panel(f"outlined: {title}", frame.rgb, mask), frame.camera_to_world[:3, 3]
 
     def _tags(self, draft: Draft, view: MapView) -> tuple[Tag, ...]:
-        """The names of what an answer speaks of, where it is."""
+        """The names of the objects in an answer, at their positions."""
         if not draft.names:
             return ()
         rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
@@ -240,7 +240,7 @@ class Artist:
 
 
 def _coloured(room: ShownRoom, answer: Region, other: Region, share: float) -> UInt8Array:
-    """The colours of the room's points, what is judged and what it was held against in strong ones."""
+    """The colours of the room's points; judged and reference objects are highlighted."""
     colours = pale(room.colours, share)
     colours[other.is_member] = OTHER_COLOUR
     colours[answer.is_member] = ANSWER_COLOUR
@@ -250,7 +250,7 @@ def _coloured(room: ShownRoom, answer: Region, other: Region, share: float) -> U
 def tags_at(
     places: Float64Array, view: MapView, names: Sequence[str], shades: Sequence[tuple[int, int, int]]
 ) -> tuple[Tag, ...]:
-    """A name at each of ``places`` (N, 3), as far as it lies before the camera."""
+    """A name at each of ``places`` (N, 3) in front of the camera."""
     return tuple(
         Tag(name, float(x), float(y), shade)
         for name, shade, (x, y) in zip(names, shades, view.project(places), strict=True)
@@ -259,7 +259,7 @@ def tags_at(
 
 
 def _ring(draft: Draft, room: ShownRoom, answer: Region) -> tuple[float, float, float] | None:
-    """Around what is outlined, from above; none around several things, which have names."""
+    """A circle around the outlined object, from above; none for several objects, which have names."""
     if len(draft.rows) != 1 or draft.names or not len(answer.points):
         return None
     low, high = room.above.project(np.percentile(answer.points, [2, 98], axis=0).astype(np.float64))
@@ -268,7 +268,7 @@ def _ring(draft: Draft, room: ShownRoom, answer: Region) -> tuple[float, float, 
 
 
 def _inside(place: Float64Array) -> tuple[float, float] | None:
-    """``place`` where it is in the picture."""
+    """``place`` in pixel coordinates."""
     x, y = float(place[0]), float(place[1])
     return (x, y) if 0 <= x <= 1 and 0 <= y <= 1 else None
 
@@ -278,7 +278,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SceneDrafts:
-    """What one process draws: the drafts of one scene by their places among all."""
+    """The work of one process: the drafts of one scene by index."""
 
     opener: Callable[[], PictureSource]
     drafts: Mapping[int, Draft]
@@ -290,7 +290,7 @@ def draw_all(
     jobs: int,
     progress: Progress = lambda n_done, n: None,
 ) -> list[bytes]:
-    """The pictures of ``drafts`` in their order, ``jobs`` scenes at once; the same bytes whatever their number."""
+    """The pictures of ``drafts`` in order, ``jobs`` scenes in parallel; the bytes do not depend on ``jobs``."""
     units = []
     for scene in dict.fromkeys(draft.scene for draft in drafts):
         mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
@@ -313,7 +313,7 @@ def draw_all(
 
 
 def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
-    """The PNG of each draft of one scene by its place."""
+    """The PNG of each draft of one scene by index."""
     artist = Artist(unit.opener())
     pictures = {}
     for place, draft in unit.drafts.items():
@@ -324,7 +324,7 @@ def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
 
 def _lost(unit: SceneDrafts, how: str) -> NoReturn:
     scene = next(iter(unit.drafts.values())).scene
-    raise DataError(f"{scene}: the process that drew its pictures {how}; try --jobs 1")
+    raise DataError(f"{scene}: the drawing process {how}; try --jobs 1")
 
 
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
@@ -334,7 +334,7 @@ Labels = Sequence[str]
 
 
 class Figures:
-    """Rows and columns of a figure; maps and views are made once for each scene."""
+    """Rows and columns of a figure; maps and views are computed once per scene."""
 
     def __init__(
         self, source: RunSource, *, with_photo: bool = False, view: Literal["corner", "above"] = "corner"
@@ -343,11 +343,11 @@ class Figures:
 
     @property
     def columns(self) -> list[str]:
-        """Titles of the columns of similarity and reasoning."""
+        """Column titles of the similarity and reasoning figures."""
         return [*(["the scene"] if self._with_photo else []), *self._source.methods]
 
     def similarity(self, texts: Sequence[str], encoder: Encoder, scale: Scale) -> list[GridRow]:
-        """A row a scene and text: each instance in the colour of its similarity, a column a method."""
+        """One row per scene and text, one column per method; instances are coloured by similarity."""
         rows = []
         for scene in self._source.scenes:
             maps = self._maps(scene)
@@ -362,7 +362,7 @@ class Figures:
         return rows
 
     def labels(self) -> tuple[list[str], list[GridRow]]:
-        """Titles of the columns, and a row a scene: the map by label n and by label n' of each method."""
+        """Column titles, and one row per scene: the map of each method by label n and by label n'."""
         titles = [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
         titles = [*(["the scene"] if self._with_photo else []), *titles]
         rows = []
@@ -383,7 +383,7 @@ class Figures:
         return titles, rows
 
     def reasoning(self, questions: Sequence[str], encoder: Encoder | None) -> list[GridRow]:
-        """A row a scene and question, a column a method: what its answer names, and what that was held against."""
+        """One row per scene and question, one column per method: answer objects and reference objects."""
         rows = []
         for scene in self._source.scenes:
             maps = self._maps(scene)
@@ -406,7 +406,8 @@ class Figures:
         return [drawn_map(self._source.instances(scene, method)) for method in self._source.methods]
 
     def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
-        """One camera for all ``maps``, chosen in the first: from above, or the corner that shows most of ``wanted``."""
+        """One camera for all ``maps``, chosen in the first: from above or from the corner that shows most of
+        ``wanted``."""
         first = maps[0]
         place = 0
         if self._view == "corner":
@@ -418,7 +419,7 @@ class Figures:
         return [chosen, *(MapView(camera, other.view(camera).view, chosen.box) for other in maps[1:])]
 
     def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> list[Cell]:
-        """The map in the colours that the frames saw, where it is asked for."""
+        """The map in the colours of the frames, if requested."""
         if not self._with_photo:
             return []
         frames = self._source.frames(scene)
@@ -426,7 +427,7 @@ class Figures:
 
 
 def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> UInt8Array:
-    """The colour (N, 3) of each point in the last frame that sees it; grey where none does."""
+    """The colour (N, 3) of each point in the last frame that sees it; grey if none does."""
     colours = np.full((len(points), 3), UNSEEN, np.uint8)
     places: Float64Array = points.astype(np.float64)
     for frame in frames:
@@ -446,7 +447,7 @@ def _answer_cell(shown: DrawnMap, view: MapView, rows_of: Sequence[Sequence[int]
 
 
 def _name_tags(shown: DrawnMap, view: MapView, names: Labels, colours: UInt8Array) -> tuple[Tag, ...]:
-    """The names of the largest things that are seen; surfaces of the room go without."""
+    """The names of the largest visible objects, without walls, floors and ceilings."""
     sizes = shown.instances.sizes
     seen = set(shown.owner[view.view.point[view.view.point >= 0]].tolist())
     largest = [int(k) for k in np.argsort(-sizes, kind="stable") if int(k) in seen]

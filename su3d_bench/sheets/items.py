@@ -1,7 +1,7 @@
-"""What a set of annotation sheets is: items without a word on who made them, the key kept apart, and how to judge.
+"""Data model of annotation sheets: anonymous items, the separate key and the instructions.
 
-``sheet.json`` goes to annotators, ``key.json`` does not. Ids begin with a letter, so that no spreadsheet takes one
-for a number.
+``sheet.json`` goes to annotators, ``key.json`` does not. Ids start with a letter so that spreadsheets do not read them
+as numbers.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _DIGITS = 12
 
 
 class _Strict:
-    """What is read as it was written: no other fields, and no value that would have to be converted."""
+    """Strict model: no extra fields, no type conversion."""
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
 
 @dataclass(frozen=True)
 class Ask(_Strict):
-    """A question that is put of an item: ``name`` stands in the answers, ``text`` is read, one of ``choices`` is right.
+    """A question about an item: ``name`` identifies it in answer files, ``text`` is shown, ``choices`` are the answers.
 
-    ``meanings``: what each choice means, in their order.
+    ``meanings``: explanations of the choices, in order.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Ask(_Strict):
 
 @dataclass(frozen=True)
 class KindOfSheet(_Strict):
-    """What is asked on sheets of a kind, and the words on its page and pictures; ``guide``: what the pictures show."""
+    """Questions, page texts and picture titles of a kind of sheet; ``guide`` explains the pictures."""
 
     title: str
     outlined: str
@@ -80,7 +80,7 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {name: kind.asks for name, kind in K
 class SheetItem(_Strict):
     """One thing to judge: ``text`` is the query, the labels, or question and answer; ``asks`` names what is asked.
 
-    ``pictures`` are file names below ``PICTURES``, ``picture_digests`` their SHA-256; ``check`` changes with all of it.
+    ``pictures`` are file names below ``PICTURES``, ``picture_digests`` their SHA-256; ``check`` is a digest of all.
     """
 
     id: str
@@ -93,7 +93,7 @@ class SheetItem(_Strict):
 
 @dataclass(frozen=True)
 class AnnotatorShare(_Strict):
-    """Ids of the items that one annotator gets, in that annotator's order."""
+    """Ids of the items assigned to one annotator, in presentation order."""
 
     name: str
     item_ids: tuple[str, ...]
@@ -101,7 +101,7 @@ class AnnotatorShare(_Strict):
 
 @dataclass(frozen=True)
 class Sheet(_Strict):
-    """What all annotators of a set together see; ``id`` is a digest of it and begins with the kind."""
+    """Everything shown to the annotators of a set; ``id`` is the kind followed by a digest."""
 
     id: str
     kind: SheetKind
@@ -114,14 +114,14 @@ class Sheet(_Strict):
         return next(ask for ask in self.asks if ask.name == name)
 
     def items_of(self, share: AnnotatorShare) -> list[SheetItem]:
-        """The items of one annotator in that annotator's order."""
+        """The items of one annotator in presentation order."""
         by_id = {item.id: item for item in self.items}
         return [by_id[item_id] for item_id in share.item_ids]
 
 
 @dataclass(frozen=True)
 class KeyItem(_Strict):
-    """What an item is: the instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
+    """The source of an item: instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
 
     ``methods``: all whose answer this is, a variant such as ``opensu3d@scheme4`` a name; ``instance_ids`` its id in the
     map of each of them (-1 where an answer names several or none). No method answers in sheets of questions: the kind
@@ -142,7 +142,7 @@ class KeyItem(_Strict):
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedRun:
-    """How the run that is judged was made.
+    """Configuration of the judged run.
 
     ``answered_by``: who gave the answers of reasoning sheets, or labels n'; ``profile``, ``encoder``, ``limit`` and
     ``changed`` (method -> settings other than its own) are those of the run; ``remarks``: what must stand beside its
@@ -157,13 +157,13 @@ class JudgedRun:
     remarks: tuple[str, ...] = ()
 
     def how_it_was_made(self) -> dict[str, Any]:
-        """These fields, for what is made of the same run."""
+        """These fields, for other records of the same run."""
         return {one.name: getattr(self, one.name) for one in fields(JudgedRun)}
 
 
 @dataclass(frozen=True)
 class Key(JudgedRun, _Strict):
-    """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
+    """The key of the maintainer: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
     code."""
 
     sheet_id: str
@@ -178,7 +178,7 @@ class Key(JudgedRun, _Strict):
 def new_item(
     set_id: str, item_id: str, text: str, asks: Sequence[str], pictures: Sequence[str], digests: Sequence[str]
 ) -> SheetItem:
-    """An item with the check that its contents give it, a short key of all that an annotator sees of it.
+    """An item with its check, a short digest of everything shown to the annotator.
 
     >>> new_item("a-1", "item-1", "chair", [], [], []).check == new_item("a-1", "item-1", "table", [], [], []).check
     False
@@ -188,17 +188,17 @@ def new_item(
 
 
 def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
-    """The id of a set: the kind and a digest of all that is in it."""
+    """The id of a set: the kind and a digest of its content."""
     return f"{kind}-" + digest_json([SCHEMA, kind, seed, contents])[:_DIGITS]
 
 
 def read_sheet(path: Path) -> Sheet:
-    """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
+    """The set in a ``sheet.json``; ``DataError`` if ``sheets make`` did not write it so."""
     return read_record(path, Sheet)
 
 
 def read_key(path: Path) -> Key:
-    """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
+    """The key in a ``key.json``; ``DataError`` if ``sheets make`` did not write it so."""
     return read_record(path, Key)
 
 
@@ -206,28 +206,31 @@ Record = TypeVar("Record", bound="DataclassInstance")
 
 
 def write_record(path: Path, record: DataclassInstance) -> Path:
-    """Write a record as JSON with the digest of its content, by which a changed file is known; its path."""
+    """Write a record as JSON with a checksum of its content; returns the path."""
     content = asdict(record)
     write_json(path, content | {"schema_version": SCHEMA, "digest": digest_json(content)})
     return path
 
 
 def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> Record:
-    """The record of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another, or was changed."""
+    """The record of a JSON file written by the command ``maker``; ``DataError`` if it is another file or was
+    changed."""
     where = printable(str(path), 200)
-    content = parsed_json(read_bytes(path, where, f"give what su3d-bench {maker} wrote", MOST_BYTES), where)
+    content = parsed_json(read_bytes(path, where, f"pass a file written by su3d-bench {maker}", MOST_BYTES), where)
     if not isinstance(content, dict) or "digest" not in content:
-        raise DataError(f"{where}: is no file that su3d-bench {maker} writes")
+        raise DataError(f"{where}: not a file written by su3d-bench {maker}")
     digest, schema = content.pop("digest"), content.pop("schema_version", None)
     if schema != SCHEMA:
-        raise DataError(f"{where}: has schema {printable(str(schema), 20)}, this version reads {SCHEMA}; make it again")
+        raise DataError(
+            f"{where}: schema {printable(str(schema), 20)} is not supported (expected {SCHEMA}); create it again"
+        )
     if digest != digest_json(content):
-        raise DataError(f"{where}: was changed since su3d-bench {maker} wrote it; put it back, or make it again")
+        raise DataError(f"{where}: changed since su3d-bench {maker} wrote it; restore it or create it again")
     try:
         return TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         place = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
-        raise DataError(f"{where}: is no such file as su3d-bench {maker} writes ({place})") from error
+        raise DataError(f"{where}: invalid file for su3d-bench {maker} ({place})") from error
 
 
 GUIDE = "how to judge"
@@ -238,7 +241,7 @@ _ALONE = (
 
 
 def guide_of(sheet: Sheet) -> tuple[str, ...]:
-    """The sentences that an annotator of a set reads first."""
+    """The instructions at the start of a sheet."""
     is_open = any(CANNOT_TELL in ask.choices for ask in sheet.asks)
     unsure = (f"'{CANNOT_TELL}' is for what the picture does not show; it is counted apart, and no fault of yours.",)
     return (*KINDS_OF_SHEETS[sheet.kind].guide, *(unsure if is_open else ()), *_ALONE)

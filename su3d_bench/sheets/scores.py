@@ -1,6 +1,6 @@
-"""What the answers to a set of sheets add up to: accuracies, tests between methods, agreement, people beside truth.
+"""Scores of a set of sheets: accuracies, paired tests, inter-annotator agreement, comparison with ground truth.
 
-``scores.json`` holds it, from which tables are made again.
+``scores.json`` stores them; tables can be recreated from it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DISPUTED_COLUMNS = (COLUMN, "scene", "kind", "why", "text")
 
 
 def whole_verdicts(judgements: Iterable[Judgement]) -> Iterator[Judgement]:
-    """What each annotator says of each question as a whole: the worst of what they say of its parts."""
+    """The overall judgement per annotator and question: the worst judgement of its parts."""
     given: dict[tuple[str, str], list[str]] = defaultdict(list)
     for judgement in judgements:
         given[judgement.item_id, judgement.annotator].append(judgement.answer)
@@ -100,7 +100,7 @@ class PairTest:
 
 @dataclass(frozen=True)
 class AskAgreement:
-    """How far annotators agree on one question; "cannot tell" is an answer like any other."""
+    """Agreement on one question; "cannot tell" counts as an answer."""
 
     ask: str
     agreement: Agreement
@@ -295,7 +295,7 @@ def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest
 
 
 def _by_unit(group: pandas.DataFrame, column: str) -> dict[str, dict[str, float]]:
-    """Value of ``column`` -> unit -> share."""
+    """``column`` value -> unit -> share."""
     return {name: dict(zip(own["unit"], own["share"], strict=True)) for name, own in group.groupby(column)}
 
 
@@ -355,7 +355,7 @@ def _sign_flip_of_steps(steps: Int64Array) -> float:
 
 
 def _confusion(sheet: Sheet, what: str, given: Sequence[_Given]) -> Confusion | None:
-    """None where the truth is known of no judged item."""
+    """The comparison with ground truth; None if no judged item has any."""
     known = [(key, ask, answer) for key, ask, answer in given if _asked(key, ask) == what and ask in key.automatic]
     if not known:
         return None
@@ -374,7 +374,7 @@ def _confusion(sheet: Sheet, what: str, given: Sequence[_Given]) -> Confusion | 
 
 
 def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterable[Judgement]) -> list[SecondLook]:
-    """What somebody should look at again, in the order of the sheet."""
+    """Items to review, in the order of the sheet."""
     given: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
     for judgement in judgements:
         given[judgement.item_id, judgement.ask][judgement.annotator] = judgement.answer
@@ -407,17 +407,17 @@ FILE = "scores.json"
 
 
 def write_scores(folder: Path, scores: Scores) -> Path:
-    """Write ``scores.json`` into ``folder``; its path."""
+    """Write ``scores.json`` into ``folder``; returns its path."""
     return items.write_record(folder / FILE, scores)
 
 
 def read_scores(path: Path) -> Scores:
-    """The scores of a file or of the folder that holds it; ``DataError`` where it is not as ``sheets score`` writes."""
+    """The scores in a file or its folder; ``DataError`` if ``sheets score`` did not write it."""
     return items.read_record(path / FILE if path.is_dir() else path, Scores, "sheets score")
 
 
 def second_looks_csv(looks: Sequence[SecondLook]) -> str:
-    """One line an item and question."""
+    """One line per item and question."""
     rows = [LOOKS_COLUMNS]
     for one in looks:
         listed = ", ".join(one.methods), one.text, ", ".join(one.pictures)
@@ -430,8 +430,8 @@ def _said(look: SecondLook) -> str:
 
 
 def second_looks_page(looks: Sequence[SecondLook], pictures: str, sheet_id: str) -> str:
-    """A page without scripts; ``pictures`` is where its picture files are, as the page sees it."""
-    return list_page(f"Second looks at {sheet_id}: {len(looks)}", "", [_entry(look) for look in looks], pictures)
+    """An HTML page without scripts; ``pictures`` is the relative path of its picture files."""
+    return list_page(f"Items to review of {sheet_id}: {len(looks)}", "", [_entry(look) for look in looks], pictures)
 
 
 def _entry(look: SecondLook) -> Entry:

@@ -1,4 +1,4 @@
-"""A set of sheets from drafts: shuffled, numbered, drawn, dealt to annotators, written as page, workbook and table."""
+"""Create a set of sheets from drafts: shuffle, number, assign to annotators; write HTML page, workbook and CSV."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ HEAD_FILL, OPEN_FILL = "FF1857B8", "FFFFF4CC"
 
 
 def workbook_bytes(sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, bytes], title: str) -> bytes:
-    """An XLSX file, the same bytes for the same sheet. Needs the ``sheets`` extra."""
+    """A deterministic XLSX file of the sheet; needs the ``sheets`` extra."""
     try:
         from openpyxl import Workbook
     except ImportError as error:
-        raise ModelMissing("a workbook needs the sheets extra: pip install 'su3d-bench[sheets]'") from error
+        raise ModelMissing("writing a workbook needs the sheets extra; pip install 'su3d-bench[sheets]'") from error
     book = Workbook()
     page = book.active
     page.title = "answers"
@@ -84,7 +84,7 @@ def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mappin
 
 
 def text_cell(page: Any, row: int, column: int, text: str) -> Any:
-    """Write ``text`` into a cell as text, never as a formula, also when somebody edits it."""
+    """Write ``text`` into a cell as text, never as a formula, even after editing."""
     cell = page.cell(row, column)
     # Line breaks stay; whatever else cannot be printed is shown as its escape.
     cell.value = "\n".join(printable(line, 2000) for line in text.split("\n")) or None
@@ -195,7 +195,7 @@ PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
 
 @dataclass(frozen=True)
 class MadeSheets:
-    """A set as it was made; ``pictures`` by file name."""
+    """A new set; ``pictures`` by file name."""
 
     sheet: Sheet
     key: Key
@@ -230,9 +230,9 @@ def make_sheets(
 
 
 def check_split(n_items: int, annotators: int, overlap: float) -> None:
-    """A ``ConfigError`` where so many items cannot be dealt so."""
+    """Raise ``ConfigError`` if the items cannot be assigned this way."""
     if not n_items:
-        raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
+        raise ConfigError("nothing to judge: the scenes have no questions or instances")
     if not 1 <= annotators <= MOST_ANNOTATORS:
         raise ConfigError(f"--annotators {annotators}: expected 1 to {MOST_ANNOTATORS}")
     if not 0.0 <= overlap <= 1.0:
@@ -269,7 +269,9 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
     Raises ``ConfigError``, before anything is written, where the folders hold another set, or answers.
     """
     if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
-        raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
+        raise ConfigError(
+            f"--key {printable(str(key_folder), 200)}: is inside the folder of the sheets; choose a separate folder"
+        )
     title = items.KINDS_OF_SHEETS[made.sheet.kind].title
     files: dict[Path, bytes] = {}
     for share in made.sheet.annotators:
@@ -299,15 +301,15 @@ def _refuse_other_sheets(sheet_id: str, folder: Path, key_folder: Path, files: M
     }
     for flag, other in known.items():
         if other != sheet_id:
-            raise ConfigError(f"{flag}: holds the sheets {printable(other)}; name another folder")
+            raise ConfigError(f"{flag}: contains the sheets {printable(other)}; choose another folder")
     for path, content in files.items():
         if path.name != PAGE and is_file(path) and file_bytes(path) != content:
             where = printable(str(path), 200)
-            raise ConfigError(f"--out: {where} holds answers, or another set; name another folder")
+            raise ConfigError(f"--out: {where} contains answers or another set; choose another folder")
 
 
 def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
-    """What the page of an annotator shows; nothing of the key."""
+    """The content of an annotator's page, without the key."""
     return {
         "id": made.sheet.id,
         "annotator": share.name,
@@ -328,7 +330,7 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
 
 
 def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
-    """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
+    """The table of one annotator, answers to be filled in; text that looks like a formula starts with ``'``."""
     rows: list[tuple[str, ...]] = [(*items.ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
     for item in sheet.items_of(share):
         for name in item.asks:

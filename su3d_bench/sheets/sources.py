@@ -1,4 +1,4 @@
-"""What sheets take from a finished run, or from the ground truth of scenes: maps, frames and ground truth."""
+"""Sources of sheets: maps, frames and ground truth of a finished run, or the ground truth of scenes alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked
 
 
 def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
-    """Those that are ``wanted``, which the run must have; all without any."""
+    """The ``wanted`` names, which the run must have; all by default."""
     for name in wanted:
         if name not in known:
             hint = errors.suggest(name, known, "it has")
@@ -56,7 +56,7 @@ class RunSource:
 
     @property
     def opener(self) -> Callable[[], RunSource]:
-        """Opens the same run in another process."""
+        """Open the same run in another process."""
         return partial(_opened, self.run.folder.path, self.methods)
 
     def of_methods(self, methods: Sequence[str]) -> RunSource:
@@ -81,8 +81,8 @@ class RunSource:
         prediction = self.prediction(scene, method)
         if not isinstance(prediction, Instances):
             raise errors.PredictionError(
-                f"{printable(str(self.run.folder.job(scene, method).prediction), 200)}: holds no instances that people "
-                f"could judge; leave {printable(method, 80)} out with --methods"
+                f"{printable(str(self.run.folder.job(scene, method).prediction), 200)}: has no instances to "
+                f"judge; exclude {printable(method, 80)} with --methods"
             )
         return prediction
 
@@ -90,13 +90,13 @@ class RunSource:
         job = self.run.folder.job(scene, method)
         if not job.prediction.is_file():
             raise errors.StoreError(
-                f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
-                "leave it out with --methods or --scenes"
+                f"{self.run.name}: has no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
+                "exclude it with --methods or --scenes"
             )
         return read_prediction(job.prediction)
 
     def refined(self, scene: str, method: str) -> RefinedNames | None:
-        """Labels n' of the map's instances; None where nobody made them."""
+        """Labels n' of the map's instances; None if not computed."""
         return refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
 
     def scene_map(self, scene: str, method: str) -> SceneMap:
@@ -129,7 +129,7 @@ class RunSource:
         return None
 
     def truth(self, scene: str, rules: ProtocolRules | None) -> GroundTruth | None:
-        """The ground truth that ``rules`` ask for; None where nobody has it."""
+        """The ground truth required by ``rules``; None if unavailable."""
         return None if rules is None else self._truths(scene, rules.ground_truth)
 
     def _read_truth(self, scene: str, variant: str) -> GroundTruth | None:
@@ -183,7 +183,7 @@ class TruthSource:
         self.frames = lru_cache(maxsize=1)(self._frames)
 
     def instances(self, scene: str, method: str = "") -> Instances:
-        """Every instance of the truth, whatever the method."""
+        """All ground-truth instances, independent of the method."""
         return self._map_of(scene)
 
     def _truth(self, scene: str) -> GroundTruth:

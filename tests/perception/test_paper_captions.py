@@ -88,12 +88,12 @@ def made(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator
         yield Finished(root, models, server)
 
 
-def test_the_run_ends_complete_whatever_the_model_answers(made: Finished) -> None:
+def test_run_completes_for_any_model_replies(made: Finished) -> None:
     assert made.code == 0
     assert set(made.model.kinds.values()) == set(FailingModel.KINDS), "every kind of answer was given"
 
 
-def test_captions_of_the_model_are_in_the_map_and_the_taggers_where_it_gave_none(made: Finished) -> None:
+def test_map_has_model_captions_with_tagger_fallback(made: Finished) -> None:
     found = read_prediction(made.file("prediction.npz"))
     assert isinstance(found, Instances) and found.captions is not None
     of_model = [caption for caption in found.captions if caption.startswith("A thing with the number ")]
@@ -105,14 +105,14 @@ def test_captions_of_the_model_are_in_the_map_and_the_taggers_where_it_gave_none
     assert any(caption.endswith(" in a scene") for caption in found.captions)
 
 
-def test_fallbacks_and_their_reasons_are_in_the_log_and_in_the_record(made: Finished) -> None:
+def test_fallbacks_and_reasons_are_logged_and_recorded(made: Finished) -> None:
     log, record = made.file("log.txt").read_text(), (made.root / "first" / "run.json").read_text()
-    for reason in ("the model refused", "is no chat completion", "status 500: out of order", "no answer within"):
+    for reason in ("the model refused", "is not a chat completion", "status 500: out of order", "no answer within"):
         assert reason in log, reason
         assert reason in record, reason
 
 
-def test_every_picture_is_asked_about_once_and_again_only_where_no_answer_came(made: Finished) -> None:
+def test_each_crop_is_requested_once_unless_unanswered(made: Finished) -> None:
     assert made.model.n_sent("good") == made.model.n_sent("refusal") == {1}
     assert made.model.n_sent("429") == {2}
     assert made.model.n_sent("malformed") == {1}
@@ -120,7 +120,7 @@ def test_every_picture_is_asked_about_once_and_again_only_where_no_answer_came(m
         assert made.model.n_sent(kind) == {N_TRIES}
 
 
-def test_every_reply_lies_with_the_run_and_the_same_command_asks_nothing(made: Finished) -> None:
+def test_replies_are_stored_with_run_and_rerun_sends_nothing(made: Finished) -> None:
     replies = [read_json(path) for path in (made.root / "first" / "language").glob("*.json")]
     assert len(replies) == len(made.model.kinds)
     assert {reply["purpose"] for reply in replies} == {"caption"}
@@ -129,12 +129,12 @@ def test_every_reply_lies_with_the_run_and_the_same_command_asks_nothing(made: F
     assert made.server.n_asked == n_asked
 
 
-def test_offline_a_fresh_folder_with_the_replies_gives_the_same_numbers_and_asks_nothing(
+def test_offline_rerun_from_stored_replies_gives_same_numbers(
     made: Finished, capsys: pytest.CaptureFixture[str]
 ) -> None:
     n_asked = made.server.n_asked
     assert made.run("again", "--offline") == 2
-    assert "holds no reply to this caption request" in capsys.readouterr().err
+    assert "no stored reply to this caption request" in capsys.readouterr().err
     shutil.copytree(made.root / "first" / "language", made.root / "again" / "language")
     assert made.run("again", "--offline") == 0
     assert made.server.n_asked == n_asked

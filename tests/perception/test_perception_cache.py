@@ -27,7 +27,7 @@ def assert_equal_to_the_bit(a: Detections, b: Detections) -> None:
         assert first.dtype == second.dtype and first.tobytes() == second.tobytes(), name
 
 
-def test_masks_survive_packing() -> None:
+def test_masks_round_trip_through_packing() -> None:
     generator = np.random.default_rng(1)
     masks = generator.random((7, 33, 41)) < 0.2
     masks[3] = False
@@ -35,7 +35,7 @@ def test_masks_survive_packing() -> None:
     assert unpack_masks(pack_masks(masks[:0])).shape == (0, 33, 41)
 
 
-def test_a_flipped_bit_a_cut_file_and_foreign_arrays_count_as_absent(tmp_path: Path) -> None:
+def test_damaged_cache_entries_are_treated_as_missing(tmp_path: Path) -> None:
     cache = FrameCache(tmp_path)
     key = content_key("a")
     path = cache.path(key)
@@ -54,7 +54,7 @@ def test_a_flipped_bit_a_cut_file_and_foreign_arrays_count_as_absent(tmp_path: P
     assert cache.load(key) is None
 
 
-def test_the_frame_digest_moves_with_pixels_and_with_the_pose_only_on_request() -> None:
+def test_frame_digest_depends_on_pixels_and_optionally_on_pose() -> None:
     cache = FrameCache(None)
     frame, other, painted = still_life(), still_life(), still_life()
     other.camera_to_world[0, 3] = 1
@@ -67,7 +67,7 @@ def test_the_frame_digest_moves_with_pixels_and_with_the_pose_only_on_request() 
     assert cache.frame_digest(frame, False) == FrameCache(None).frame_digest(frame, False)
 
 
-def test_answers_with_without_and_from_the_cache_are_equal_to_the_bit(tmp_path: Path) -> None:
+def test_results_are_bit_identical_with_and_without_cache(tmp_path: Path) -> None:
     needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))
     answers = [
         perception(tmp_path, CountingEncoder(), cache).detect(still_life(), needs, Timer())
@@ -78,7 +78,7 @@ def test_answers_with_without_and_from_the_cache_are_equal_to_the_bit(tmp_path: 
         assert_equal_to_the_bit(answers[0], answer)
 
 
-def test_a_second_run_encodes_nothing_and_a_new_ratio_only_its_own_crops(tmp_path: Path) -> None:
+def test_second_run_encodes_only_new_crop_ratios(tmp_path: Path) -> None:
     needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))
     first = CountingEncoder()
     n = len(perception(tmp_path, first).detect(still_life(), needs, Timer()))
@@ -97,7 +97,7 @@ def test_a_second_run_encodes_nothing_and_a_new_ratio_only_its_own_crops(tmp_pat
     assert third.n_images == n
 
 
-def test_excluded_regions_cost_one_crop_and_are_encoded_when_asked_for_later(tmp_path: Path) -> None:
+def test_excluded_regions_are_encoded_on_later_request(tmp_path: Path) -> None:
     everything = perception(tmp_path / "all", CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
     background = everything.names[0]
     n_kept = sum(name != background for name in everything.names)

@@ -54,7 +54,7 @@ def write(folder: Path, content: Any) -> Path:
     return path
 
 
-def test_regions_are_those_of_the_file_and_pictures_are_passed_over(tmp_path: Path) -> None:
+def test_regions_match_file_and_image_crops_are_ignored(tmp_path: Path) -> None:
     write(tmp_path, detections())
     found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
     assert found.regions.names == ("item", "coffee table")
@@ -65,7 +65,7 @@ def test_regions_are_those_of_the_file_and_pictures_are_passed_over(tmp_path: Pa
     assert found.regions.rows is not None and found.regions.rows.tolist() == [0, 1]
 
 
-def test_a_mask_of_one_pixels_width_stays_and_a_box_turned_round_goes(tmp_path: Path) -> None:
+def test_one_pixel_wide_mask_is_valid_and_inverted_box_is_dropped(tmp_path: Path) -> None:
     # SAM's box of a column of pixels, first to last, has no width; the original's filter_gobs looks at the mask's area.
     thin = np.zeros((2, *FRAME.depth_m.shape), bool)
     thin[0, 10:70, 33] = thin[1, 5:9, 5:9] = True
@@ -90,7 +90,7 @@ def perception(folder: Path, encoder: CountingEncoder) -> Perception:
     return build_perception("stored", config, scene=SCENE, cache_root=folder / "c", mesh=None, encoder=encoder)
 
 
-def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_made_them(tmp_path: Path) -> None:
+def test_stored_features_are_used_only_for_same_encoder_and_crops(tmp_path: Path) -> None:
     write(tmp_path, detections())
     needs = PerceptionNeeds(crop_ratios=(1.0,), crop_padding_px=20)
 
@@ -112,14 +112,14 @@ def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_m
     [
         ({"mask": masks()[:, :-1]}, r"masks are \(3, 119, 160\), the frame has height 120 and width 160"),
         ({"class_id": np.array([0, 2, 0])}, "class number 2; 'classes' has 2 names"),
-        ({"classes": "item"}, "'classes' is no list of names"),
+        ({"classes": "item"}, "'classes' is not a list of names"),
         ({"xyxy": np.zeros((2, 4))}, r"xyxy is \(2, 4\)"),
         ({"confidence": np.array([np.nan, 1, 1])}, "a confidence is not finite"),
         ({"confidence": np.ones(2001)}, "has 2001 regions"),
         ({"image_feats": np.ones((3, 8))}, r"image_feats are \(3, 8\); expected 3 rows of length 1"),
     ],
 )
-def test_what_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_mismatched_detections_give_one_line_error(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     write(tmp_path, detections(**changes))
     with pytest.raises(DataError, match=message) as caught:
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
@@ -131,10 +131,10 @@ class Calling:
         return (exec, ("raise AssertionError('code of a file was run')",))
 
 
-def test_a_file_that_asks_for_code_is_refused(tmp_path: Path) -> None:
+def test_pickle_that_executes_code_fails(tmp_path: Path) -> None:
     write(tmp_path, detections(image_crops=[Calling()]))
     with pytest.raises(PredictionError, match="exec"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
     write(tmp_path, [1, 2])
-    with pytest.raises(DataError, match="holds a list"):
+    with pytest.raises(DataError, match="contains a list"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

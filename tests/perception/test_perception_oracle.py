@@ -65,7 +65,7 @@ def test_the_pose_moves_the_masks() -> None:
     assert np.array_equal(image, np.roll(expected_square(), -10, axis=1))
 
 
-def test_holes_of_the_mesh_are_filled_from_near_pixels_of_like_depth_only() -> None:
+def test_mesh_holes_are_filled_from_near_pixels_of_similar_depth() -> None:
     left, right = (-3.0, -0.5, -3.0, 3.0, 2.0), (-0.42, 3.0, -3.0, 3.0, 2.0)  # a slit of four pixels
     mesh = quad_mesh(left, right, instance=[1, 2])
     image = MeshProjector(mesh, OracleConfig(fill_px=3)).instance_image(flat_frame())
@@ -119,7 +119,7 @@ def noisy(index: int = 0, **values: float) -> tuple[list[np.typing.NDArray[np.bo
     return disturb(masks, ["chair", "cup", "wall"], ["chair", "cup", "wall"], noise, index)
 
 
-def test_noise_is_drawn_from_seed_and_frame_alone() -> None:
+def test_noise_depends_only_on_seed_and_frame() -> None:
     values = {"drop_probability": 0.5, "split_probability": 0.5, "flip_probability": 0.5}
     outcomes = []
     for index in range(12):
@@ -130,7 +130,7 @@ def test_noise_is_drawn_from_seed_and_frame_alone() -> None:
     assert [noisy(i, seed=1, **values)[1] for i in range(12)] != [noisy(i, **values)[1] for i in range(12)]
 
 
-def test_each_kind_of_noise_does_what_its_name_says() -> None:
+def test_each_noise_type_has_its_effect() -> None:
     assert noisy(drop_probability=1.0) == ([], [])
     eroded, _ = noisy(erode_px=2)
     assert eroded[0].sum() == 36 * 36
@@ -145,7 +145,7 @@ def test_each_kind_of_noise_does_what_its_name_says() -> None:
     assert all(new != old for new, old in zip(flipped, ["chair", "cup", "wall"], strict=True))
 
 
-def test_the_oracle_method_hands_back_every_instance_of_the_truth() -> None:
+def test_oracle_method_returns_all_ground_truth_instances() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(6, 3)).astype(np.float32)
     semantic = np.array([28, 20, 0, 28, 20, 0], np.int32)

@@ -113,7 +113,7 @@ def test_names_of_walls_floors_and_ceilings_are_background(name: str) -> None:
         "wall-to-wall carpet", "floor and rug", "coffee grounds", "video wall", "wall hanging", "",
     ],
 )  # fmt: skip
-def test_what_hangs_or_stands_there_stays(name: str) -> None:
+def test_objects_on_walls_and_floors_are_not_background(name: str) -> None:
     assert not is_background(name, NAMES)
 
 

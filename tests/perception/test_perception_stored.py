@@ -98,9 +98,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("change", "message"), BAD, ids=[message[:24] for _, message in BAD])
-def test_what_is_wrong_in_a_file_is_said_with_frame_and_region(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+def test_file_errors_name_frame_and_region(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     path = written(tmp_path, with_features=False)
     arrays: dict[str, Any] = {**dict(np.load(path)), **change}
     np.savez(path, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})

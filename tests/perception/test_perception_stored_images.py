@@ -77,22 +77,22 @@ def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others
         (np.zeros((120, 160, 3), np.uint8), "not a label image: 8 bits, PNG colour type 2; expected one grey channel"),
         (
             np.arange(120 * 160, dtype=np.uint16).reshape(120, 160),
-            "has 19199 regions of 160x120 pixels; expected one a thing",
+            "has 19199 regions of 160x120 pixels; expected one region per object",
         ),
     ],
 )
-def test_what_is_no_label_image_is_said(tmp_path: Path, image: np.ndarray, message: str) -> None:
+def test_invalid_label_image_fails(tmp_path: Path, image: np.ndarray, message: str) -> None:
     write_image(tmp_path, image)
     with pytest.raises(DataError) as caught:
         images(tmp_path).frame(still_life(40))
     assert str(caught.value).startswith("rgbd/desk: frame-0040.segm.png") and message in str(caught.value)
 
 
-def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+def test_image_link_outside_the_folder_fails(tmp_path: Path) -> None:
     outside = write_image(tmp_path / "outside")
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels/frame-0040.segm.png").symlink_to(outside)
-    with pytest.raises(ConfigError, match="leads out of"):
+    with pytest.raises(ConfigError, match="is outside"):
         images(tmp_path / "labels")
 
 
@@ -100,12 +100,12 @@ def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> Non
     ("file", "text", "message"),
     [
         ("names.toml", "48", "not a TOML or JSON table of names by value"),
-        ("names.toml", 'book = "48"', "'book' is no value of a label image; expected 1 to 65535"),
-        ("names.toml", '70000 = "book"', "'70000' is no value of a label image"),
+        ("names.toml", 'book = "48"', "'book' is not a label value; expected 1 to 65535"),
+        ("names.toml", '70000 = "book"', "'70000' is not a label value"),
         ("names.json", '{"48": "a\\nb"}', "the name of 48 is"),
     ],
 )
-def test_what_is_wrong_with_the_names_is_said(tmp_path: Path, file: str, text: str, message: str) -> None:
+def test_invalid_names_file_fails(tmp_path: Path, file: str, text: str, message: str) -> None:
     (tmp_path / file).write_text(text)
     with pytest.raises(DataError) as caught:
         read_names(tmp_path / file, "rgbd/desk")

@@ -131,27 +131,27 @@ def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(mode
         assert answer.names == answers[0].names
 
 
-def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:
+def test_profile_reports_exactly_the_deviations_from_the_paper() -> None:
     ram = SimpleNamespace(tagger=SimpleNamespace(caveat=None))
     encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
-        "names and captions: the tagger's names and a template stand in for the paper's vision model"
+        "names and captions: the tagger's names and a template replace the paper's vision model"
     ]
     other = PaperConfig.model_validate(
         {"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}, "stop_words": ["room"]}}
     )
     encoder.name, captioner.vision_model = "ViT-L-14/openai", "some-model"
     assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
-        "masks: sam-vit-b stands in for the paper's sam-vit-h",
-        "named masks: boxes.box_threshold, stop_words set otherwise than OpenSU3D's",
-        "features: ViT-L-14/openai stands in for the paper's clip-vit-h-14",
-        "names and captions: some-model stands in for the paper's gpt-4-vision-preview",
+        "masks: sam-vit-b replaces the paper's sam-vit-h",
+        "named masks: boxes.box_threshold, stop_words differ from OpenSU3D's settings",
+        "features: ViT-L-14/openai replaces the paper's clip-vit-h-14",
+        "names and captions: some-model replaces the paper's gpt-4-vision-preview",
     ]
 
 
-def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_models: Path) -> None:
+def test_auto_selects_paper_on_camera_images_if_models_exist(models: Path, no_models: Path) -> None:
     here, away = config_of(models), config_of(no_models)
     assert resolve_profile("auto", "camera", here) == "paper"
     assert resolve_profile("auto", "rendered-rooms", here) == "embedded"
@@ -161,7 +161,7 @@ def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_mo
     assert caveat is not None and "rendered rooms only" in caveat
 
 
-def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:
+def test_missing_requested_tagger_fails_before_any_frame(models: Path, no_models: Path) -> None:
     check_models("paper", config_of(models))
     with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found .*run: python tools/export_onnx\.py ram-plus"):
         check_models("paper", config_of(models, tagger="ram-onnx"))
@@ -183,4 +183,4 @@ def test_a_room_runs_end_to_end(
         assert isinstance(found, Instances) and len(found) > 0
         sealed = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
         assert {"packages.torch", "packages.transformers"} <= sealed["steps"]["predict"]["key"].keys()
-    assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
+    assert "RAM++ is not installed" in str(read_json(tmp_path / "out" / "metrics.json"))

@@ -58,7 +58,7 @@ def plain(scene: str, kind: str, k: int) -> AuditedQuestion:
     return AuditedQuestion(scene, kind, f"{kind} {k}", "nothing", (), (), (), ROOM)
 
 
-def test_a_relation_is_held_against_that_of_the_name_to_which_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relation_reference_is_the_related_object_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     one = audited(monkeypatch, new_question("painted/a", "relative", "vase on a table", (3,), "generated"))[0]
     assert (ids(one.right), ids(one.held), ids(one.others)) == ([3], [1], [4])
     assert one.answer == "vase #3"
@@ -77,7 +77,7 @@ def test_answers_of_templates_are_in_words(monkeypatch: pytest.MonkeyPatch) -> N
     assert (yes.answer, ids(yes.right), ids(yes.held)) == ("yes: lamp #6", [6], [5])
 
 
-def test_the_draw_is_even_over_kinds_and_scenes_and_the_same_for_a_seed() -> None:
+def test_sampling_is_balanced_and_deterministic() -> None:
     every = [
         plain(f"painted/{s}", kind, k) for s in "abcd" for kind in ("count", "instance", "what on") for k in range(9)
     ]
@@ -114,7 +114,7 @@ def judged(folder: Path, path: Path, verdicts: Sequence[str]) -> Path:
     return path
 
 
-def test_the_verb_leaves_sheets_a_page_and_a_table_to_fill_in(folder: Path) -> None:
+def test_audit_command_writes_pictures_page_and_table(folder: Path) -> None:
     rows = rows_of(folder / "audit.csv")
     assert tuple(rows[0]) == COLUMNS
     assert [row["number"] for row in rows] == [str(k) for k in range(1, 15)]
@@ -156,7 +156,7 @@ def test_verdicts_add_up_by_kind_and_the_wrong_ones_are_listed(
     assert sum(count["right"] for count in counts["kinds"].values()) == 10
 
 
-def test_an_unknown_verdict_is_refused_with_its_row(tmp_path: Path) -> None:
+def test_unknown_verdict_error_names_the_row(tmp_path: Path) -> None:
     (tmp_path / "audit.csv").write_text(f"{','.join(COLUMNS)}\n1,a,count,x,0,rigth,\n", encoding="utf-8")
     with pytest.raises(DataError, match="row 2: unknown verdict"):
         read_verdicts(tmp_path / "audit.csv")

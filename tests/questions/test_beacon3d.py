@@ -43,14 +43,14 @@ def numbers(folder: Path, asked: object, answers: object) -> dict[str, Number]:
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS["grounding"])))
-def test_a_made_problem_of_grounding_has_every_number_of_the_original(index: int, tmp_path: Path) -> None:
+def test_synthetic_grounding_metrics_match_original(index: int, tmp_path: Path) -> None:
     problem = PROBLEMS["grounding"][index]
     found = numbers(tmp_path, problem["metadata"], [{"correct": one} for one in problem["correct"]])
     assert {name: 100 * one.least for name, one in found.items()} == problem["answer"]
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS["qa"])))
-def test_a_made_problem_of_answers_has_every_number_of_the_original(index: int, tmp_path: Path) -> None:
+def test_synthetic_qa_metrics_match_original(index: int, tmp_path: Path) -> None:
     problem = PROBLEMS["qa"][index]
     found = numbers(tmp_path, problem["metadata"], problem["answers"])
     assert found.pop("settled").least == 1.0
@@ -58,7 +58,7 @@ def test_a_made_problem_of_answers_has_every_number_of_the_original(index: int, 
     assert all(one.least == one.most for one in found.values())
 
 
-def test_an_object_counts_where_its_finest_texts_are_right_and_a_spelling_is_one_case(tmp_path: Path) -> None:
+def test_object_score_uses_most_specific_texts_and_merges_spellings(tmp_path: Path) -> None:
     shouted = copy.deepcopy(GROUNDING)
     shouted["scene0025_00"]["box"]["27"]["chain_3"][1] = COARSE | {"text": "BOX", "obj_id": ["29"]}
     answers = [{"object_id": 27}, {"object_id": 27}, {"object_id": 27}, {"object_id": 27}, {"object_id": 27}]
@@ -67,7 +67,7 @@ def test_an_object_counts_where_its_finest_texts_are_right_and_a_spelling_is_one
     assert (found["chain"].least, found["fine alone"].least) == (0.0, 1.0)
 
 
-def test_the_texts_of_a_file_ask_a_map_in_their_chains_and_are_questions_too(tmp_path: Path) -> None:
+def test_file_texts_are_chained_queries_and_questions(tmp_path: Path) -> None:
     asked, _ = written(tmp_path, GROUNDING, [])
     (scene, cases), *rest = read_foreign_queries(asked).items()
     assert scene == "scene0025_00" and not rest and len(cases) == 4
@@ -83,7 +83,7 @@ def test_the_texts_of_a_file_ask_a_map_in_their_chains_and_are_questions_too(tmp
     [(GROUNDING, [{"correct": 1}, {"object_id": 3}] * 2), (QA, [{"pred": "red", "score": 2}] * 3)],
     ids=["grounding", "qa"],
 )
-def test_damaged_files_are_read_or_refused_in_one_line(asked: object, answers: object, tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_give_one_line_error(asked: object, answers: object, tmp_path: Path) -> None:
     paths = written(tmp_path, asked, answers)
     for path in paths:
         whole = path.read_bytes()

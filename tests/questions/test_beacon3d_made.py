@@ -57,7 +57,7 @@ ROOM = SceneMap(
 # ---- made questions
 
 
-def test_each_object_has_three_questions_and_three_chains_in_the_form_of_the_release() -> None:
+def test_each_object_has_three_questions_and_three_chains() -> None:
     grounding, questions = made_files({"room": ROOM})
     chains, answers = chains_of(grounding, "here"), questions_of_objects(questions, "here")
     n_objects = len(answers.asked) // 3
@@ -123,7 +123,7 @@ def has_each_question_once(problem: Any) -> bool:
 
 
 @pytest.mark.parametrize("problem", [one for one in PROBLEMS if has_each_question_once(one)])
-def test_with_a_judge_a_made_problem_has_every_number_of_the_original(problem: Any, tmp_path: Path) -> None:
+def test_synthetic_metrics_with_judge_match_original(problem: Any, tmp_path: Path) -> None:
     questions = questions_of_objects(problem["metadata"], "here")
     (tmp_path / "a.json").write_text(json.dumps(problem["answers"]))
     scores = {key[1]: reply.score for key, reply in read_replies(tmp_path / "a.json", questions).items()}
@@ -135,12 +135,12 @@ def test_with_a_judge_a_made_problem_has_every_number_of_the_original(problem: A
     assert {name: 100 * one.least for name, one in found.items()} == problem["answer"]
 
 
-def test_a_reply_that_is_no_score_leaves_the_answer_open() -> None:
+def test_reply_without_score_leaves_answer_unscored() -> None:
     scores = [score_of(ModelReply(text)) for text in ("3 of 5", "4.5", "0", "", "9" * 5000)]
     assert scores == [3, 4, None, None, None] and score_of(ModelReply("5", failure="no")) is None
 
 
-def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
+def test_answers_are_judged_once_and_api_key_is_never_shown(
     chat: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
@@ -160,7 +160,7 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     assert main([*words, *server]) == 0
     said = capsys.readouterr()
     assert "judge: gpt-4o-2024-08-06, asked for 2 answers" in said.out
-    assert "it gave 1 of them no score, for which the least and the most stand" in said.out
+    assert "1 replies without a score" in said.out
     assert chat.n_asked == 2 and {body["model"] for body in chat.bodies} == {"gpt-4o-2024-08-06"}
     (system, user) = next(body["messages"] for body in chat.bodies if "mauve" in str(body))
     assert (
@@ -175,4 +175,4 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     assert KEY not in said.out + said.err + stored
     Path("qa.json").write_text(json.dumps([{"pred": "teal"}, *rows[1:]]))
     assert main([*words, "--offline"]) == 2
-    assert "holds no reply to this judge request" in capsys.readouterr().err
+    assert "no stored reply to this judge request" in capsys.readouterr().err

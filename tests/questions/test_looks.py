@@ -53,31 +53,31 @@ def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> Any:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
-def test_the_sides_of_a_thing_are_its_own_however_it_is_turned(degrees: float) -> None:
+def test_object_dimensions_are_rotation_invariant(degrees: float) -> None:
     sides = looks_of("desk", slab(1.6, 0.8, 0.7, degrees), None, is_cut=False).sides
     assert sides == pytest.approx([1.6, 0.8, 0.7], abs=0.03)
 
 
-def test_round_square_and_rectangular_faces_have_their_words() -> None:
+def test_faces_are_round_square_or_rectangular() -> None:
     assert words_of("table", polygon(40)) == ({"round"}, {"round"})
     assert words_of("table", slab(1, 1, 0.7, 20)) == ({"square"}, {"square"})
     assert words_of("table", slab(1.4, 0.8, 0.7, 20)) == ({"rectangular"}, {"rectangular"})
 
 
-def test_what_is_between_two_shapes_is_neither_for_sure_and_may_be_both() -> None:
+def test_intermediate_shapes_are_ambiguous() -> None:
     assert words_of("table", polygon(8)) == (frozenset(), {"round"})  # an octagon
     assert words_of("table", slab(1.18, 1, 0.7)) == (frozenset(), {"square", "rectangular"})
     assert words_of("table", polygon(3)) == (frozenset(), frozenset())  # a triangle is none of them
 
 
-def test_of_what_is_cut_or_small_or_not_said_of_such_things_no_shape_is_told() -> None:
+def test_cut_small_or_unsuitable_objects_have_no_shape() -> None:
     assert words_of("table", polygon(40), is_cut=True) == (frozenset(), SHAPES)
     assert words_of("table", slab(0.15, 0.15, 0.1)) == (frozenset(), SHAPES)
     assert words_of("chair", slab(0.5, 0.5, 0.9)) == (frozenset(), SHAPES)
     assert words_of("cushion", slab(0.5, 0.2, 0.5)) == (frozenset(), SHAPES)  # a square one that leans
 
 
-def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixels_has_in_one() -> None:
+def test_colour_is_sure_only_under_all_lighting() -> None:
     red, blue = np.tile([200.0, 40.0, 40.0], (70, 1)), np.tile([50.0, 90.0, 180.0], (30, 1))
     assert maybe_colours([np.concatenate([red, blue])]) == {"red", "blue"}
     assert maybe_colours([np.concatenate([red, blue[:15]])]) == {"red"}
@@ -89,7 +89,7 @@ def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixel
     assert looks_of("chair", slab(0.5, 0.5, 0.9), None, is_cut=False).maybe >= COLOURS  # never seen
 
 
-def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
+def test_clearly_long_and_tall_objects_are_recognized() -> None:
     def build(name: str, *sides: float, is_cut: bool = False) -> Any:
         looks = looks_of(name, slab(*sides), None, is_cut=is_cut)
         return looks.words & BUILDS, looks.maybe & BUILDS
@@ -118,7 +118,7 @@ def asked(*things: MapObject) -> dict[str, tuple[str, tuple[int, ...] | None]]:
     return {one.text: (one.kind, one.answers) for one in questions if one.kind.startswith("property")}
 
 
-def test_a_word_is_asked_where_it_is_sure_of_the_answers_and_nobody_would_say_it_of_another() -> None:
+def test_word_is_asked_only_if_unambiguous() -> None:
     table = (1.0, 1.0, 0.7)
     pair = thing(1, "table", table, "round red"), thing(2, "table", table, "rectangular", "brown")
     assert asked(*pair) == {
@@ -131,7 +131,7 @@ def test_a_word_is_asked_where_it_is_sure_of_the_answers_and_nobody_would_say_it
     assert three["round table"] == ("property", (1, 3))  # all that it is sure of
 
 
-def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:
+def test_scan_sizes_ignore_objects_cut_by_images() -> None:
     small, large = thing(1, "box", (0.3, 0.3, 0.3)), thing(2, "box", (0.4, 0.4, 0.4))
     assert asked(small, large) == {"large box": ("property", (2,)), "small box": ("property", (1,))}
     assert asked(small, replace(large, is_cut=True)) == {}
@@ -149,7 +149,7 @@ def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:
     assert asked(thing(1, "book", (0.3, 0.3, 0.3)), thing(2, "book", (0.4, 0.4, 0.4))) == {}  # a row, perhaps
 
 
-def test_large_is_the_face_of_what_is_flat_and_soft_things_are_neither_long_nor_tall() -> None:
+def test_flat_objects_use_face_area_and_soft_objects_have_no_length() -> None:
     flat = looks_of("picture", slab(0.8, 0.02, 0.5), None, is_cut=False)
     assert measure_of("picture", flat, "large") == pytest.approx(0.4, abs=0.02)
     block = looks_of("box", slab(0.8, 0.5, 0.5), None, is_cut=False)
@@ -200,14 +200,14 @@ def test_the_share_of_the_image_is_that_of_the_projected_square() -> None:
     assert pytest.approx(25**2, rel=0.02) == LEAST_SHARE * 640 * 480
 
 
-def test_what_stands_behind_something_is_not_seen() -> None:
+def test_occluded_objects_are_not_visible() -> None:
     dataset, truth = seen_by_one_camera(depth_m=1.5)
     assert sights(dataset, "s", truth, 1) == {}
     objects = known_objects(truth, 1, None, {})
     assert [thing.is_asked for thing in objects.objects] == [False, False]
 
 
-def test_a_colour_is_told_where_frames_show_the_one_that_a_thing_was_made_in() -> None:
+def test_colour_is_given_if_frames_show_the_material_colour() -> None:
     dataset, truth = seen_by_one_camera()
     seen, box = sights(dataset, "s", truth, 1), np.array([[0, 0, 0], [1, 1, 1]], float)
     whole = [WholeObject(1, "chair", box, ("wicker",), "red"), WholeObject(2, "table", box, (), "blue")]
@@ -216,7 +216,7 @@ def test_a_colour_is_told_where_frames_show_the_one_that_a_thing_was_made_in() -
     assert known_objects(truth, 1, [WholeObject(1, "picture", box)], seen).objects[0].caption == ""
 
 
-def test_a_colour_that_nobody_vouches_for_is_the_same_in_other_light() -> None:
+def test_unannotated_colour_must_be_stable_under_lighting() -> None:
     dataset, truth = seen_by_one_camera()
     box = np.array([[0, 0, 0], [1, 1, 1]], float)
     seen = sights(dataset, "s", truth, 1)
@@ -229,7 +229,7 @@ def test_a_colour_that_nobody_vouches_for_is_the_same_in_other_light() -> None:
 
 
 @pytest.mark.parametrize(("aside", "is_cut"), [(0.0, False), (-0.15, True)])
-def test_what_ends_where_the_image_ends_is_cut(aside: float, is_cut: bool) -> None:
+def test_object_at_image_border_is_cut(aside: float, is_cut: bool) -> None:
     dataset, truth = seen_by_one_camera()
     moved = truth.points + np.array([aside, 0, 0], np.float32) * (truth.instance == 1)[:, None]
     truth = replace(truth, points=moved)

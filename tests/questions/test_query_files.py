@@ -53,13 +53,13 @@ def write_map(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
-def test_both_forms_give_the_queries_of_each_scene(tmp_path: Path, name: str, content: str) -> None:
+def test_toml_and_csv_give_the_same_queries(tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content)
     assert read_query_file(tmp_path / name) == QUERIES
 
 
 @pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
+def test_damaged_files_are_read_or_give_one_line_error(tmp_path: Path, name: str, content: str) -> None:
     path = tmp_path / name
 
     def read(damaged: bytes) -> object:
@@ -71,7 +71,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, name: str
         assert n_refused > 20
 
 
-def test_sentences_of_scanrefer_and_nr3d_are_held_against_boxes(
+def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flat = Replica.ground_truth

@@ -41,12 +41,12 @@ SQA3D_ANSWERS = json.dumps({"annotations": [{"question_id": 7, "answers": [{"ans
 
 
 @pytest.mark.parametrize("name", ["q.toml", "q.csv"])
-def test_a_written_set_is_read_as_it_was(tmp_path: Path, name: str) -> None:
+def test_question_set_round_trips(tmp_path: Path, name: str) -> None:
     write_questions(tmp_path / name, SET)
     assert read_questions(tmp_path / name) == SET
 
 
-def test_scanrefer_objects_are_one_more_than_its_ids_and_equal_sentences_share_answers(tmp_path: Path) -> None:
+def test_scanrefer_ids_are_shifted_and_equal_sentences_are_merged(tmp_path: Path) -> None:
     (tmp_path / "ScanRefer.json").write_text(SCANREFER)
     text = "a white cabinet in the corner"
     assert read_questions(tmp_path / "ScanRefer.json") == (
@@ -54,7 +54,7 @@ def test_scanrefer_objects_are_one_more_than_its_ids_and_equal_sentences_share_a
     )
 
 
-def test_nr3d_is_known_by_its_columns(tmp_path: Path) -> None:
+def test_nr3d_is_detected_by_its_columns(tmp_path: Path) -> None:
     (tmp_path / "nr3d.csv").write_text(NR3D)
     assert read_questions(tmp_path / "nr3d.csv") == (
         replace(
@@ -64,7 +64,7 @@ def test_nr3d_is_known_by_its_columns(tmp_path: Path) -> None:
     )
 
 
-def test_sqa3d_takes_its_answers_from_the_file_beside_it(tmp_path: Path) -> None:
+def test_sqa3d_answers_are_read_from_the_annotation_file(tmp_path: Path) -> None:
     questions = tmp_path / "v1_balanced_questions_val_scannetv2.json"
     questions.write_text(SQA3D)
     text = "I sit. What is in front?"
@@ -78,7 +78,7 @@ def test_sqa3d_takes_its_answers_from_the_file_beside_it(tmp_path: Path) -> None
     ("name", "content"),
     [("q.json", SCANREFER), ("q.csv", NR3D), ("s.json", SQA3D), ("q.toml", toml_text(SET[:2]))],
 )
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
+def test_damaged_files_are_read_or_give_one_line_error(tmp_path: Path, name: str, content: str) -> None:
     path = tmp_path / name
 
     def read(damaged: bytes) -> object:
@@ -100,7 +100,7 @@ def test_the_papers_queries_are_asked_of_its_13_scenes() -> None:
     assert len({one.id for one in found}) == len(found)
 
 
-def test_the_verb_makes_questions_from_classes_boxes_and_frames(
+def test_command_generates_questions_from_classes_boxes_and_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenes = f"{SCENES}/painted.py:Painted/a"
@@ -129,7 +129,7 @@ def test_the_verb_makes_questions_from_classes_boxes_and_frames(
         ("nr3d.csv", "scan_id,utterance\nscene0000_00,plant\n"),
     ],
 )
-def test_what_is_no_set_is_refused_in_one_line_that_names_the_file(name: str, text: str, tmp_path: Path) -> None:
+def test_invalid_question_set_error_names_the_file(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(DataError) as caught:
         read_questions(tmp_path / name, "replica")

@@ -51,7 +51,7 @@ def test_relations_come_from_boxes() -> None:
     assert ASKED["relative by name", "table under a vase"] == (2,)
 
 
-def test_what_stands_between_two_single_things_is_asked() -> None:
+def test_object_between_two_unique_objects_is_asked() -> None:
     row = SceneMap(tuple(placed(k, name, (k * 0.8, 0, 0), (0.3, 0.3, 0.5)) for k, name in
                          ((1, "bin"), (2, "lamp"), (3, "sofa"))))  # fmt: skip
     asked = {one.text: one.answers for one in generate("a/b", row)}
@@ -64,7 +64,7 @@ def row_of(*things: MapObject) -> dict[tuple[str, str], tuple[int, ...] | None]:
     return {(one.kind, one.text): one.answers for one in generate("a/b", SceneMap((*things, *others)))}
 
 
-def test_a_relation_that_all_of_a_name_have_stands_apart() -> None:
+def test_relation_shared_by_all_of_a_name_is_a_separate_kind() -> None:
     table, other_table = placed(1, "table", (0, 0, 0), (1, 1, 0.7)), placed(2, "desk", (4, 0, 0), (1, 1, 0.7))
     cup, other_cup = (
         placed(3, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1)),
@@ -85,7 +85,7 @@ def test_a_pair_near_a_threshold_is_not_asked_about() -> None:
     assert not any(text == "chair next to a table" for _, text in row_of(table, doubtful))
 
 
-def test_of_what_is_cut_by_the_images_no_place_is_asked() -> None:
+def test_positions_of_cut_objects_are_not_asked() -> None:
     table, cup = placed(1, "table", (0, 0, 0), (1, 1, 0.7)), placed(2, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1))
     lamp, sofa = placed(3, "lamp", (3, 0, 0), (0.3, 0.3, 1.5)), placed(4, "sofa", (6, 0, 0), (1, 1, 0.7))
     assert row_of(table, cup)["relative by name", "cup on a table"] == (2,)
@@ -100,7 +100,7 @@ def test_of_what_is_cut_by_the_images_no_place_is_asked() -> None:
     assert not any("sofa" in text for text in seen if "How many" not in text)
 
 
-def test_what_no_frame_shows_is_neither_asked_for_nor_an_answer() -> None:
+def test_invisible_objects_are_not_in_questions_or_answers() -> None:
     table, cup = placed(1, "table", (0, 0, 0), (1, 1, 0.7)), placed(2, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1))
     assert ("instance", "cup") in row_of(table, cup)
     hidden = row_of(table, replace(cup, is_asked=False))
@@ -108,7 +108,7 @@ def test_what_no_frame_shows_is_neither_asked_for_nor_an_answer() -> None:
     assert ("instance", "table") in hidden
 
 
-def test_a_colour_or_material_is_asked_where_all_of_the_name_have_one() -> None:
+def test_colour_or_material_is_asked_if_known_for_all_of_a_name() -> None:
     red, blue, plain, woven = (
         replace(placed(k, "chair", (4.0 * k, 0, 0), (0.5, 0.5, 0.9)), caption=caption)
         for k, caption in ((1, "red"), (2, "blue wooden"), (3, ""), (4, "wicker"))
@@ -121,7 +121,7 @@ def test_a_colour_or_material_is_asked_where_all_of_the_name_have_one() -> None:
     assert row_of(blue)["property by name", "wooden chair"] == (2,)
 
 
-def test_who_knows_names_alone_is_right_by_the_share_of_the_name() -> None:
+def test_name_only_baseline_equals_share_of_the_name() -> None:
     chairs = SceneMap(tuple(placed(k, "chair", (4.0 * k, 0, 0), (0.5, 0.5, 0.9)) for k in range(1, 5)))
     assert right_by_name(new_question("a/b", "property", "red chair", (1,), "x"), chairs) == 0.25
     assert right_by_name(new_question("a/b", "property by name", "old chair", (1, 2, 3, 4), "x"), chairs) == 1.0
@@ -129,12 +129,12 @@ def test_who_knows_names_alone_is_right_by_the_share_of_the_name() -> None:
     assert right_by_name(new_question("a/b", "relative", "chair on a table", None, "x"), chairs) == 0.0
 
 
-def test_what_more_than_a_third_answers_is_dropped() -> None:
+def test_questions_answered_by_over_a_third_are_dropped() -> None:
     same = SceneMap(tuple(placed(k, "chair", (k, 0, 0), (0.4, 0.4, 0.9)) for k in range(1, 4)))
     assert all(one.text != "chair" for one in generate("a/b", same))
 
 
-def test_objects_are_named_after_most_of_their_vertices_and_small_ones_left_out() -> None:
+def test_objects_take_majority_class_and_small_ones_are_excluded() -> None:
     truth = room()
     semantic = truth.semantic.copy()
     semantic[truth.instance == 2] = np.where(np.arange(150) < 40, ID["table"], ID["chair"])
@@ -156,5 +156,5 @@ def test_objects_are_named_after_most_of_their_vertices_and_small_ones_left_out(
         ("", "sofa", False),
     ],
 )
-def test_a_label_is_right_by_the_lexicon(label: str, class_name: str, is_right: bool) -> None:
+def test_label_correctness_follows_the_lexicon(label: str, class_name: str, is_right: bool) -> None:
     assert is_called(label, class_name) is is_right

@@ -67,7 +67,7 @@ def solver() -> Solver:
         ("how many furniture are there", (1, 2, 6, 11), 4),
     ],
 )
-def test_questions_that_geometry_settles(
+def test_geometric_questions_are_answered(
     solver: Solver, question: str, ids: tuple[int, ...], value: float | None
 ) -> None:
     found = solver.answer(question)
@@ -85,7 +85,7 @@ def test_questions_that_geometry_settles(
         ("How far is the bed from the bed?", "one thing in the map"),
     ],
 )
-def test_what_cannot_be_settled_says_so(solver: Solver, question: str, reason: str) -> None:
+def test_unsettled_questions_are_reported(solver: Solver, question: str, reason: str) -> None:
     found = solver.answer(question)
     assert not found.is_settled
     assert found.text.startswith("I cannot settle this: ")
@@ -93,7 +93,7 @@ def test_what_cannot_be_settled_says_so(solver: Solver, question: str, reason: s
     assert found.object_ids == ()
 
 
-def test_left_depends_on_who_looks_and_it_is_said() -> None:
+def test_left_depends_on_viewpoint_and_is_noted() -> None:
     # Who stands at the origin and looks along +x sees what has the greater y on the left.
     scene = SceneMap((thing(1, "chair", box(2, 0.5, 0, 0.2, 0.2, 1)), thing(2, "sofa", box(2, -0.5, 0, 0.2, 0.2, 1))))
     near = Solver(scene, np.zeros(3)).answer("Is the chair left of the sofa?")
@@ -105,7 +105,7 @@ def test_left_depends_on_who_looks_and_it_is_said() -> None:
     assert Solver(scene, np.zeros(3)).answer("What is to the left of the sofa?").object_ids == (1,)
 
 
-def test_an_unknown_noun_goes_to_the_encoder_last_and_it_is_said() -> None:
+def test_unknown_noun_falls_back_to_encoder_with_a_note() -> None:
     def nearest(noun: str, names: Sequence[str]) -> tuple[str, float]:
         assert "floor" not in names
         return ("bed", 0.9) if noun == "bunk" else ("table", 0.7)
@@ -119,7 +119,7 @@ def test_an_unknown_noun_goes_to_the_encoder_last_and_it_is_said() -> None:
     assert not asked.answer("Which sink is closer to the harp?").is_settled
 
 
-def test_answers_in_words_are_read_for_their_yes_or_number() -> None:
+def test_yes_no_and_numbers_are_parsed_from_text_answers() -> None:
     assert Answer("There are 2 cups (ID #7 and #8)").said(2) == 2
     assert Answer("There are 3").said(2) == 3
     assert Answer("No, there is none").said(True) is False
@@ -139,7 +139,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
     )
 
 
-def test_generated_questions_are_answered_as_they_were_made(room: SceneMap) -> None:
+def test_generated_questions_are_answered_correctly(room: SceneMap) -> None:
     questions = generate_questions(room, n_each=4, seed=3, eye=room.middle)
     assert questions == generate_questions(room, n_each=4, seed=3, eye=room.middle)
     assert {one.kind for one in questions} >= {"closer", "nearest", "distance", "count", "largest", "what on", "is on"}
@@ -151,7 +151,7 @@ def test_generated_questions_are_answered_as_they_were_made(room: SceneMap) -> N
     assert not any("left of" in one.text for one in generate_questions(room, n_each=4))
 
 
-def test_the_truth_of_a_nearest_object_is_that_of_all_distances(room: SceneMap) -> None:
+def test_nearest_object_answer_matches_all_distances(room: SceneMap) -> None:
     centres = np.array([one.centroid for one in room.objects])
     for one in generate_questions(room, n_each=8, seed=1):
         if one.kind not in ("closer", "farthest"):
@@ -172,7 +172,7 @@ def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
     sound = replace(made, boxes=np.zeros((2, 2, 3), np.float32))
     assert [one.name for one in map_of(sound).objects] == ["lamp", "couch"]
     assert [one.name for one in map_of(sound, RefinedNames(("a", "b"), "test")).objects] == ["a", "b"]
-    with pytest.raises(PredictionError, match="two instances of one id"):
+    with pytest.raises(PredictionError, match="duplicate instance ids"):
         map_of(replace(sound, ids=np.array([3, 3], np.int32)))
 
 
@@ -188,7 +188,7 @@ class Said:
         return [Reply(self.text, "stop")] * len(requests)
 
 
-def test_the_prompt_holds_the_paper_s_six_rules_and_every_object() -> None:
+def test_prompt_contains_the_six_paper_rules_and_all_objects() -> None:
     assert len(STRATEGY) == 6 and all(rule in solving.system_prompt() for rule in STRATEGY)
     model = Said('{"reasoning": "3.59 < 5.32", "answer": "the kitchen sink", "object_ids": [9, 999]}')
     found = LanguageSolver(bedroom(), model, LanguageConfig()).answer("Which sink is closer to bed?")
@@ -201,7 +201,7 @@ def test_the_prompt_holds_the_paper_s_six_rules_and_every_object() -> None:
     }  # fmt: skip
 
 
-def test_a_map_larger_than_the_context_is_cut_by_relevance_and_it_is_said() -> None:
+def test_oversized_map_is_truncated_by_relevance_with_a_note() -> None:
     filler = [thing(100 + k, "plate", box(9, k, 0, 0.1, 0.1, 0.1)) for k in range(300)]
     scene = SceneMap((*filler, *bedroom().objects))
     config = LanguageConfig(context_tokens=2000, max_answer_tokens=200)
@@ -255,14 +255,14 @@ def page_model(case: Any) -> Said:
     return Said(json.dumps({"reasoning": "as shown", "answer": case["told"], **ids}))
 
 
-def test_there_are_seven_and_they_are_asked_of_the_paper_s_scenes() -> None:
+def test_seven_paper_questions_belong_to_paper_scenes() -> None:
     assert len(PAGE) == 7
     asked = [question for question in paper_queries() if question.kind == "reasoning" and question.reply]
     assert {(one.scene, one.text) for one in asked} == {(one["scene"], one["question"]) for one in PAGE}
 
 
 @each_case
-def test_the_built_in_solver_gives_the_page_s_answer_or_says_that_it_cannot(case: Any) -> None:
+def test_builtin_solver_gives_published_answer_or_none(case: Any) -> None:
     scene = shown_map(case)
     found = Solver(scene).answer(case["question"])
     assert found.is_settled is case["is_settled_by_geometry"]
@@ -273,7 +273,7 @@ def test_the_built_in_solver_gives_the_page_s_answer_or_says_that_it_cannot(case
 
 
 @each_case
-def test_the_page_s_answer_in_a_model_s_words_is_right_and_another_is_wrong(case: Any) -> None:
+def test_paraphrased_published_answer_is_correct(case: Any) -> None:
     scene, model = shown_map(case), page_model(case)
     solver = by_language_model(model, LanguageConfig())
     (found,) = solver.ask(scene, [case["question"]])

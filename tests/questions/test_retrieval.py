@@ -45,7 +45,7 @@ def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None
 def test_retrieval_without_comparable_features_is_refused() -> None:
     with pytest.raises(PredictionError, match="no features"):
         rank(instances_with(None), "east", TwoWords())
-    with pytest.raises(PredictionError, match="3 dimensions and encoder 'two-words' gives 2"):
+    with pytest.raises(PredictionError, match="3 dimensions, encoder 'two-words' has 2"):
         rank(instances_with(np.ones((1, 3))), "east", TwoWords())
 
 
@@ -57,9 +57,7 @@ def as_the_program_of_conceptfusion_shows(similarity: Float64Array) -> list[int]
 
 
 @pytest.mark.parametrize("rows_at_once", [7, 65536])
-def test_of_features_alone_the_points_are_found_that_their_own_program_shows(
-    rows_at_once: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_feature_only_retrieval_matches_original_program(rows_at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(questions_model, "BLOCK_ROWS", rows_at_once)
     random = np.random.default_rng(3)
     features = random.normal(size=(60, 2)).astype(np.float16)
@@ -73,7 +71,7 @@ def test_of_features_alone_the_points_are_found_that_their_own_program_shows(
     assert np.array_equal(found.points, dense.points)
 
 
-def test_where_every_point_is_equally_similar_none_is_found() -> None:
+def test_equal_similarities_retrieve_no_points() -> None:
     for n, features in ((0, np.zeros((0, 2))), (3, np.zeros((3, 2))), (3, np.ones((3, 2)))):
         dense = DenseFeatures(np.zeros((n, 3), np.float32), features.astype(np.float16))
         assert points_found(dense, ["east"], TwoWords()).sizes.tolist() == [0]
@@ -94,7 +92,7 @@ def test_names_of_background_are_left_out(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["wall lamp", "floor mat", "ceiling fan", "wall-mounted shelf", "sofa", "", "<wall>x"])
-def test_things_on_walls_and_floors_stay(name: str) -> None:
+def test_objects_on_walls_and_floors_are_retained(name: str) -> None:
     assert undesired(plan_of((1, 1)), (name,), FilterConfig()) == ("",)
 
 

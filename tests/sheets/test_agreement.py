@@ -56,7 +56,7 @@ def test_cohens_kappa_is_that_of_his_own_example() -> None:
     assert cohen_kappa(left, right) == pytest.approx((0.29 - 0.35) / 0.65)
 
 
-def test_without_a_second_answer_or_without_items_nothing_can_be_said() -> None:
+def test_agreement_is_undefined_without_two_answers_or_items() -> None:
     always = np.array([[2, 0], [2, 0]])
     assert fleiss_kappa(always) is None
     assert krippendorff_alpha(always) is None
@@ -68,7 +68,7 @@ def test_without_a_second_answer_or_without_items_nothing_can_be_said() -> None:
     assert krippendorff_alpha(np.array([[1, 0], [0, 1]])) is None  # no item with two answers
 
 
-def test_all_coefficients_of_one_question_stand_side_by_side() -> None:
+def test_all_agreement_coefficients_of_a_question() -> None:
     ratings = {
         "a": {"ann": "right", "bob": "right", "cyn": "right"},
         "b": {"ann": "wrong", "bob": "wrong"},
@@ -92,7 +92,7 @@ def test_all_coefficients_of_one_question_stand_side_by_side() -> None:
     assert found.interval is None  # four items
 
 
-def test_the_interval_of_alpha_is_from_the_alphas_without_each_item() -> None:
+def test_alpha_interval_is_a_jackknife_over_items() -> None:
     answers = ["rr", "ww", "rw", "rr", "ww", "rr", "wr", "rr", "ww", "rr", "rw"]
     ratings = {str(k): dict(zip("xy", both, strict=True)) for k, both in enumerate(answers)}
     found = agreement(ratings)

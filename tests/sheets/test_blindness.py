@@ -90,7 +90,7 @@ def differs(picture: UInt8Array, other: UInt8Array) -> Any:
 
 
 @pytest.mark.proof
-def test_the_views_of_an_item_are_those_of_the_room_wherever_its_answer_is_not(source: RunSource) -> None:
+def test_views_outside_the_answer_show_only_the_room(source: RunSource) -> None:
     artist = Artist(source)
     every = [draft for kind in KINDS for draft in drafts_of(source, kind)]
     assert {draft.kind for draft in every} == set(KINDS)
@@ -120,13 +120,13 @@ class OwnMap(Artist):
 
 
 @pytest.mark.proof
-def test_a_map_that_is_drawn_is_found(source: RunSource) -> None:
+def test_blindness_check_detects_a_drawn_map(source: RunSource) -> None:
     of_method = [draft for draft in drafts_of(source, "retrieval") if draft.methods[0] == "openmask3d"]
     assert min(n_astray(OwnMap(source), draft) for draft in of_method[:3]) > 1000
 
 
 @pytest.mark.proof
-def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(source: RunSource) -> None:
+def test_picture_is_independent_of_map_density_and_completeness(source: RunSource) -> None:
     whole = source.instances(SCENE, "openmask3d")
     row = int(np.argsort(whole.sizes)[len(whole) // 2])
     mask, random = whole.mask(row), np.random.default_rng(0)
@@ -147,7 +147,7 @@ def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(source
 
 
 @pytest.mark.proof
-def test_sheets_of_questions_come_out_the_same_without_any_map(run: Path, tmp_path: Path) -> None:
+def test_question_sheets_do_not_depend_on_maps(run: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare" / run.name
     shutil.copytree(run, bare, ignore=shutil.ignore_patterns("prediction*", ".cache"))
     assert list(run.rglob("prediction*")) and not list(bare.rglob("prediction*"))

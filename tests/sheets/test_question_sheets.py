@@ -48,7 +48,7 @@ def painted_objects() -> Any:
 # Made
 
 
-def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: TruthSource) -> None:
+def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource) -> None:
     drafts = question_drafts(source, "painted/a", 2)
     made = [one for one in drafts if one.question_kind in MADE_KINDS]
     reasoned = [one for one in drafts if one.question_kind not in MADE_KINDS]
@@ -126,7 +126,7 @@ def scored() -> tuple[Sheet, Key, Scores]:
     return sheet, key, score(sheet, key, judgements(sheet, ann=ANN, bob=BOB))
 
 
-def test_a_question_is_as_right_as_the_worst_of_its_parts() -> None:
+def test_question_score_is_the_worst_of_its_parts() -> None:
     sheet, _ = question_set(KINDS_ASKED)
     whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB))]
     assert whole == [RIGHT, ARGUABLE, WRONG, WRONG]

@@ -23,10 +23,10 @@ def small() -> tuple[Sheet, Key]:
 # What is refused
 
 
-def test_answered_twice_names_both_places(small: tuple[Sheet, Key]) -> None:
+def test_duplicate_answer_error_names_both_rows(small: tuple[Sheet, Key]) -> None:
     rows = [*both(small), replace(both(small)[0], at="again.csv: row 9")]
     (fault,) = check_answers(small[0], rows).faults
-    assert fault == "again.csv: row 9: is answered a second time, first at ann.csv: row 2; keep one of the two"
+    assert fault == "again.csv: row 9: duplicate answer, first at ann.csv: row 2; remove one of them"
 
 
 @pytest.mark.parametrize("change", [{"sheet_id": "retrieval-other"}, {"kind": "annotation"}, {"items": ()}])
@@ -39,7 +39,7 @@ def test_a_key_of_another_set_is_refused(small: tuple[Sheet, Key], change: dict[
 
 
 @pytest.mark.parametrize(("separator", "mark"), [(",", ""), (";", ""), ("\t", "\ufeff")])
-def test_csv_is_read_as_pages_and_spreadsheets_write_it(
+def test_csv_from_pages_and_spreadsheets_is_read(
     small: tuple[Sheet, Key], separator: str, mark: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "ann.csv"
@@ -81,7 +81,7 @@ NO_WORDS = ",".join(ANSWER_COLUMNS).encode() + b"\na,b,\x1b[2J,d,e,f\n"
 
 
 @pytest.mark.parametrize("content", [b"", b"sheet_id,item_id\n", b"\xff\xfes\x00", NO_WORDS])
-def test_a_csv_that_is_none_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_invalid_csv_fails(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(content)
     with pytest.raises(DataError, match=r"a\.csv"):
         read_answers(tmp_path / "a.csv")
@@ -102,9 +102,7 @@ def with_page(content: bytes, page: bytes) -> bytes:
     return stream.getvalue()
 
 
-def test_a_part_that_swells_a_document_type_and_a_cut_file_are_refused(
-    small: tuple[Sheet, Key], tmp_path: Path
-) -> None:
+def test_hostile_and_truncated_workbooks_fail(small: tuple[Sheet, Key], tmp_path: Path) -> None:
     book = workbook(both(small))
     with zipfile.ZipFile(io.BytesIO(book)) as archive:
         swollen = archive.read(PAGE).replace(b"</worksheet>", b" " * (300 << 20) + b"</worksheet>")
@@ -114,7 +112,7 @@ def test_a_part_that_swells_a_document_type_and_a_cut_file_are_refused(
             read_answers(tmp_path / "a.xlsx")
 
 
-def test_a_formula_is_no_answer(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+def test_formula_is_not_an_answer(small: tuple[Sheet, Key], tmp_path: Path) -> None:
     rows = both(small)
     rows[0] = replace(rows[0], answer='=IF(1,"right","wrong")')
     (tmp_path / "a.xlsx").write_bytes(workbook(rows))

@@ -52,9 +52,7 @@ def asked(server: ChatServer, *more: str) -> list[str]:
     return [*words, "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
 
 
-def test_several_kinds_give_a_folder_each_and_what_one_kind_alone_gives(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_kind_has_a_folder_equal_to_a_single_kind_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     both = told(capsys, "--kind", "annotation", "reasoning", "--per-kind", "2", "--out", "all", "--jobs", "1")
     assert [one["kind"] for one in both] == ["annotation", "reasoning"]
     (alone,) = told(capsys, "--kind", "annotation", "--per-kind", "2", "--out", "alone")
@@ -67,7 +65,7 @@ def test_several_kinds_give_a_folder_each_and_what_one_kind_alone_gives(
     assert any(one.automatic for one in key.items)
 
 
-def test_a_language_model_answers_reasoning_sheets_and_its_replies_stay(
+def test_language_model_replies_to_reasoning_sheets_are_stored(
     folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (first,) = told(capsys, *asked(server))

@@ -30,7 +30,7 @@ from su3d_bench.sheets.sources import RunSource
 TEXTS = tuple(f"thing {k}" for k in range(12))
 
 
-def test_what_annotators_get_names_no_method_no_scene_and_no_truth(tmp_path: Path) -> None:
+def test_annotator_files_reveal_no_method_scene_or_ground_truth(tmp_path: Path) -> None:
     files = write_sheets(made("retrieval", TEXTS), tmp_path / "out", tmp_path / "key")
     secret = ("scheme1", "scheme4", "secret", "opensu3d", "question-", "relative", "automatic")
     shown = [path for path in (tmp_path / "out").rglob("*") if path.suffix in (".html", ".csv", ".json")]
@@ -45,13 +45,13 @@ def test_what_annotators_get_names_no_method_no_scene_and_no_truth(tmp_path: Pat
     assert {tuple(Image.open(path).info) for path in (tmp_path / "out").rglob("*.png")} == {()}
 
 
-def test_the_key_may_not_lie_among_the_sheets(tmp_path: Path) -> None:
+def test_key_inside_the_sheets_folder_fails(tmp_path: Path) -> None:
     for key in (tmp_path / "out", tmp_path / "out" / "deeper"):
-        with pytest.raises(ConfigError, match="keep the key apart"):
+        with pytest.raises(ConfigError, match="choose a separate folder"):
             write_sheets(made("retrieval", TEXTS), tmp_path / "out", key)
 
 
-def test_the_same_sheets_are_the_same_bytes(tmp_path: Path) -> None:
+def test_sheets_are_deterministic(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_sheets(made("annotation", HOSTILE, annotators=2), tmp_path / name, tmp_path / f"{name}-key")
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
@@ -74,13 +74,13 @@ def test_sheets_are_split_evenly_with_the_chosen_overlap(
     assert sum(n == annotators for n in times.values()) == n_shared or annotators == 1
 
 
-def test_sheet_and_key_come_back_from_their_files(tmp_path: Path) -> None:
+def test_sheet_and_key_round_trip(tmp_path: Path) -> None:
     both = made("reasoning", HOSTILE, annotators=3)
     assert read_sheet(write_record(tmp_path / "sheet.json", both.sheet)) == both.sheet
     assert read_key(write_record(tmp_path / "key.json", both.key)) == both.key
 
 
-def test_schemes_that_find_the_same_object_are_asked_about_once(painted_source: RunSource) -> None:
+def test_methods_with_same_object_share_an_item(painted_source: RunSource) -> None:
     asked = [new_question("painted/a", "instance", text, (k,), "test") for k, text in ((1, "chair"), (2, "sofa"))]
     drafts = retrieval_drafts(painted_source, "painted/a", asked, WordEncoder())
     assert [(one.text, one.methods, one.automatic["retrieval"]) for one in drafts] == [
@@ -91,7 +91,7 @@ def test_schemes_that_find_the_same_object_are_asked_about_once(painted_source: 
     assert all(len(one.methods) == len(one.instance_ids) for one in drafts)
 
 
-def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
+def test_labels_are_in_random_order_and_equal_labels_merged(
     painted_source: RunSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     same = annotation_drafts(painted_source, "painted/a", 50, np.random.default_rng(0))
@@ -110,7 +110,7 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
                 ("n",): "right", ("n'",): "wrong"}  # fmt: skip
 
 
-def test_answers_that_maps_share_are_judged_once(painted_source: RunSource) -> None:
+def test_answers_shared_by_maps_are_judged_once(painted_source: RunSource) -> None:
     question = new_question("painted/a", "reasoning", "How many chairs are there?", None, "test")
     drafts = reasoning_drafts(painted_source, "painted/a", [question], 1, built_in(WordEncoder()))
     assert [one.methods for one in drafts] == [METHODS[:2], METHODS[2:]]
@@ -131,7 +131,7 @@ def test_answers_that_maps_share_are_judged_once(painted_source: RunSource) -> N
         ("object #5", "object"),
     ],
 )  # fmt: skip
-def test_answers_name_things_without_the_ids_of_a_map(text: str, told: str) -> None:
+def test_answers_contain_no_map_ids(text: str, told: str) -> None:
     box = np.array([[0, 0, 0], [1, 1, 1.0]])
     named = {60: "lamp", 102761000071: "lamp", 26: "sofa", 5: ""}
     scene = SceneMap(tuple(MapObject(number, name, "", box[0], box) for number, name in named.items()))
@@ -160,7 +160,7 @@ def test_sheets_are_made_from_the_command_line(
     assert all((painted_folder / "out" / "pictures" / item.pictures[0]).is_file() for item in sheet.items)
     assert main(["sheets", "make", "run", "--kind", "annotation", "--out", "labels", "--quiet"]) == 0
     for wrong, line in (
-        (words, "painted/a: has no ground truth that questions could be made from"),
+        (words, "painted/a: no ground truth to generate questions from"),
         ([*words, "--questions", "paper"], "asks nothing of a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
         (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "leave it out"),
@@ -169,7 +169,7 @@ def test_sheets_are_made_from_the_command_line(
         assert line in capsys.readouterr().err
 
 
-def test_a_folder_of_another_set_and_one_with_answers_are_refused_and_stay(tmp_path: Path) -> None:
+def test_folder_with_another_set_or_answers_is_not_overwritten(tmp_path: Path) -> None:
     out, key = tmp_path / "out", tmp_path / "key"
 
     def files() -> dict[Path, bytes]:
@@ -180,11 +180,11 @@ def test_a_folder_of_another_set_and_one_with_answers_are_refused_and_stay(tmp_p
     write_sheets(made("retrieval", TEXTS), out, key)
     assert files() == before
     for folders in ((out, key), (out, tmp_path / "other"), (tmp_path / "other", key)):
-        with pytest.raises(ConfigError, match=r"holds the sheets retrieval-\w+; name another folder"):
+        with pytest.raises(ConfigError, match=r"contains the sheets retrieval-\w+; choose another folder"):
             write_sheets(made("retrieval", TEXTS[:2]), *folders)
     table = out / "annotator-1/sheet.csv"
     table.write_text(table.read_text().replace(",,", ",right,", 1))
     answered = files()
-    with pytest.raises(ConfigError, match=r"sheet\.csv holds answers, or another set; name another folder"):
+    with pytest.raises(ConfigError, match=r"sheet\.csv contains answers or another set; choose another folder"):
         write_sheets(made("retrieval", TEXTS), out, key)
     assert files() == answered

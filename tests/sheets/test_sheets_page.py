@@ -60,7 +60,7 @@ def test_the_page_says_what_may_run_and_load(tmp_path: Path) -> None:
 
 
 @needs_chromium
-def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_path: Path, browser: Chromium) -> None:
+def test_sheet_keyboard_answers_survive_reload_and_export(tmp_path: Path, browser: Chromium) -> None:
     both, page = written(tmp_path, "retrieval", TEXTS)
     browser.open(page)
     assert shown(browser) == "0 of 4 answered, item 1 of 4"
@@ -84,7 +84,7 @@ def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_pat
 
 
 @needs_chromium
-def test_hostile_text_is_shown_and_does_nothing(tmp_path: Path, browser: Chromium) -> None:
+def test_hostile_text_is_displayed_without_effect(tmp_path: Path, browser: Chromium) -> None:
     both, page = written(tmp_path, "retrieval", HOSTILE)
     browser.open(page)
     for item in both.sheet.items:

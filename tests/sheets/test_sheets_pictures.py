@@ -59,7 +59,7 @@ def test_the_best_view_shows_the_object_and_hides_it_behind_nothing() -> None:
     assert not seen_in(frames[0], points.astype(np.float64))[2].any()
 
 
-def test_a_mask_in_a_frame_holds_what_lies_nearest_to_the_instance() -> None:
+def test_frame_mask_contains_pixels_nearest_to_the_instance() -> None:
     from scipy.spatial import KDTree
 
     wall = frame_of(np.full((30, 40), 2.0, np.float32))

@@ -73,9 +73,7 @@ def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, 
 
 
 @pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
-def test_what_people_fill_in_comes_back_as_scores(
-    kind: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_annotator_answers_are_scored_end_to_end(kind: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     png = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
     origin = Key("", kind, "runs/made", "0", ("opensu3d",), "a made truth", ())
     made = make_sheets(origin, drafts(kind, 30), [png] * 30, seed=5, annotators=3, overlap=0.4)

@@ -29,7 +29,7 @@ def small() -> tuple[Sheet, Key]:
 # What simulated people give
 
 
-def test_people_without_error_give_exactly_the_key() -> None:
+def test_error_free_annotators_reproduce_the_key() -> None:
     sheet, key = retrieval_set(80, ("ann", "bob", "cyn"))
     found = scored(sheet, key, answered(sheet, key, {"ann": 0.0, "bob": 0.0, "cyn": 0.0}))
     people, truth = cells_of(found), cells_of(found, "automatic")
@@ -74,7 +74,7 @@ def test_known_error_rates_give_the_known_accuracies_and_agreement() -> None:
     assert confusion.n_equal / confusion.n == pytest.approx(1 - (first + second) / 2, abs=4 * (0.16 / 2 / n) ** 0.5)
 
 
-def test_the_paired_test_is_the_sign_flip_test_where_both_are_exact() -> None:
+def test_paired_test_matches_exact_sign_flip_test() -> None:
     rng = np.random.default_rng(0)
 
     def general(changes: Float64Array) -> float:
@@ -131,7 +131,7 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
 HOSTILE = '<script>alert(1)</script>=HYPERLINK("x") \\input{x} \u202ecba \U0001f600' + "x" * 10_000
 
 
-def test_hostile_texts_do_no_harm_in_tables_and_lists(small: tuple[Sheet, Key]) -> None:
+def test_hostile_texts_are_escaped_in_tables_and_lists(small: tuple[Sheet, Key]) -> None:
     scores = scored(*small, answered(*small, {"ann": 0.0, "bob": 0.5}))
     looks = [replace(one, text=HOSTILE, pictures=("../../x.png", 'a".png')) for one in scores.second_looks]
     content = asdict(replace(scores, run=HOSTILE, automatic_rule=HOSTILE, second_looks=tuple(looks)))

@@ -26,7 +26,7 @@ def hostile() -> tuple[MadeSheets, bytes]:
     return both, book_of(both)
 
 
-def test_everything_given_is_text_and_one_cell_alone_a_formula(hostile: tuple[MadeSheets, bytes]) -> None:
+def test_workbook_cells_are_text_except_one_formula(hostile: tuple[MadeSheets, bytes]) -> None:
     for page in openpyxl.load_workbook(io.BytesIO(hostile[1])).worksheets:
         formulas = [cell.coordinate for row in page.iter_rows() for cell in row if cell.data_type == "f"]
         assert formulas == (["B2"] if page.title == "answers" else [])
@@ -51,9 +51,7 @@ def test_answers_are_chosen_from_lists_and_all_else_is_locked(hostile: tuple[Mad
 
 
 @pytest.mark.skipif(OFFICE is None, reason="no LibreOffice: install libreoffice-calc")
-def test_libreoffice_opens_the_workbook_and_keeps_what_is_in_it(
-    tmp_path: Path, hostile: tuple[MadeSheets, bytes]
-) -> None:
+def test_libreoffice_preserves_the_workbook(tmp_path: Path, hostile: tuple[MadeSheets, bytes]) -> None:
     assert OFFICE is not None
     (tmp_path / "sheet.xlsx").write_bytes(hostile[1])
     profile = f"-env:UserInstallation={(tmp_path / 'profile').as_uri()}"

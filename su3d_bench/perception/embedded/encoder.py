@@ -51,7 +51,7 @@ def log_size(height: int, width: int) -> tuple[float, float]:
 
 
 class EmbeddedEncoder:
-    """Two small towers, trained on rendered rooms only; files are read at the first use.
+    """Two small towers trained on rendered rooms only; files are read at first use.
 
     Every text runs through the network alone and all on one thread, so that a feature never depends on what else is in
     the batch or on the machine's number of cores. Images run in batches where these give the bits that each image gives
@@ -153,5 +153,5 @@ class EmbeddedEncoder:
     def _path(self, name: str) -> Path:
         path = self._folder / name
         if not path.is_file():
-            raise ModelMissing(f"encoder '{self.name}': there is no {path}; reinstall the package")
+            raise ModelMissing(f"encoder '{self.name}': missing file {path}; reinstall the package")
         return path

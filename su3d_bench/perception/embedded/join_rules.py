@@ -1,4 +1,4 @@
-"""What joins: superpixels to surfaces, surfaces to floor and walls, the others to objects; and all parameters."""
+"""Rules and parameters for merging superpixels into surfaces, and surfaces into floor, walls and objects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class QualityWeights(BaseModel):
 
 
 class SegmenterConfig(BaseModel):
-    """What is an edge, what is one surface, what is one object.
+    """Parameters that define edges, surfaces and objects.
 
     Colours are CIELAB units with lightness counted ``lightness_weight``, because shading moves lightness more than hue;
     angles are degrees; jumps in depth are relative to the depth. Parameters are grouped by stage: larger ``*_scale``,

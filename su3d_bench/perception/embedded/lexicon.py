@@ -172,7 +172,7 @@ def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
 
 @dataclass(frozen=True)
 class Names:
-    """One name and its softmax confidence (K,) float64 a region."""
+    """One name and its softmax confidence (K,) float64 per region."""
 
     names: tuple[str, ...]
     confidences: Float64Array
@@ -207,7 +207,7 @@ class Namer:
         self.digest = content_key("namer", config.model_dump_json(), encoder.digest, *self._words.words)
 
     def name(self, features: Float32Array) -> Names:
-        """The likeliest word for each of the ``features`` (K, D) of crops at ratio 1.0."""
+        """The most probable word for each of the ``features`` (K, D) of crops at ratio 1.0."""
         logits = self._words.similarity(features) / self._temperature
         weights = np.exp(logits - logits.max(axis=1, keepdims=True)) if len(logits) else logits
         best = weights.argmax(axis=1) if len(logits) else np.zeros(0, np.intp)
@@ -238,7 +238,7 @@ def class_words(class_name: str) -> tuple[str, ...]:
 
 @cache
 def trained_words() -> frozenset[str]:
-    """Every word that a caption of the training may hold, as the tokenizer reads it."""
+    """All words that training captions may contain, as tokenized."""
     names = (*vocabulary(), *SURFACES, *SYNONYMS)
     texts = [*CLASS_TEMPLATES, *ANYTHING, *(word for name in names for word in class_words(name))]
     texts += [*GROUPS, *AFFORDANCES, "room", *(name for name, _ in COLOURS), *MATERIALS]

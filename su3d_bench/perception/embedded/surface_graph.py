@@ -144,7 +144,7 @@ def merge_cheapest(
     """Join pieces while a border's ``cost`` (E,) is below 1, cheap borders first.
 
     The limit rises to 1 in ``n_levels`` steps. At each step every piece joins its cheapest neighbour below the limit,
-    and costs are computed anew from the joined sums, until none is left. Ties go to the pair first by (a, b).
+    and costs are recomputed from the joined sums, until none is left. Ties go to the pair first by (a, b).
     Pieces that stand ``is_apart`` (N,) join nothing.
     """
     if is_apart is not None:

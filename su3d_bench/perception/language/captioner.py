@@ -1,4 +1,4 @@
-"""Names and captions of image crops by a vision-language model; the tagger's where the model gives none.
+"""Names and captions of image crops by a vision-language model, with the tagger's name as fallback.
 
 And the paper's own words to its models, those of other tasks too.
 """
@@ -64,7 +64,7 @@ class Captioner:
         self.digest = content_key("captioner", config.model_dump_json(include=MOVES_CAPTIONS))
 
     def requests(self, crops: Sequence[UInt8Array]) -> list[ChatRequest]:
-        """What is asked of the crops (h, w, 3)."""
+        """The requests for the crops (h, w, 3)."""
         config = self._config
         return [
             ChatRequest(
@@ -83,7 +83,7 @@ class Captioner:
         ]
 
     def captions(self, crops: Sequence[UInt8Array], tagger_names: Sequence[str]) -> list[CropCaption]:
-        """One caption a crop; ``tagger_names`` are what the fallback calls them. Reasons of fallbacks go to the log."""
+        """One caption per crop; ``tagger_names`` are the fallback names. Reasons of fallbacks are logged."""
         requests = self.requests(crops)
         replies = self._model.ask_all(requests)
         captions = [
@@ -91,12 +91,12 @@ class Captioner:
             for request, reply, name in zip(requests, replies, tagger_names, strict=True)
         ]
         for reason in dict.fromkeys(caption.reason for caption in captions if caption.source == "fallback"):
-            logger.warning("captions: the tagger's name and the simple caption stand where the answer was: %s", reason)
+            logger.warning("captions: using the tagger's name and the template caption where the reply was: %s", reason)
         return captions
 
 
 def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:
-    """What the model said, or the tagger's name and "an {object} in a scene" (the paper's section IV-B)."""
+    """The model's caption, or the tagger's name and "an {object} in a scene" (the paper's section IV-B)."""
     description = None if reply.failure else described(reply.text)
     if description is None:
         name = tagger_name.strip() or "object"
@@ -105,9 +105,9 @@ def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:
 
 
 def reason_of(reply: Reply) -> str:
-    """Why a reply holds nothing of use."""
+    """The reason why a reply is unusable."""
     if reply.failure:
         return reply.failure
     if not reply.text.strip():
         return f"an empty answer ({reply.finish_reason or 'no reason given'})"
-    return "the model refused" if is_refusal(reply.text) else "the answer cannot be read"
+    return "the model refused" if is_refusal(reply.text) else "the answer cannot be parsed"

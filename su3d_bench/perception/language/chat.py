@@ -1,4 +1,4 @@
-"""What is asked of a language model, and what it answered."""
+"""Requests to language models and their replies."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Image:
 
     @cached_property
     def digest(self) -> str:
-        """A key of the pixels, whatever library packs them."""
+        """A digest of the pixels, independent of the image encoder."""
         return digest_bytes(f"{self.rgb.shape}".encode() + np.ascontiguousarray(self.rgb).tobytes())
 
     @cached_property
@@ -222,9 +222,9 @@ def check_address(address: str) -> None:
     except ValueError:
         is_address = has_secret = False
     if not is_address:
-        raise ValueError("expected an http or https address, such as http://localhost:8000/v1")
+        raise ValueError("expected an http or https URL, such as http://localhost:8000/v1")
     if has_secret:
-        raise ValueError("holds a name, a password or a query; keys belong in the environment")
+        raise ValueError("contains credentials or a query; set keys in the environment")
 
 
 SCHEMA = 1
@@ -245,7 +245,7 @@ class ReplyStore:
         return self.folder / f"{key}.json"
 
     def load(self, key: str) -> Reply | None:
-        """The reply under ``key``; None where there is none, or one that is damaged."""
+        """The reply under ``key``; None if missing or damaged."""
         path = self.path(key)
         try:
             if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
@@ -289,7 +289,7 @@ class ReplyStore:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the folder against other threads and processes; the lock leaves no file behind."""
+        """Lock the folder against other threads and processes; the lock file is removed."""
         try:
             handle = hold_folder(self.folder, waits=True)
         except OSError as error:

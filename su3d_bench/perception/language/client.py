@@ -1,4 +1,4 @@
-"""Asking language models: each question once, within the budget, and kept with the run."""
+"""Client of language models: each request is sent once, within the budget, and stored with the run."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class LanguageModel(Protocol):
     """What captions, names and reasoning need of a language model."""
 
     def ask_all(self, requests: Sequence[ChatRequest]) -> list[Reply]:
-        """A reply to each of ``requests``, in their order."""
+        """The replies to ``requests``, in order."""
         ...
 
 
 class ChatClient:
-    """An OpenAI-compatible server behind a store of replies; may be used from several threads.
+    """An OpenAI-compatible server with stored replies; thread-safe.
 
     ``offline``: a question without a stored reply is a ``StoreError``. A request that failed for good is stored as
     that, so that a rerun is identical; ``ask_failed_again`` gives it another chance.
@@ -85,8 +85,8 @@ class ChatClient:
                 return known
             if self._offline:
                 raise StoreError(
-                    f"{self._store.folder}: holds no reply to this {request.purpose} request of model "
-                    f"'{request.model}' ({request.key[:12]}); give the command without --offline to ask for it"
+                    f"{self._store.folder}: no stored reply to this {request.purpose} request of model "
+                    f"'{request.model}' ({request.key[:12]}); run without --offline to send it"
                 )
             reply = self._send(request)
             self._sent.add(request.key)
@@ -98,7 +98,7 @@ class ChatClient:
         return None if reply is not None and reply.failure and is_wanted_again else reply
 
     def estimate(self, requests: Sequence[ChatRequest]) -> Estimate:
-        """The most that ``ask_all`` of ``requests`` can cost; nothing is sent."""
+        """Upper bound of the cost of ``ask_all`` for ``requests``; sends nothing."""
         different = {request.key: request for request in requests}
         to_send = [request for request in different.values() if self._known(request) is None]
         return estimate_of(self._config, to_send, len(different) - len(to_send))
@@ -114,8 +114,8 @@ class ChatClient:
                 most = self._config.max_failures_in_a_row
                 if self._count(failed=failed.is_down) >= most:
                     raise ModelMissing(
-                        f"{self._server.name}: {most} requests failed one after the other "
-                        f"({failed}); answers so far are kept: run the same command again when the server works"
+                        f"{self._server.name}: {most} consecutive requests failed "
+                        f"({failed}); replies so far are stored: rerun the command when the server works"
                     ) from None
             else:
                 self._count(failed=False)
@@ -196,7 +196,7 @@ class Server:
 
     @property
     def name(self) -> str:
-        """Host and port."""
+        """The host and port."""
         return printable(urlsplit(self._address).netloc, 200)
 
     def send(self, request: ChatRequest) -> Reply:
@@ -221,8 +221,8 @@ class Server:
         openai = require("openai", "a language model")
         if not self._key and self._address == HOSTED:
             raise ModelMissing(
-                f"${self._config.key_variable} is not set: put the key of {self.name} there, or name a server of "
-                "your own with --base-url"
+                f"${self._config.key_variable} is not set; set it to the key of {self.name}, or use your own "
+                "server with --base-url"
             )
         return openai.OpenAI(
             api_key=self._key or NO_KEY,
@@ -254,7 +254,7 @@ class Server:
             reason = self._shown(str(error.__cause__ or error), 120)
             if type(error.__cause__).__name__ in ("ConnectError", "UnsupportedProtocol"):
                 raise ModelMissing(
-                    f"{self.name}: cannot be reached ({reason}); start the server or name another --base-url"
+                    f"{self.name}: cannot connect ({reason}); start the server or set another --base-url"
                 ) from None
             raise _Failed(f"the connection failed: {reason}; tried {n_tries} times", is_down=True) from None
         return content
@@ -265,16 +265,16 @@ class Server:
         message = self._shown(message if isinstance(message, str) else str(error))
         if status in (401, 403):
             raise ModelMissing(
-                f"{self.name}: refuses the key in ${self._config.key_variable} (status {status}); set the right one"
+                f"{self.name}: rejects the key in ${self._config.key_variable} (status {status}); set a valid key"
             ) from None
         if status == 404:
             raise ModelMissing(
-                f"{self.name}: knows no such model or address (status 404: {message}); name the model with --model "
+                f"{self.name}: unknown model or address (status 404: {message}); set the model with --model "
                 "and the server with --base-url, which usually ends with /v1"
             ) from None
         if status == 429 and getattr(error, "code", "") == "insufficient_quota":
             raise ModelMissing(
-                f"{self.name}: the account has no quota left ({message}); top it up, then ask again"
+                f"{self.name}: the account has no quota left ({message}); add credit and rerun"
             ) from None
         if status in (400, 422):
             named = next((name for name in OPTIONAL_PARAMETERS if re.search(rf"\b{name}\b", message)), None)
@@ -289,7 +289,7 @@ class Server:
             completion = _Completion.model_validate_json(content)
         except ValidationError:
             said = self._shown(content[:200].decode("utf-8", "replace"), 60)
-            raise _Failed(f"the server's answer is no chat completion: '{said}'", is_down=True) from None
+            raise _Failed(f"the response is not a chat completion: '{said}'", is_down=True) from None
         choice = completion.choices[0]
         answer = (choice.message.content or choice.message.refusal or "").encode("utf-8", "replace").decode()
         answer = self._without_key(answer)
@@ -318,7 +318,7 @@ def _address_of(config: LanguageConfig) -> str:
 def _key_of(config: LanguageConfig) -> str:
     key = os.environ.get(config.key_variable, "").strip()
     if not all("!" <= character <= "~" for character in key):
-        raise ConfigError(f"${config.key_variable}: holds characters that no key has; set it again")
+        raise ConfigError(f"${config.key_variable}: contains invalid characters; set it again")
     return key
 
 
@@ -375,7 +375,7 @@ class Estimate:
         return asdict(self) | {"models": list(self.models)}
 
     def line(self) -> str:
-        """The estimate for people."""
+        """The estimate as text."""
         to_send = self.n_requests - self.n_stored
         cost = "no price in the table" if self.usd is None else f"at most {self.usd:.4f} USD"
         models = ", ".join(self.models) or "no model"
@@ -386,7 +386,7 @@ class Estimate:
 
 
 def cost_usd(config: LanguageConfig, model: str, input_tokens: int, output_tokens: int) -> float | None:
-    """US dollars by the price table; None where it has no such model."""
+    """US dollars by the price table; None for an unknown model."""
     price = config.prices.get(model)
     if price is None:
         return None
@@ -446,7 +446,7 @@ class Spending:
         cost = cost_usd(self._config, model, input_tokens, output_tokens)
         if cost is None and self._config.budget_usd:
             raise ConfigError(
-                f"budget_usd is set and model '{model}' has no price; add [perception.language.prices.\"{model}\"] "
+                f"budget_usd is set but model '{model}' has no price; add [perception.language.prices.\"{model}\"] "
                 "with input_usd and output_usd, or cap budget_tokens"
             )
         return cost or 0.0

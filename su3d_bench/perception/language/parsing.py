@@ -1,4 +1,4 @@
-"""What a model meant by its answer: a name and a description, one name, or an answer with object ids.
+"""Parse replies of language models: a name and description, one name, or an answer with object ids.
 
 Servers that take a schema answer in JSON. What others write is searched for JSON, then for the form that the paper's
 prompt shows; what holds nothing of use is None. Every pattern reads a bounded text.
@@ -97,7 +97,7 @@ class Answered:
 
 
 def is_refusal(text: str) -> bool:
-    """Whether ``text`` says that it will not or cannot answer."""
+    """Whether ``text`` is a refusal."""
     return _REFUSAL.search(text[:400]) is not None
 
 
@@ -166,7 +166,7 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
 
 
 def _ids(listed: list[Any], known: Collection[int]) -> tuple[int, ...]:
-    """Those of ``listed`` that are ``known``, each once."""
+    """The ``known`` ids in ``listed``, without duplicates."""
     texts = [str(value) for value in listed if isinstance(value, int | str)]
     numbers = dict.fromkeys(int(value.lstrip("#")) for value in texts if re.fullmatch(rf"#?{_ID}", value))
     return tuple(number for number in numbers if number in known)
@@ -190,7 +190,7 @@ def clean_name(text: str) -> str | None:
 
 
 def _json_objects(text: str) -> Iterator[dict[str, Any]]:
-    """The JSON objects in ``text``, those inside prose too."""
+    """The JSON objects in ``text``, including those inside prose."""
     decoder, start = json.JSONDecoder(), 0
     for _ in range(MOST_OBJECTS_TRIED):
         start = text.find("{", start)

@@ -69,7 +69,7 @@ class ModelEntry:
             if form.form == name:
                 return form
         known = ", ".join(form.form for form in self.forms)
-        raise ConfigError(f"model '{self.name}': does not come in the form '{name}'; known: {known}")
+        raise ConfigError(f"model '{self.name}': not available in the form '{name}'; known: {known}")
 
 
 def _entry(name: str, row: Mapping[str, Any]) -> ModelEntry:

@@ -24,7 +24,7 @@ def _one_of(kind: Kind, *more: str) -> AfterValidator:
 
     def check(name: str) -> str:
         if name not in known:
-            raise ValueError(f"is no {kind}; known: {', '.join(known)}")
+            raise ValueError(f"is not a {kind}; known: {', '.join(known)}")
         return name
 
     return AfterValidator(check)
@@ -65,7 +65,7 @@ class ModelsConfig(BaseModel):
     def _are_of_models(cls, paths: dict[str, Path]) -> dict[str, Path]:
         unknown = [name for name in paths if name not in MODELS]
         if unknown:
-            raise ValueError(f"'{unknown[0]}' is no model; known: {', '.join(MODELS)}")
+            raise ValueError(f"'{unknown[0]}' is not a known model; known: {', '.join(MODELS)}")
         return paths
 
     @model_validator(mode="after")

@@ -114,9 +114,9 @@ def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles
         if originals := [form for form in forms if form.form == "original"]:  # the one form that is a single file
             return ModelFiles(entry, originals[0], path.parent, path)
         known = " or ".join(name for form in forms for name in _names(form.files[0]))
-        raise ConfigError(f"model '{entry.name}': {path} is no file that it is read from; name a folder with {known}")
+        raise ConfigError(f"model '{entry.name}': {path} is not a supported file; use a folder with {known}")
     if not path.is_dir():
-        raise ModelMissing(f"model '{entry.name}': there is no {path}; mend the path, or {what_to_fetch(entry, forms)}")
+        raise ModelMissing(f"model '{entry.name}': missing {path}; correct the path, or {what_to_fetch(entry, forms)}")
     for form in forms:
         if (found := _whole(entry, form, path)) is not None:
             return found
@@ -152,7 +152,7 @@ def _snapshots(folder: Path) -> Iterator[Path]:
         return
     folders = sorted(path for path in snapshots.glob("*") if path.is_dir())
     if len(folders) > 1:
-        raise ConfigError(f"{snapshots}: holds {len(folders)} snapshots and no refs/main; name one with models.paths")
+        raise ConfigError(f"{snapshots}: holds {len(folders)} snapshots but no refs/main; select one with models.paths")
     yield from folders
 
 
@@ -191,7 +191,7 @@ def file_sha256(path: Path) -> str:
     """SHA-256 of a file, kept in ``$SU3D_CACHE`` under its path, size and time of change: weights are gigabytes."""
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        raise ConfigError(f"{path}: is no plain file")
+        raise ConfigError(f"{path}: is not a regular file")
     if status.st_size < 2**20:
         return digest_file(path)
     key = f"{path.resolve()}\n{status.st_size}\n{status.st_mtime_ns}"
@@ -236,7 +236,7 @@ def read_weights(path: Path, device: str = "cpu") -> dict[str, Any]:
             content = inner
             break
     if not isinstance(content, dict) or not content or not all(isinstance(v, torch.Tensor) for v in content.values()):
-        raise DataError(f"{path}: is no table of tensors by name; fetch the file anew from where it was published")
+        raise DataError(f"{path}: is not a dict of tensors; download the file again from its source")
     return {str(name): tensor for name, tensor in content.items()}
 
 
@@ -248,7 +248,7 @@ def _read_safetensors(path: Path, device: str) -> Any:
         with safetensors.safe_open(str(regular(path)), framework="pt") as file:
             return {name: torch.empty(file.get_slice(name).get_shape(), device="meta") for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: not readable as safetensors: {bounded(error)}; fetch it anew") from error
+        raise DataError(f"{path}: not readable as safetensors: {bounded(error)}; download it again") from error
 
 
 def _read_pickled(path: Path, device: str) -> Any:
@@ -259,11 +259,10 @@ def _read_pickled(path: Path, device: str) -> Any:
         return torch.load(regular(path), map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
         raise DataError(
-            f"{path}: holds more than plain tensors, which is refused because it can run code; use the model's "
-            "safetensors file"
+            f"{path}: contains more than plain tensors and could run code; use the model's safetensors file"
         ) from error
     except (OSError, RuntimeError, ValueError, EOFError, KeyError, AttributeError, IndexError, TypeError) as error:
-        raise DataError(f"{path}: not readable as torch weights: {bounded(error)}; fetch it anew") from error
+        raise DataError(f"{path}: not readable as torch weights: {bounded(error)}; download it again") from error
 
 
 def check_settings_size(path: Path) -> None:
@@ -278,9 +277,11 @@ def read_settings(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(file_text(path))
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); fetch it from where the weights come") from error
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); download it from the source of the weights"
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as JSON ({bounded(error, 80)}); fetch it anew") from error
+        raise DataError(f"{path}: not readable as JSON ({bounded(error, 80)}); download it again") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a {type(content).__name__}, expected a table")
     return content
@@ -338,10 +339,10 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
             **more,
         )
     except (OSError, ValueError, RuntimeError, KeyError, ImportError, SafetensorError) as error:
-        raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
+        raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; download the folder again") from error
     if missing := sorted(info["missing_keys"]):
         raise DataError(
-            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
+            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is not "
             f"{files.entry.name}; {what_to_fetch(files.entry, (files.form,))}"
         )
     return model

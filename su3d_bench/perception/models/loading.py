@@ -105,7 +105,7 @@ def _onnx_encoder(
     device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
     manifest = encoders.EncoderManifest.read(files.weights)
     if manifest.name != files.entry.name:
-        raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
+        raise ConfigError(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
     spec = encoders.onnx_spec(files, config.transform)
 
     def identity() -> Mapping[str, Any]:
@@ -292,7 +292,7 @@ def _problems_of_export(files: ModelFiles) -> list[str]:
     manifest = kind.read(files.weights)
     wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:
-        wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
+        wrong.append(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
     return wrong
 
 

@@ -42,7 +42,7 @@ class OnnxManifest(BaseModel):
         try:
             manifest = cls.model_validate_json(json.dumps(content))
         except ValidationError as error:
-            raise DataError(f"{path}: is no manifest of an exported model ({bounded(error, 120)})") from error
+            raise DataError(f"{path}: is not the manifest of an exported model ({bounded(error, 120)})") from error
         if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
             needed = " and ".join(cls.REQUIRES)
             raise DataError(f"{path}: files must be names inside the folder, {needed} among them; export it again")
@@ -57,7 +57,7 @@ def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
         if not path.is_file():
             wrong.append(f"{path}: is missing; export it again")
         elif file_sha256(path) != digest:
-            wrong.append(f"{path}: is not the file that the manifest describes; export it again")
+            wrong.append(f"{path}: does not match the manifest; export it again")
     return wrong
 
 
@@ -73,10 +73,10 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
     if PROVIDERS[provider] not in available:
         known = ", ".join(name for name, long in PROVIDERS.items() if long in available)
         raise ModelMissing(
-            f"provider '{provider}': this onnxruntime has {known} alone; pip install onnxruntime-gpu in its place"
+            f"provider '{provider}': not available in this onnxruntime ({known}); install onnxruntime-gpu instead"
         )
     if not path.is_file():
-        raise ModelMissing(f"{path}: there is no such file; export the model with tools/export_onnx.py")
+        raise ModelMissing(f"{path}: file not found; export the model with tools/export_onnx.py")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads
     options.inter_op_num_threads = 1
@@ -91,7 +91,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
     if PROVIDERS[provider] not in used:
         # ONNX Runtime falls back to the CPU where a provider's own libraries do not load
         raise ModelMissing(
-            f"provider '{provider}': onnxruntime could not start it; install the CUDA libraries it needs"
+            f"provider '{provider}': onnxruntime failed to start it; install the CUDA libraries it needs"
         )
     return session
 

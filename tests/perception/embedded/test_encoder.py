@@ -51,7 +51,7 @@ def test_a_feature_does_not_depend_on_its_batch(encoder: EmbeddedEncoder, images
     assert np.array_equal(np.concatenate([encoder.encode_texts([text]) for text in TEXTS]), texts)
 
 
-def test_apparent_size_is_kept(encoder: EmbeddedEncoder) -> None:
+def test_feature_depends_on_crop_size(encoder: EmbeddedEncoder) -> None:
     small = np.full((20, 20, 3), 130, np.uint8)
     large = np.full((400, 400, 3), 130, np.uint8)
     assert np.array_equal(shrink(small), shrink(large))
@@ -118,7 +118,7 @@ def test_different_texts_have_different_ids(one: str, other: str) -> None:
     assert not np.array_equal(ids[0], ids[1])
 
 
-def test_words_that_no_caption_holds_are_named() -> None:
+def test_words_missing_from_training_captions_are_listed() -> None:
     encoder = EmbeddedEncoder()
     captions = ["A couch on the wooden table", "bowl next to a lamp in scene", "something to type with", "tv-screens"]
     assert [encoder.unseen_words(text) for text in captions] == [()] * 4

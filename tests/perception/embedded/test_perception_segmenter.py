@@ -75,7 +75,7 @@ def test_two_boxes_that_touch_on_a_table_are_two_regions() -> None:
     assert best_iou(regions, ids == RIGHT) > 0.9
 
 
-def test_the_faces_of_one_box_are_one_object_and_with_caution_several_parts() -> None:
+def test_faces_of_a_box_are_one_object_but_several_parts() -> None:
     boxes = {LEFT: TWO_BOXES[LEFT]}
     frame, ids = view(boxes, {TABLE: GREY, LEFT: RED})
     assert best_iou(objects(frame), ids == LEFT) > 0.9
@@ -89,21 +89,21 @@ def test_a_box_of_the_table_s_colour_is_found_by_shape() -> None:
     assert best_iou(objects(frame), ids == LEFT) > 0.8
 
 
-def test_coplanar_regions_are_told_apart_by_colour() -> None:
+def test_coplanar_regions_are_separated_by_colour() -> None:
     frame = still_life()
     picture = np.zeros(frame.depth_m.shape, bool)
     picture[10:30, 70:110] = True
     assert best_iou(objects(frame), picture) > 0.85
 
 
-def test_the_wall_is_no_object_but_a_part() -> None:
+def test_wall_is_a_part_but_not_an_object() -> None:
     frame = still_life()
     wall = (frame.depth_m == 3.0) & (frame.rgb[..., 0] == 205)
     assert best_iou(objects(frame), wall) < 0.1
     assert best_iou(RgbdSegmenter(SegmenterConfig(), "parts").segment(frame), wall) > 0.9
 
 
-def test_a_small_patch_flush_with_the_wall_is_its_pattern_and_a_large_one_an_object() -> None:
+def test_small_flush_patch_joins_wall_and_large_patch_is_object() -> None:
     frame = still_life()
     frame.rgb[95:105, 20:30] = 240, 200, 40
     truth = np.zeros(frame.depth_m.shape, bool)

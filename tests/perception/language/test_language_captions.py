@@ -51,7 +51,7 @@ class Spoken:
         ("chair", "chair", ""),
     ],
 )  # fmt: skip
-def test_a_name_and_a_description_are_read_out_of_any_form(text: str, name: str, caption: str) -> None:
+def test_name_and_description_are_parsed_from_each_format(text: str, name: str, caption: str) -> None:
     assert described(text) == Described(name, caption)
 
 
@@ -63,7 +63,7 @@ def test_a_name_and_a_description_are_read_out_of_any_form(text: str, name: str,
         "As an AI, I cannot see images.",
     ],
 )  # fmt: skip
-def test_refusals_echoes_and_noise_describe_nothing(text: str) -> None:
+def test_refusals_echoes_and_noise_give_no_caption(text: str) -> None:
     assert described(text) is None
 
 
@@ -91,7 +91,7 @@ def test_a_chosen_name_is_one_of_the_names_or_a_short_noun_phrase(text: str, nam
     assert chosen_name(text, NAMES) == name
 
 
-def test_ids_of_an_answer_are_those_of_the_map() -> None:
+def test_answer_ids_are_restricted_to_the_map() -> None:
     found = answered(
         'So: {"answer": "bathroom sink", "object_ids": [179, "#60", 7, true], "reasoning": "near"}', (179, 60)
     )
@@ -103,7 +103,7 @@ def test_ids_of_an_answer_are_those_of_the_map() -> None:
     assert answered(" ", (1,)) is None
 
 
-def test_ids_of_parts_of_objects_are_understood_whole() -> None:
+def test_long_part_ids_are_parsed_completely() -> None:
     part = 123456000012  # of object 12; its first nine digits are another's
     known = (123456000, part)
     told = answered(f'{{"answer": "lamp", "object_ids": [{part}], "reference_ids": ["#{part}", 123456000]}}', known)
@@ -115,7 +115,7 @@ def test_ids_of_parts_of_objects_are_understood_whole() -> None:
     assert digits is not None and digits.object_ids == ()
 
 
-def test_the_paper_s_prompt_goes_with_each_crop() -> None:
+def test_each_crop_is_sent_with_the_paper_prompt() -> None:
     model = Spoken("`lamp':`A lit lamp.'")
     crops = [np.full((8, 8, 3), value, np.uint8) for value in (0, 255)]
     captions = Captioner(model, LanguageConfig()).captions(crops, ["thing", "thing"])
@@ -130,12 +130,12 @@ def test_the_paper_s_prompt_goes_with_each_crop() -> None:
     ("model", "reason"),
     [
         (Spoken("I'm sorry, I can't help with that."), "the model refused"),
-        (Spoken("???"), "the answer cannot be read"),
+        (Spoken("???"), "the answer cannot be parsed"),
         (Spoken(""), "an empty answer (no reason given)"),
         (Spoken("", failure="status 500: down"), "status 500: down"),
     ],
 )
-def test_where_the_model_refuses_the_tagger_s_name_stands(
+def test_tagger_name_is_used_when_the_model_refuses(
     model: Spoken, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     crop = np.zeros((8, 8, 3), np.uint8)
@@ -161,23 +161,23 @@ def seen() -> Instances:
     )
 
 
-def test_the_top_m_names_go_by_score_and_then_by_order() -> None:
+def test_top_m_names_are_sorted_by_score_then_order() -> None:
     assert top_names(seen(), 3) == [
         TopNames("sofa", ("sofa", "couch", "Couches"), (0.9, 0.5, 0.5)),
         TopNames("thing", (), ()),
     ]
-    with pytest.raises(PredictionError, match="keeps no names of its views"):
+    with pytest.raises(PredictionError, match="has no per-view names"):
         top_names(replace(seen(), view_names=None), 3)
 
 
-def test_the_vote_sums_scores_over_spellings_of_one_name() -> None:
+def test_vote_sums_scores_over_spellings() -> None:
     assert vote(TopNames("sofa", ("sofa", "couch", "Couches"), (0.9, 0.5, 0.5))).name == "couch"
     assert vote(TopNames("sofa", ("sofa", "couch"), (0.5, 0.5))).name == "sofa"
     nobody = vote(TopNames("thing", (), ()))
     assert (nobody.name, nobody.source) == ("thing", "label")
 
 
-def test_the_model_refines_with_the_paper_s_prompt_and_n_stays_where_it_does_not() -> None:
+def test_model_refines_labels_and_falls_back_to_label_n() -> None:
     model = Spoken("seat")
     refined = ModelRefiner(model, LanguageConfig()).refine(top_names(seen(), 3))
     assert [(one.name, one.source) for one in refined] == [("seat", "model"), ("thing", "label")]

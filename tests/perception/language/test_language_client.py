@@ -36,7 +36,7 @@ def everything_in(folder: Path) -> str:
     return "".join(path.read_text(errors="replace") for path in sorted(folder.rglob("*")) if path.is_file())
 
 
-def test_an_answer_is_stored_and_a_rerun_asks_nothing(server: ChatServer, tmp_path: Path) -> None:
+def test_rerun_uses_stored_replies(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: Answered("a lamp")
     first = client(server, tmp_path).ask_all([ask("one"), ask("two"), ask("one")])
     assert [reply.text for reply in first] == ["a lamp"] * 3
@@ -61,7 +61,7 @@ def test_the_request_is_that_of_a_chat_completion(server: ChatServer, tmp_path: 
     assert (tmp_path / "images" / f"{picture.digest}.png").is_file()
 
 
-def test_offline_replays_without_key_and_package_and_names_what_is_missing(
+def test_offline_replay_needs_no_key_and_reports_missing_replies(
     server: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client(server, tmp_path).ask(ask("known"))
@@ -69,13 +69,13 @@ def test_offline_replays_without_key_and_package_and_names_what_is_missing(
     monkeypatch.setitem(sys.modules, "openai", None)
     offline = ChatClient(LanguageConfig(), ReplyStore(tmp_path), offline=True)
     assert offline.ask(ask("known")).text == "ok"
-    with pytest.raises(StoreError, match=r"holds no reply to this ask request of model 'tiny-model'.*--offline"):
+    with pytest.raises(StoreError, match=r"no stored reply to this ask request of model 'tiny-model'.*--offline"):
         offline.ask(ask("unknown"))
     assert server.n_asked == 1
 
 
 @pytest.mark.parametrize("trouble", [error(429, "slow down"), error(503, "busy")])
-def test_trouble_that_passes_is_retried(server: ChatServer, tmp_path: Path, trouble: Answered) -> None:
+def test_transient_errors_are_retried(server: ChatServer, tmp_path: Path, trouble: Answered) -> None:
     server.script = [trouble]
     assert client(server, tmp_path).ask(ask("x")).text == "ok"
     assert server.n_asked == 2
@@ -86,18 +86,18 @@ def test_trouble_that_passes_is_retried(server: ChatServer, tmp_path: Path, trou
     [
         (error(400, "content policy"), "status 400: content policy"),
         (Answered(status=302, headers={"Location": "http://127.0.0.1:9/elsewhere"}), "status 302"),
-        (Answered(raw=b"{not json"), "no chat completion: '{not json'"),
-        (Answered(raw=b"[" * 100_000), "no chat completion"),
-        (Answered(raw=b"<html>gateway</html>", kind="text/html"), "no chat completion: '<html>"),
-        (Answered(raw=b'{"choices": [{"message": {"content": 5}}]}'), "no chat completion"),
-        (Answered(usage=(10**30, 1)), "no chat completion"),
+        (Answered(raw=b"{not json"), "not a chat completion: '{not json'"),
+        (Answered(raw=b"[" * 100_000), "not a chat completion"),
+        (Answered(raw=b"<html>gateway</html>", kind="text/html"), "not a chat completion: '<html>"),
+        (Answered(raw=b'{"choices": [{"message": {"content": 5}}]}'), "not a chat completion"),
+        (Answered(usage=(10**30, 1)), "not a chat completion"),
         (Answered(raw=b" " * 3_000_000), "larger than 100,000 bytes"),
         (Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"}), "the answer is packed"),
         (Answered(wait_s=30), "no answer within 0.3 s; tried 1 times"),
     ],
     ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "huge", "packed", "hung"],
 )
-def test_what_is_no_answer_is_a_failure_of_the_request(
+def test_invalid_response_is_a_request_failure(
     server: ChatServer, tmp_path: Path, trouble: Answered, reason: str
 ) -> None:
     server.script = [trouble]
@@ -106,7 +106,7 @@ def test_what_is_no_answer_is_a_failure_of_the_request(
     assert server.n_asked == 1
 
 
-def test_a_failure_for_good_is_stored_and_asked_again_on_demand_only(server: ChatServer, tmp_path: Path) -> None:
+def test_permanent_failure_is_stored_and_retried_only_on_request(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: error(500, "down")
     failed = client(server, tmp_path).ask(ask("x"))
     assert failed.failure == "status 500: down; tried 2 times"
@@ -118,9 +118,9 @@ def test_a_failure_for_good_is_stored_and_asked_again_on_demand_only(server: Cha
     assert server.n_asked == 3
 
 
-def test_a_server_that_fails_again_and_again_ends_the_command(server: ChatServer, tmp_path: Path) -> None:
+def test_repeated_server_failures_end_the_command(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: error(500)
-    with pytest.raises(ModelMissing, match="3 requests failed one after the other"):
+    with pytest.raises(ModelMissing, match="3 consecutive requests failed"):
         client(server, tmp_path, max_retries=0, max_failures_in_a_row=3, max_concurrent=1).ask_all(
             [ask(str(k)) for k in range(9)]
         )
@@ -130,21 +130,19 @@ def test_a_server_that_fails_again_and_again_ends_the_command(server: ChatServer
 @pytest.mark.parametrize(
     ("trouble", "line"),
     [
-        (error(401, f"Incorrect API key provided: {KEY}"), r"refuses the key in \$SU3D_TEST_KEY"),
-        (error(404, "model 'tiny-model' not found"), "knows no such model or address"),
+        (error(401, f"Incorrect API key provided: {KEY}"), r"rejects the key in \$SU3D_TEST_KEY"),
+        (error(404, "model 'tiny-model' not found"), "unknown model or address"),
         (error(429, "pay", "insufficient_quota"), "no quota left"),
     ],
 )
-def test_what_no_request_can_get_past_is_one_line(
-    server: ChatServer, tmp_path: Path, trouble: Answered, line: str
-) -> None:
+def test_fatal_server_errors_give_one_line(server: ChatServer, tmp_path: Path, trouble: Answered, line: str) -> None:
     server.script = [trouble]
     with pytest.raises(ModelMissing, match=line) as caught:
         client(server, tmp_path, max_retries=0).ask(ask("x"))
     assert KEY not in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_the_key_stands_in_no_file_and_no_message(server: ChatServer, tmp_path: Path) -> None:
+def test_api_key_is_never_written_or_printed(server: ChatServer, tmp_path: Path) -> None:
     server.script = [
         Answered(f"your key is {KEY}", model=KEY, finish=KEY),
         error(400, f"bad request with {KEY} and sk-other-987654321"),
@@ -157,7 +155,7 @@ def test_the_key_stands_in_no_file_and_no_message(server: ChatServer, tmp_path: 
     assert KEY not in everything_in(tmp_path) and "sk-other" not in everything_in(tmp_path)
 
 
-def test_the_hosted_service_needs_a_key_and_a_server_of_ones_own_does_not(
+def test_only_the_hosted_service_needs_an_api_key(
     server: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SU3D_TEST_KEY")
@@ -169,7 +167,7 @@ def test_the_hosted_service_needs_a_key_and_a_server_of_ones_own_does_not(
     assert client(server, tmp_path, base_url="").ask(ask("x")).text == "ok"
 
 
-def test_parameters_that_a_server_refuses_are_left_out_and_recorded(server: ChatServer, tmp_path: Path) -> None:
+def test_refused_parameters_are_dropped_and_recorded(server: ChatServer, tmp_path: Path) -> None:
     server.script = [
         error(400, "Unsupported parameter: 'max_tokens' is not supported; use 'max_completion_tokens' instead"),
         error(400, "seed is not supported by this model"),
@@ -183,7 +181,7 @@ def test_parameters_that_a_server_refuses_are_left_out_and_recorded(server: Chat
     assert server.bodies[-1]["max_completion_tokens"] == 20
 
 
-def test_a_damaged_reply_is_asked_for_again(server: ChatServer, tmp_path: Path) -> None:
+def test_damaged_reply_is_requested_again(server: ChatServer, tmp_path: Path) -> None:
     client(server, tmp_path).ask(ask("x"))
     path = ReplyStore(tmp_path).path(ask("x").key)
     entry = json.loads(path.read_text())
@@ -196,7 +194,7 @@ def test_a_damaged_reply_is_asked_for_again(server: ChatServer, tmp_path: Path) 
     assert ReplyStore(tmp_path).load(ask("x").key) is not None
 
 
-def test_of_two_processes_the_first_reply_is_kept(server: ChatServer, tmp_path: Path) -> None:
+def test_first_reply_of_two_processes_is_stored(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: Answered(f"answer {len(server.bodies)}")
     clients = [client(server, tmp_path) for _ in range(4)]
     replies: list[str] = []
@@ -209,7 +207,7 @@ def test_of_two_processes_the_first_reply_is_kept(server: ChatServer, tmp_path: 
     assert kept is not None and set(replies) == {kept.text}
 
 
-def test_the_budget_stops_before_it_is_passed_and_goes_on_when_raised(server: ChatServer, tmp_path: Path) -> None:
+def test_budget_is_never_exceeded_and_can_be_raised(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: Answered(usage=(30, 10))
     questions = [ask(str(k)) for k in range(5)]
     most = questions[0].n_input_tokens + 20  # what a request may cost
@@ -232,7 +230,7 @@ def test_a_budget_in_dollars_needs_a_price(server: ChatServer, tmp_path: Path) -
     assert server.n_asked == 1
 
 
-def test_an_estimate_counts_what_is_stored_and_sends_nothing(server: ChatServer, tmp_path: Path) -> None:
+def test_estimate_counts_stored_replies_and_sends_nothing(server: ChatServer, tmp_path: Path) -> None:
     priced = {"tiny-model": Price(input_usd=1.0, output_usd=2.0)}
     asked = client(server, tmp_path, prices=priced)
     asked.ask(ask("stored"))
@@ -252,7 +250,7 @@ def test_the_rate_limit_spaces_requests(server: ChatServer, tmp_path: Path) -> N
     assert pauses == [0.0, 2.0, 4.0]
 
 
-def test_pictures_are_keyed_by_their_pixels_and_counted_by_the_rule_of_the_models() -> None:
+def test_images_are_keyed_by_pixels_and_token_counts_match_openai() -> None:
     pixels = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
     assert Image(pixels).digest == Image(pixels.copy()).digest != Image(pixels[:, ::-1]).digest
     assert ask("x", images=(Image(pixels),)).key != ask("x").key
@@ -264,6 +262,6 @@ def test_pictures_are_keyed_by_their_pixels_and_counted_by_the_rule_of_the_model
 
 
 @pytest.mark.parametrize("address", ["ftp://x", "http://user:secret@host/v1", "localhost:8000", "http://h/v1?key=1"])
-def test_an_address_that_is_none_or_holds_a_secret_is_refused(address: str) -> None:
-    with pytest.raises(ValueError, match=r"expected an http|keys belong in the environment"):
+def test_invalid_urls_and_urls_with_credentials_fail(address: str) -> None:
+    with pytest.raises(ValueError, match=r"expected an http|set keys in the environment"):
         LanguageConfig(base_url=address)

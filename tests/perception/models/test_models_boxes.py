@@ -47,7 +47,7 @@ def test_crops_and_points_equal_those_of_transformers() -> None:
     np.testing.assert_array_equal(point_grid(12), _build_point_grid(12))
 
 
-def test_stability_is_the_share_of_pixels_that_keep_their_side() -> None:
+def test_stability_score_matches_definition() -> None:
     import torch
     from transformers.models.sam.image_processing_pil_sam import _compute_stability_score
 
@@ -84,7 +84,7 @@ def test_a_mask_of_small_islands_keeps_the_largest_and_counts_as_changed() -> No
     assert not without_small_parts(mask_of(".. .."), 2, "islands")[1]
 
 
-def test_what_passes_the_filters_is_what_transformers_lets_pass() -> None:
+def test_mask_filters_match_transformers() -> None:
     import torch
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil, _normalize_coordinates
 

@@ -56,7 +56,7 @@ def test_every_entry_is_complete() -> None:
     assert {name for names in PROFILE_MODELS.values() for name in names} <= set(MODELS)
 
 
-def test_a_model_lies_below_su3d_models_under_its_short_name_or_its_repositorys(home: Path) -> None:
+def test_models_are_found_by_short_or_repository_name(home: Path) -> None:
     for place in ("clip-vit-h-14", "laion/CLIP-ViT-H-14-laion2B-s32B-b79K", "CLIP-ViT-H-14-laion2B-s32B-b79K"):
         folder = fill(home / "models" / place)
         found = locate("clip-vit-h-14")
@@ -65,7 +65,7 @@ def test_a_model_lies_below_su3d_models_under_its_short_name_or_its_repositorys(
             (folder / name).unlink()
 
 
-def test_the_hugging_face_cache_is_searched_last_and_its_main_revision_counts(home: Path) -> None:
+def test_hugging_face_cache_is_searched_last_at_main_revision(home: Path) -> None:
     repository = "openai/clip-vit-base-patch32"
     main = snapshot(home / "hf" / "hub", repository, "aa11", is_main=True)
     snapshot(home / "hf" / "hub", repository, "bb22", is_main=False)
@@ -86,7 +86,7 @@ def test_a_revision_that_would_leave_the_cache_is_not_followed(home: Path) -> No
         locate("clip-vit-b-32")
 
 
-def test_safetensors_are_preferred_and_two_files_of_words_serve_for_one(home: Path) -> None:
+def test_safetensors_are_preferred_and_vocab_files_are_alternatives(home: Path) -> None:
     folder = home / "models" / "clip-vit-b-32"
     fill(folder, ("pytorch_model.bin", "config.json", "preprocessor_config.json", "vocab.json", "merges.txt"))
     assert locate("clip-vit-b-32").weights.name == "pytorch_model.bin"
@@ -97,7 +97,7 @@ def test_safetensors_are_preferred_and_two_files_of_words_serve_for_one(home: Pa
         locate("clip-vit-b-32")
 
 
-def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
+def test_configured_path_is_the_only_one_used(home: Path) -> None:
     fill(home / "models" / "clip-vit-b-32")
     mine = fill(home / "mine")
     assert locate("clip-vit-b-32", path=mine).folder == mine
@@ -107,15 +107,15 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
         ModelMissing, match=r"mine lacks config\.json; run: su3d-bench models fetch clip-vit-b-32 \(0\.6 GB\)"
     ):
         locate("clip-vit-b-32", path=mine)
-    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench models fetch"):
+    with pytest.raises(ModelMissing, match=r"missing .*absent; correct the path, or run: su3d-bench models fetch"):
         locate("clip-vit-b-32", path=home / "absent")
-    with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
+    with pytest.raises(ConfigError, match=r"is not a supported file; use a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
     renamed = fill(home / "other", ("my_sam.pth",)) / "my_sam.pth"
     assert locate("sam-vit-h", path=renamed).weights == renamed
 
 
-def test_a_missing_model_is_one_line_with_the_command_that_brings_it(home: Path) -> None:
+def test_missing_model_error_names_the_download_command(home: Path) -> None:
     with pytest.raises(ModelMissing) as caught:
         locate("clip-vit-h-14")
     assert str(caught.value) == (
@@ -127,9 +127,7 @@ def test_a_missing_model_is_one_line_with_the_command_that_brings_it(home: Path)
         locate("ram-plus", ("onnx",))
 
 
-def test_the_digest_of_a_large_file_is_read_again_only_when_the_file_has_changed(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_file_digest_is_recomputed_only_after_changes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = home / "weights.safetensors"
     path.write_bytes(bytes(2**20 + 1))
     n_read: list[Path] = []

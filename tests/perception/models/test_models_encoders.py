@@ -79,7 +79,7 @@ def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: 
     assert encoder.encode_texts([]).shape == (0, encoder.dim)
 
 
-def test_the_digest_moves_with_all_that_moves_a_feature(folder: Path, tmp_path: Path) -> None:
+def test_digest_changes_with_everything_that_affects_features(folder: Path, tmp_path: Path) -> None:
     digest = load_encoder(config(folder)).digest
     assert load_encoder(config(folder, batch=4)).digest == digest
     assert load_encoder(config(folder, transform="transformers")).digest != digest
@@ -117,7 +117,7 @@ def _counting(towers: _CountingTowers, cache: FrameCache | None = None) -> Found
     return FoundationEncoder("counting", RAW, lambda: towers, lambda: tokenise, lambda: {"files": "1"}, cache)
 
 
-def test_a_text_is_encoded_once_and_remembered_on_disk(tmp_path: Path) -> None:
+def test_text_features_are_cached_on_disk(tmp_path: Path) -> None:
     towers = _CountingTowers()
     encoder = _counting(towers, FrameCache(tmp_path))
     first = encoder.encode_texts(["a", "b", "a", "c"])
@@ -147,7 +147,7 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
             torch.save({"a": _Payload()}, tmp_path / name)
         else:
             (tmp_path / name).write_bytes(form)
-        with pytest.raises(DataError, match=r"holds more than plain tensors|not readable as torch weights"):
+        with pytest.raises(DataError, match=r"contains more than plain tensors|not readable as torch weights"):
             read_weights(tmp_path / name)
 
 
@@ -156,12 +156,12 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
     [
         ({"model_type": "bert"}, "an encoder is 'clip' or 'siglip'"),
         ({"vision_config": {"num_hidden_layers": 10**6}}, "num_hidden_layers is 1000000"),
-        ({"vision_config": [1]}, "vision_config is no table"),
+        ({"vision_config": [1]}, "vision_config is not a table"),
         ({"quantization_config": {}}, "the weights are quantised"),
         ({"vision_config": {"image_size": 64}}, "the image tower takes 64 px"),
     ],
 )
-def test_a_configuration_without_sense_is_refused_before_anything_is_made(
+def test_invalid_configuration_fails_before_loading(
     folder: Path, tmp_path: Path, change: dict[str, Any], said: str
 ) -> None:
     target = tmp_path / "clip-vit-h-14"

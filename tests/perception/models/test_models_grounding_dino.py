@@ -103,7 +103,7 @@ CENTRES = np.array(
 )
 
 
-def test_boxes_are_thresholded_suppressed_and_called_by_their_phrases(tokenizer: Any) -> None:
+def test_boxes_are_thresholded_suppressed_and_named_by_phrase(tokenizer: Any) -> None:
     told = Told(tokenizer, PROBABILITIES, CENTRES)
     found = told.detect(RGB, ["Cat", "coffee table", "cat"], BoxConfig())
     assert told.texts == ["cat. coffee table."], "each tag is asked for once"
@@ -113,14 +113,14 @@ def test_boxes_are_thresholded_suppressed_and_called_by_their_phrases(tokenizer:
     np.testing.assert_allclose(found.boxes, [[0, 0, 30, 40], [30, 0, 60, 40]])
 
 
-def test_conceptgraphs_calls_every_box_by_the_first_word_of_its_phrase(tokenizer: Any) -> None:
+def test_conceptgraphs_names_boxes_by_first_word_of_phrase(tokenizer: Any) -> None:
     found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES)
     # "table" is in "coffee table", which overlaps it by one half, which 0.5 allows; a full stop alone is the first tag.
     assert found.names == ("cat", "coffee table", "cat", "coffee table", "cat")
     np.testing.assert_allclose(found.scores, [0.9, 0.8, 0.7, 0.3, 0.25])
 
 
-def test_a_box_found_by_the_mark_of_the_texts_beginning_is_the_first_tag_there_and_has_no_name_else(
+def test_box_matched_by_start_token_has_first_tag_or_no_name(
     tokenizer: Any,
 ) -> None:
     probabilities = np.zeros((1, 8), np.float32)
@@ -130,14 +130,14 @@ def test_a_box_found_by_the_mark_of_the_texts_beginning_is_the_first_tag_there_a
     assert told.detect(RGB, ["cat", "coffee table"], BoxConfig()).names == ("coffee",)
 
 
-def test_a_box_may_be_called_by_a_whole_tag_and_go_where_it_stands_for_none(tokenizer: Any) -> None:
+def test_box_is_named_by_complete_tag_or_dropped(tokenizer: Any) -> None:
     config = CONCEPTGRAPHS_BOXES.model_copy(update={"names": "tag"})
     found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], config)
     assert found.names == ("cat", "coffee table", "cat")
     np.testing.assert_allclose(found.scores, [0.9, 0.3, 0.25])
 
 
-def test_tags_that_one_text_cannot_hold_are_asked_for_in_a_second(tokenizer: Any) -> None:
+def test_tags_beyond_text_limit_use_a_second_prompt(tokenizer: Any) -> None:
     told = Told(tokenizer, PROBABILITIES, CENTRES, longest_text=7)
     told.detect(RGB, ["cat", "coffee table", "sofa", "lamp", "book"], BoxConfig())
     assert told.texts == ["cat. coffee table.", "sofa. lamp.", "book."]

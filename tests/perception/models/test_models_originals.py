@@ -38,7 +38,7 @@ def test_every_case_names_its_source() -> None:
     assert set(CASES["sources"]) == set(CASES) - {"sources", "squares"}
 
 
-def test_conceptgraphs_names_a_box_by_the_first_word_of_its_phrase_and_drops_none() -> None:
+def test_conceptgraphs_naming_matches_original_and_drops_no_box() -> None:
     n_lost = n_renamed = 0
     for case in CASES["names"]:
         for phrase, answer in case["phrases"]:
@@ -56,7 +56,7 @@ def test_the_detectors_image_has_the_originals_size(case: list[int]) -> None:
 
 
 @pytest.mark.parametrize("case", CASES["suppressed"], ids=lambda case: f"{case['threshold']}")
-def test_suppression_keeps_what_torchvision_keeps_at_the_threshold_too(case: dict[str, Any]) -> None:
+def test_suppression_matches_torchvision_at_the_threshold(case: dict[str, Any]) -> None:
     boxes, scores = np.array(case["boxes"], np.float32), np.array(case["scores"], np.float32)
     assert suppress(boxes, scores, case["threshold"]).tolist() == case["kept"]
 
@@ -164,7 +164,7 @@ class Drawn:
         return torch.from_numpy(logits), torch.from_numpy(scores)
 
 
-def test_automatic_masks_have_the_originals_boxes_and_a_mask_of_one_pixels_width_has_none() -> None:
+def test_automatic_mask_boxes_match_original() -> None:
     found = AutomaticMasks(Sam(Drawn()), AutomaticMaskConfig()).regions(np.zeros((64, 64, 3), np.uint8))
     sides = found.boxes[:, 2:] - found.boxes[:, :2]
     rows = np.concatenate([found.boxes[:, :2], sides, found.masks.sum(axis=(1, 2))[:, None]], axis=1)
@@ -180,7 +180,7 @@ def test_boxes_of_masks_end_at_the_last_pixel(rows: str, box: list[int]) -> None
 # ---- RAM
 
 
-def test_rams_picture_is_bilinear_and_conceptgraphs_is_what_pillow_makes_unasked() -> None:
+def test_ram_image_resizing_matches_ram_and_conceptgraphs() -> None:
     from PIL import Image
 
     rgb = blocks(96, 128)

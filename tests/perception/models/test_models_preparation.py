@@ -51,7 +51,7 @@ def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -
         assert np.array_equal(ours.pixels([image]), answer), image.shape
 
 
-def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> None:
+def test_old_and_new_processor_files_give_the_transform(tmp_path: Path) -> None:
     path = tmp_path / "preprocessor_config.json"
     usual = {"image_mean": [0.1, 0.2, 0.3], "image_std": [1, 2, 3], "resample": 3}
     path.write_text(json.dumps(usual | {"size": 224, "crop_size": 224, "do_center_crop": True}))
@@ -121,7 +121,7 @@ def test_batches_are_halved_when_the_memory_runs_out() -> None:
     assert batches.size == 3
 
 
-def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_are_assigned_to_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -136,7 +136,7 @@ def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert precision_for("bfloat16", "cuda:1") == "bfloat16"
 
 
-def test_the_cpu_takes_float32_and_a_gpu_that_is_not_here_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cpu_uses_float32_and_missing_gpu_gives_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     assert device_for("cpu", 3) == "cpu"

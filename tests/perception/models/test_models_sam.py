@@ -92,7 +92,7 @@ def test_single_masks_of_boxes_and_of_points_are_those_of_transformers(sam: Sam)
     assert (mask != theirs[0, 0]).mean() < 1e-3
 
 
-def test_regions_on_demand_look_at_each_frame_once() -> None:
+def test_regions_on_demand_encode_each_frame_once() -> None:
     looks: list[UInt8Array] = []
 
     class Counting(Sam):
@@ -115,7 +115,7 @@ def test_regions_on_demand_look_at_each_frame_once() -> None:
     assert regions.encode_regions(first, masks[0][0], np.array([[0, 0, 9, 9]])).shape == (1, 8)
 
 
-def test_a_checkpoint_fills_every_weight_or_is_refused() -> None:
+def test_incomplete_checkpoint_fails() -> None:
     from transformers import SamModel
 
     state = {
@@ -129,5 +129,5 @@ def test_a_checkpoint_fills_every_weight_or_is_refused() -> None:
     for name, tensor in tiny_sam().state_dict().items():
         assert (model.state_dict()[name] == tensor).all(), name
     state.pop("mask_decoder.iou_token.weight")
-    with pytest.raises(DataError, match=r"sam\.pth: is no checkpoint of this SAM: .*iou_token"):
+    with pytest.raises(DataError, match=r"sam\.pth: is not a checkpoint of this SAM model: .*iou_token"):
         fill_sam(SamModel(tiny_sam().config), state, "sam.pth")

@@ -46,7 +46,7 @@ class ByColour:
         return np.array([[word in text for word in ("red", "green", "blue")] for text in texts], np.float32)
 
 
-def test_the_likeliest_words_are_those_that_some_part_of_the_image_shows() -> None:
+def test_most_probable_words_are_taken_over_image_parts() -> None:
     image = np.zeros((40, 60, 3), np.uint8)
     image[:, :, 0] = 200
     image[20:, 30:] = 0, 0, 255
@@ -54,10 +54,10 @@ def test_the_likeliest_words_are_those_that_some_part_of_the_image_shows() -> No
     # Most of the image is red and three quarters are nothing else; one is blue: both 1, in the order of the list.
     assert tagger.tags(image) == ("blue", "red")
     assert WordTagger(ByColour(), ("green", "blue", "red"), n_tags=9).tags(image) == ("blue", "red", "green")
-    assert tagger.caveat is not None and "RAM++ is not here" in tagger.caveat
+    assert tagger.caveat is not None and "RAM++ is not installed" in tagger.caveat
 
 
-def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
+def test_stop_word_tags_are_removed_and_added_tags_come_last() -> None:
     found = ["bed", " lamp ", "bedroom", "Blue", "wall lamp", "bed", ""]
     expected = ("bed", "lamp", "other item", "wall", "floor", "ceiling")
     assert chosen_tags(found, STOP_WORDS, (*ADDED_TAGS, *BACKGROUND_TAGS)) == expected
@@ -68,23 +68,23 @@ def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\xff\xfe", "is no UTF-8 text"),
-        (b"a" * 101, "is no word"),
+        (b"\xff\xfe", "is not UTF-8 text"),
+        (b"a" * 101, "is not a word"),
         (b"ab\n" * 20_001, "has 20001 words"),
         (b"a" * (2**21 + 1), "bytes; expected a list of words"),
     ],
 )
-def test_what_is_no_word_list_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+def test_invalid_word_list_gives_one_line_error(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "words.txt"
     path.write_bytes(content)
     with pytest.raises(DataError, match=message) as caught:
         read_word_list(path)
     assert str(caught.value).isprintable()
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="cannot read the list of words"):
         read_word_list(tmp_path / "absent.txt")
 
 
-def test_an_exported_tagger_names_what_its_list_holds() -> None:
+def test_exported_tagger_uses_names_of_its_list() -> None:
     shapes: list[tuple[int, ...]] = []
 
     def run(_: None, fed: dict[str, Float32Array]) -> list[Float32Array]:

@@ -234,7 +234,7 @@ def transformers_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
         raise DataError(f"{path}: model_type is {str(kind)[:40]!r}; an encoder is 'clip' or 'siglip'")
     if "quantization_config" in config:
         raise DataError(
-            f"{path}: the weights are quantised, which is not the published encoder; fetch the folder again"
+            f"{path}: the weights are quantised, which is not the published encoder; download the folder again"
         )
     text, vision = (_table(path, config, key) for key in ("text_config", "vision_config"))
     for table in (config, text, vision):
@@ -262,7 +262,7 @@ def _table(path: Path, config: Mapping[str, Any], key: str) -> Mapping[str, Any]
     for name in (key, f"{key}_dict"):  # older files, LAION's among them, repeat a part there, and that counts
         part = config.get(name)
         if not isinstance(part, dict | None):
-            raise DataError(f"{path}: {name} is no table; fetch the file again")
+            raise DataError(f"{path}: {name} is not a table; download the file again")
         table |= part or {}
     return {name: value for name, value in table.items() if value is not None}
 
@@ -321,7 +321,9 @@ def open_clip_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     open_clip = require_open_clip(files.entry.name)
     config = open_clip.get_model_config(files.form.architecture)
     if config is None:
-        raise DataError(f"open_clip {open_clip.__version__} knows no '{files.form.architecture}'; install a newer one")
+        raise DataError(
+            f"open_clip {open_clip.__version__} has no '{files.form.architecture}'; install a newer version"
+        )
     transform = ImageTransform(int(config["vision_cfg"]["image_size"]), convention=convention)
     text = config["text_cfg"]
     n_tokens, n_words = text.get("context_length", OPEN_CLIP_TOKENS), text.get("vocab_size", OPEN_CLIP_WORDS)
@@ -340,7 +342,7 @@ def load_open_clip(files: ModelFiles) -> Any:
     try:
         model.load_state_dict(model_files.read_weights(files.weights), strict=True)
     except RuntimeError as error:
-        raise DataError(f"{files.weights}: is no {files.form.architecture}: {bounded(error)}") from error
+        raise DataError(f"{files.weights}: not a {files.form.architecture}: {bounded(error)}") from error
     return model.eval()
 
 

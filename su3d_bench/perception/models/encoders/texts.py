@@ -167,6 +167,6 @@ def _load(folder: Path, load: Callable[[], Any]) -> Any:
     except Exception as error:  # tokenizers raises plain Exception for any fault of a file; others are raised again
         if type(error) is Exception or isinstance(error, OSError | ValueError | KeyError | TypeError | AttributeError):
             raise DataError(
-                f"{folder}: its tokenizer cannot be read: {bounded(error)}; fetch its files again"
+                f"{folder}: its tokenizer cannot be read: {bounded(error)}; download its files again"
             ) from error
         raise

@@ -35,7 +35,7 @@ RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
 # Of its tensors: made by the network itself from its window size; the authors' loader drops them too.
 MADE_BY_ITSELF = ("relative_position_index", "attn_mask")
-WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
+WORDS_CAVEAT = "tags: RAM++ is not installed; using the most probable words of a list by the encoder instead"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
 # Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70): a tag
@@ -179,17 +179,17 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
         return vocabulary()
     try:
         if path.stat().st_size > MAX_LIST_BYTES:
-            raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one a line")
+            raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one per line")
         words = listed_words(file_text(path))
     except OSError as error:
-        raise DataError(f"{path}: the list of words cannot be read ({error.strerror})") from error
+        raise DataError(f"{path}: cannot read the list of words ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is no UTF-8 text; expected a list of words, one a line") from error
+        raise DataError(f"{path}: is not UTF-8 text; expected a list of words, one per line") from error
     if not 1 <= len(words) <= MAX_WORDS:
         raise DataError(f"{path}: has {len(words)} words; expected 1 to {MAX_WORDS}")
     for word in words:
         if len(word) > MAX_WORD_LENGTH or not word.isprintable():
-            raise DataError(f"{path}: {word[:40]!r} is no word; expected short printable texts")
+            raise DataError(f"{path}: {word[:40]!r} is not a word; expected short printable texts")
     return words
 
 
