@@ -123,7 +123,7 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
         assert runs_page.text_of(browser, "#maps .legend").strip()
     assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
     runs_page.choose(browser, "maps", "Colour by", kinds[4])
-    assert "right class" in runs_page.text_of(browser, "#maps .legend")
+    assert "correct class" in runs_page.text_of(browser, "#maps .legend")
     runs_page.choose(browser, "maps", "Colour by", kinds[5])
     assert runs_page.options(browser, "maps", "Text") == ["chair", "table"]
     first = runs_page.picture(browser)
