@@ -1,4 +1,4 @@
-"""A map in the form in which a page shows it: thinned, quantised, ordered along a curve and deflated.
+"""Pack a map for the HTML page: downsampled, quantised, sorted along a Z-order curve and deflated.
 
 The content of a map is ``JSON length (uint32, little endian) | JSON | tree | planes``. The tree says where the points
 are: level after level a byte a cell, whose bits are the eighths of the cell that hold any (1 the half along x, 2 along
@@ -27,15 +27,15 @@ from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.metrics.matching.nearest import Candidates, first_rows
 from su3d_bench.reports.pictures.maps import map_cloud
 
-LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen
-COARSER = 1.15  # from one spacing that is tried to the next
+LEAST_SPACING_M = 0.015  # of drawn points; finer spacing is invisible on a screen
+COARSER = 1.15  # ratio between consecutive spacings that are tried
 STEPS_A_SPACING = 2  # a point stands in the middle of one of these, so the grid itself does not show
 MOST_CELLS = 1 << 16  # along an axis, in which a page counts
 NO_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
-NEAR_M = 0.05  # a truth farther than this says nothing of a point of the map
+NEAR_M = 0.05  # maximum distance between a map point and its ground truth
 COLOUR_NEAR_M = 0.06  # frames are sampled every few centimetres
 DEFLATE_LEVEL = 7  # level 9 takes five times as long for maps that are a fiftieth smaller
-COLOUR_BITS = 5  # of each channel that are kept; no eye sees more on single points
+COLOUR_BITS = 5  # per channel; more is invisible on single points
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _first_of_cells(points: Float32Array, spacing_m: float) -> Int64Array:
 
 
 def _curve(cells: Int64Array) -> Int64Array:
-    """Where each cell (n, 3) stands on a Z-order curve, along which neighbours have like values."""
+    """Return the Z-order (Morton) index of each cell (n, 3)."""
     if not len(cells):
         return np.zeros(0, np.int64)
     cells = cells - cells.min(axis=0)
@@ -122,7 +122,7 @@ def nearest_classes(points: Float32Array, truth: Candidates, classes: Int64Array
 
 
 def jpeg_text(rgb: UInt8Array, quality: int) -> str:
-    """A picture as a JPEG in base64."""
+    """Return an image as a base64 JPEG."""
     return base64.b64encode(jpeg_bytes(rgb, quality)).decode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""Pages of runs and of registries: each a single file that loads nothing, in which every text is data, never markup."""
+"""Self-contained HTML pages of runs and registries; all text is data, never markup."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ function boardTable(board, rows) {
   const metrics = headlineColumns(board, (row, k) => row.values[k], true);
   return table(`${scenesText(board)}; per cent with the 95 % interval over scenes, the best bold`, [
     { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
-    { label: 'Rank', title: 'From which rank to which it may go, with 95 % for all rows together', num: true,
+    { label: 'Rank', title: 'Simultaneous 95 % rank interval', num: true,
       value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null), show: ranksText },
     ...metrics,
     { label: 'Frame', title: 'Median seconds a frame that was looked at; in brackets without perception', num: true,
@@ -189,7 +189,7 @@ function methodPage() {
 
 function scenesTable(board, row) {
   const rows = Object.entries(row.of_scenes).map(([scene, values]) => ({ scene, values }));
-  return table('Each scene alone, in per cent', [
+  return table('Per scene, in per cent', [
     { label: 'Scene', value: (one) => one.scene, show: (one) => link(DATA.scene_pages[one.scene], one.scene) },
     ...board.headline.map((metric, k) => ({ label: metric, num: true, value: (one) => one.values[k],
       show: (one) => valueCell(metric, one.values[k]) })),
@@ -199,12 +199,12 @@ function scenesTable(board, row) {
 // --- one scene
 
 function scenePage() {
-  main.append(intro('Each method on this scene alone. One scene tells little: a ranking is of all scenes together. Data ',
+  main.append(intro('Each method on this scene only. Rankings use all scenes. Data ',
     hash(DATA.digest), '.'));
   DATA.boards.forEach((board, k) => {
     const id = `board-${k}`, valueOf = (row, j) => row.of_scenes[DATA.name][j];
     section(id, board.protocol, intro(`Version ${board.version}: ${board.summary}. Ranked over ${scenesText(board)}.`),
-      table('This scene alone, in per cent; the best is bold', [
+      table('This scene, in per cent; the best is bold', [
         { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
         ...headlineColumns(board, valueOf, false),
         { label: 'Rank over all scenes', num: true, value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null),

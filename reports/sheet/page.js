@@ -180,9 +180,9 @@
     byId("export").classList.toggle("ready", done === nTotal);
     const note = byId("note");
     note.classList.toggle("alarm", !canSave);
-    if (!canSave) note.textContent = "This browser keeps nothing for this page: export before you close it.";
-    else if (done === nTotal) note.textContent = "All is answered. Export the answers and send the file back.";
-    else note.textContent = "Answers are kept in this browser as you go.";
+    if (!canSave) note.textContent = "Your browser cannot save progress; export before closing.";
+    else if (done === nTotal) note.textContent = "All done. Export your answers and send us the file.";
+    else note.textContent = "Answers are saved in this browser as you go.";
   }
 
   byId("back").addEventListener("click", () => go(-1));

@@ -1,4 +1,4 @@
-"""Pages for people who judge: one annotator's sheet with everything in it, and lists of what to look at.
+"""Pages for human evaluation: self-contained annotation sheets and lists of items to review.
 
 What scenes, queries and maps say reaches a sheet as data and is written with ``textContent``; a policy in each page
 lets nothing run or load that is not in it, or in lists beside it.
@@ -21,7 +21,7 @@ MOST_CHARACTERS = 2000  # of a text in a list
 
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
-    """The page of one annotator; ``data``: id, annotator, columns, guide, asks and items, pictures in base 64."""
+    """Return the page of one annotator; ``data``: id, annotator, columns, guide, asks, items and base64 pictures."""
     script = file_text(HERE / "page.js")
     names = {"sheet": data["id"], "annotator": data["annotator"]}
     return rendered(HERE, script, title=title, data=embedded_json(data), **names)

@@ -2,10 +2,9 @@
 
 function compareSection() {
   if (!DATA.comparisons.length) return;
-  part('compare', 'Compare', 'B less A over the scenes that both have, in percentage points: the exact test that flips '
-    + 'the signs of single scenes, with the least p that so many scenes can give; p of all, corrected by Holm for all '
-    + 'metrics of the comparison; and the 95 % t interval from the differences without each scene. Bold: p of all below '
-    + '0.05.', (section) => {
+  part('compare', 'Compare', 'B − A over the common scenes, in percentage points: p of the exact sign-flip '
+    + 'test over scenes, with the smallest p possible for this number of scenes; p adjusted by Holm over all metrics of '
+    + 'the comparison; and the 95 % jackknife t interval. Bold: adjusted p below 0.05.', (section) => {
     const sides = [...new Set(DATA.comparisons.flatMap((one) => [one.left, one.right].map(String)))].map((text) => {
       const at = text.indexOf(',');
       return [text, sideName(Number(text.slice(0, at)), text.slice(at + 1))];
@@ -21,8 +20,8 @@ function compareSection() {
       const [left, right] = [a.input.value, b.input.value], straight = find(left, right);
       const one = straight || find(right, left);
       if (one && !one.reason) { place.replaceChildren(...compared(one, !straight)); return; }
-      const why = left === right ? 'Choose two different sides.'
-        : 'These two are not compared on this page; run su3d-bench compare.';
+      const why = left === right ? 'Choose two different methods.'
+        : 'This page has no comparison of these two; run su3d-bench compare.';
       place.replaceChildren(h('p', { class: one ? 'note warn' : 'note' }, one ? one.reason : why));
     }
     draw();
@@ -41,7 +40,7 @@ function compared(one, isTurned) {
     scenes: Object.entries(d.per_scene).map(([scene, value]) => [scene, times(value)]) })));
   const spread = (row) => (row.interval ? h('small', null, ` [${row.interval.map(signed).join(', ')}]`) : null);
   const least = (row) => h('small', null, ` (${plural(row.pairs, 'scene')}, at least ${row.least.toPrecision(2)})`);
-  const table = dataTable({ caption: 'Differences, B less A', rows, columns: [
+  const table = dataTable({ caption: 'Differences, B − A', rows, columns: [
     { label: 'Protocol', value: (row) => row.protocol }, { label: 'Metric', value: (row) => row.metric },
     { label: 'p', num: true, value: (row) => row.p,
       show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), least(row)] : '–') },
@@ -69,7 +68,7 @@ function differenceStrip(row) {
 }
 
 function provenanceSection() {
-  part('provenance', 'Provenance', 'What these numbers depend on.', (section) => {
+  part('provenance', 'Provenance', 'Configuration, code version and data of each run.', (section) => {
     RUNS.forEach((run, index) => {
       const lines = factsOfRun(run).flatMap(([name, text]) => [h('dt', null, name), h('dd', null, text)]);
       fill(section, null, [h('h3', null, runNames[index]), h('dl', null, lines), noteList(run.warnings)]);
@@ -83,7 +82,7 @@ function factsOfRun(run) {
   const status = run.is_incomplete ? 'incomplete' : 'complete';
   const packages = Object.entries(run.packages).map(([name, version]) => `${name} ${version}`);
   return [
-    ['Folder', run.name], ['Status', run.is_partial ? `${status}, partial: ${run.limit} frames a scene` : status],
+    ['Folder', run.name], ['Status', run.is_partial ? `${status}, partial: ${run.limit} frames per scene` : status],
     ['Methods', run.methods.join(', ')], ['Scenes', String(run.scenes.length)], ['Profile', run.profile || '–'],
     ['Encoder', run.encoder ? `${run.encoder}, ${run.encoder_digest || 'no digest'}` : '–'],
     ['Seed', String(run.seed ?? '–')], ['Code', run.code],

@@ -1,4 +1,4 @@
-// Elements of the page. Texts reach the document as text nodes alone.
+// Elements of the page. Text is only inserted as text nodes.
 
 const SVG = 'http://www.w3.org/2000/svg';
 const byId = (id) => document.getElementById(id);
@@ -33,7 +33,7 @@ function select(label, options, chosen, onChange) {
 }
 
 const isNumber = (value) => typeof value === 'number' && Number.isFinite(value);
-// Counts and ratios are told apart by their names, as in metrics.json.
+// The name distinguishes counts from ratios, as in metrics.json.
 const isCount = (metric) => metric.startsWith('n_');
 const percent = (value, digits = 1) => (isNumber(value) ? (100 * value).toFixed(digits) : '–');
 const metricText = (metric, value) =>
@@ -53,7 +53,7 @@ function compareValues(a, b) {
   return String(a).localeCompare(String(b), 'en', { numeric: true });
 }
 
-// Keeps its place where the table beneath it scrolls sideways.
+// Stays in place when the table scrolls horizontally.
 const captionOf = (text) => h('caption', null, h('span', null, text));
 
 // A table that sorts by its headers and, with `filter`, shows the rows whose text holds what is typed.
@@ -128,13 +128,13 @@ function noteList(lines, most = 6) {
   return [
     list(lines.slice(0, most)),
     lines.length > most
-      ? h('details', null, h('summary', null, `${lines.length - most} more remarks`), list(lines.slice(most)))
+      ? h('details', null, h('summary', null, `${lines.length - most} more notes`), list(lines.slice(most)))
       : null,
   ];
 }
 
 function whisker(value, interval, ceiling) {
-  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the truth's score.
+  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the ground-truth ceiling.
   const width = 104, x = (v) => 2 + Math.min(1, Math.max(0, v)) * (width - 4);
   if (!isNumber(value)) return null;
   return svg('svg', { width, height: 10, viewBox: `0 0 ${width} 10`, 'aria-hidden': 'true' },

@@ -27,7 +27,7 @@ function toGallery(text, wish, title) {
 
 function gallerySection() {
   if (!DATA.gallery || !DATA.gallery.length) return;
-  part('gallery', 'Worst errors', 'Single errors, the dearest first. The cost is by how many percentage points the '
+  part('gallery', 'Worst errors', 'Individual errors, most costly first. The cost is by how many percentage points the '
     + 'score over all scenes rises when this one error alone is put right and the score is formed anew. Costs do not '
     + 'add up: two errors that hide each other cost nothing alone, and several put right at once may give more or '
     + 'less than their sum.', galleryContent);

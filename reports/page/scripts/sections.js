@@ -122,7 +122,7 @@ function summarySection() {
         warn(h('strong', null, `${where}PARTIAL. `), `Only the first ${run.limit} frames of each scene were used.`);
       }
       if (run.is_incomplete) {
-        warn(h('strong', null, `${where}INCOMPLETE. `), 'Some scenes failed and are in no number.',
+        warn(h('strong', null, `${where}INCOMPLETE. `), 'Some scenes failed and are excluded from all numbers.',
           noteList(run.failed, 3));
       }
     }
@@ -132,29 +132,29 @@ function summarySection() {
       const below = [noteList(notesOf(rows)), meaningsOf(rows[0].headline)];
       fill(section, null, [h('h3', null, protocol), summaryTable(rows), below]);
     }
-    if (!PROTOCOLS.length) warn('No protocol scored these runs.');
-    if (DATA.found.length) fill(section, null, [h('h3', null, 'Found, not scored'), foundTable(DATA.found)]);
+    if (!PROTOCOLS.length) warn('These runs have no scores.');
+    if (DATA.found.length) fill(section, null, [h('h3', null, 'Predictions without ground truth'), foundTable(DATA.found)]);
     fill(section, null, [noteList(RUNS.flatMap((run) => run.unscored))]);
   });
 }
 
 // What the numbers mean, for tooltips and the list below the tables.
 const MEANINGS = new Map(Object.entries({
-  AP: 'average precision of the instances, mean over several IoU thresholds',
-  AP50: 'average precision where a mask and its object share half of their union',
-  AP25: 'average precision where a mask and its object share a quarter of their union',
-  centroid: 'boxes whose centre is right', class: 'boxes whose class is right',
-  mIoU: 'intersection over union of the points of a class, mean over the classes',
-  'F-mIoU': 'the same, classes weighted by how many points they have',
-  mAcc: 'share of the points of a class that are called so, mean over the classes',
-  'label n': 'the name that a method gave an instance while it mapped is right',
-  "label n'": 'the name made afterwards out of the names of an instance’s best views is right',
-  'well-merged': 'instances that are one object, whole', 'under-merged': 'instances that are part of one object',
-  'over-merged': 'instances that hold several objects',
+  AP: 'instance average precision, mean over IoU thresholds',
+  AP50: 'average precision at an IoU threshold of 0.5',
+  AP25: 'average precision at an IoU threshold of 0.25',
+  centroid: 'boxes with a correct centre', class: 'boxes with the correct class',
+  mIoU: 'point-wise intersection over union, mean over the classes',
+  'F-mIoU': 'IoU weighted by the number of points of each class',
+  mAcc: 'point-wise recall per class, mean over the classes',
+  'label n': 'the label assigned during mapping is correct',
+  "label n'": 'the label computed afterwards from the best views of an instance is correct',
+  'well-merged': 'instances that match exactly one object', 'under-merged': 'instances that cover only part of an object',
+  'over-merged': 'instances that cover several objects',
   "well-merged n'": 'the same, of instances that keep a name out of their best views',
   "under-merged n'": 'the same, of instances that keep a name out of their best views',
   "over-merged n'": 'the same, of instances that keep a name out of their best views',
-  answer: 'questions whose answer is right', objects: 'questions whose objects are right',
+  answer: 'questions answered correctly', objects: 'questions with the correct objects',
 }));
 
 function meaningsOf(metrics) {
@@ -166,7 +166,7 @@ function meaningsOf(metrics) {
 function foundTable(rows) {
   const named = ([name, n]) => (n === 1 && name ? name : `${name || 'without a name'} × ${n}`);
   return dataTable({
-    caption: 'What the maps hold; sizes are the longest edges of the boxes, ms an update is the median with perception',
+    caption: 'Contents of the maps; size: longest edge of the box; ms per update: median, including perception',
     rows,
     columns: [
       { label: 'Scene', value: (one) => one.scene },
@@ -176,7 +176,7 @@ function foundTable(rows) {
       { label: 'Smallest / median / largest (m)', num: true, value: (one) => (one.extents_m ? one.extents_m[1] : null),
         show: (one) => (one.extents_m ? one.extents_m.map((edge) => edge.toFixed(2)).join(' / ') : '–') },
       { label: 'Updates', num: true, value: (one) => one.n_updates },
-      { label: 'ms an update', num: true, value: (one) => one.update_ms, show: (one) => msText(one.update_ms) },
+      { label: 'ms per update', num: true, value: (one) => one.update_ms, show: (one) => msText(one.update_ms) },
       { label: 'Names', value: (one) => one.names.slice(0, 12).map(named).join(', ') },
     ],
   });
@@ -199,23 +199,23 @@ function summaryTable(rows) {
   const marks = metrics.some((metric) => best[metric] !== null);
   const ceilings = (one) => metrics.map((metric) => metricText(metric, one.ceiling[metric])).join(' / ');
   return dataTable({
-    caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean of the scenes'}`
+    caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean over scenes'}`
       + `${marks ? '; the best is bold' : ''}`,
     rows,
     columns: [
       { label: 'Method', value: nameOf },
       ...metrics.map(column),
-      { label: 'Truth’s score', title: 'What the truth itself scores where it is handed in as a map', num: true,
+      { label: 'Ground-truth ceiling', title: 'Score of the ground truth evaluated as a prediction', num: true,
         value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
         show: (one) => (one.ceiling ? ceilings(one) : '–') },
       { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },
-      { label: 'Within 5 cm', title: 'Share of the scored points with a point of the map that near', num: true,
+      { label: 'Within 5 cm', title: 'Fraction of ground-truth points within 5 cm of the map', num: true,
         value: covered, show: (one) => percent(covered(one)) },
     ],
   });
 }
 
-// A table with a row a scene or class and a column a method, of one protocol and one metric.
+// A table of one protocol and metric: one row per scene or class, one column per method.
 function matrixSection({ id, title, intro, what, head, metricsOf, valuesOf }) {
   const usable = PROTOCOLS.filter((protocol) =>
     resultsOf(protocol).some((one) => one.result && Object.keys(valuesOf(one)).length));
@@ -249,7 +249,7 @@ function matrixTable(protocol, name, all, head, valuesOf) {
   const rows = keys.map((key) => ({ key, best: best(key) }))
     .filter((row) => all.some((one) => isNumber(at(one, row.key))));
   const pooled = (one) => one.result.metrics[name];
-  const marked = rows.some((row) => row.best !== null) ? '; the best of a row is bold' : '';
+  const marked = rows.some((row) => row.best !== null) ? '; the best per row is bold' : '';
   const partial = all.some((one) => RUNS[one.run].is_partial) ? ' (PARTIAL)' : '';
   return dataTable({
     caption: `${protocol}: ${name} in per cent${partial}${marked}`,
@@ -268,7 +268,7 @@ function matrixTable(protocol, name, all, head, valuesOf) {
 
 function scenesSection() {
   matrixSection({ id: 'scenes', title: 'Scenes', what: 'Metric', head: 'Scene',
-    intro: 'Each scene alone.',
+    intro: 'Results per scene.',
     metricsOf: (rows) => [...new Set(rows.flatMap((one) => [...one.headline, ...Object.keys(one.result.metrics)]))],
     valuesOf: (one) => (one.result ? one.result.per_scene : {}) });
 }
@@ -276,7 +276,7 @@ function scenesSection() {
 function classesSection() {
   const columnsOf = (one) => Object.values(one.result.per_class).slice(0, 1).flatMap(Object.keys);
   matrixSection({ id: 'classes', title: 'Classes', what: 'Column', head: 'Class',
-    intro: 'Each class over all scenes; classes without a value in any method are left out.',
+    intro: 'Results per class over all scenes; classes without a value for any method are omitted.',
     metricsOf: (rows) => [...new Set(rows.flatMap(columnsOf))],
     valuesOf: (one) => (one.result ? one.result.per_class : {}) });
 }

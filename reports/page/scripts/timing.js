@@ -1,9 +1,9 @@
-// The section of times: the course of the updates, methods beside each other, stages, maps midway.
+// Timing: course of the updates, methods, stages, intermediate maps.
 
 function timingSection() {
   if (!DATA.timing.length) return;
-  part('timing', 'Timing', 'What each update costs. Perception is read from its cache where the stage “cache” '
-    + 'stands; “map” is everything but reading the frame and perception.', (section) => {
+  part('timing', 'Timing', 'Time per update. A stage “cache” means that perception was read from its cache; “map” '
+    + 'is everything except reading the frame and perception.', (section) => {
     section.append(h('ul', { class: 'facts' }, RUNS.map((run, k) =>
       h('li', null, RUNS.length > 1 ? `${runNames[k]}: ` : '', h('b', null, run.hardware)))));
     coursePlot(section);
@@ -20,7 +20,7 @@ function timingSection() {
 function coursePlot(section) {
   const scenes = [...new Set(DATA.timing.flatMap((one) => Object.keys(one.series)))], place = h('div');
   const scene = select('Scene', scenes.map((name) => [name, name]), scenes[0], plot);
-  const what = select('Time of', [['map', 'the map alone'], ['total', 'the whole update']], 'map', plot);
+  const what = select('Time of', [['map', 'map only'], ['total', 'complete update']], 'map', plot);
   const axes = [['updates', 'updates so far'], ['points', 'points of the map']];
   const against = select('Against', axes, 'updates', plot);
   section.append(h('div', { class: 'toolbar' }, scene, what, against), place);
@@ -35,13 +35,13 @@ function coursePlot(section) {
       return { name: nameOf(one), style: styleOf(one.run, one.method), x, y };
     }).filter((line) => line.x.length);
     const per = Math.max(1, ...usable.map((one) => one.series[name].per));
-    const yLabel = `ms an update${per > 1 ? ` (means of up to ${per})` : ''}`, [, xLabel] = axes[byPoints ? 1 : 0];
-    place.replaceChildren(linePlot({ label: `Milliseconds an update in ${name}`, lines, xLabel, yLabel }));
+    const yLabel = `ms per update${per > 1 ? ` (means of up to ${per})` : ''}`, [, xLabel] = axes[byPoints ? 1 : 0];
+    place.replaceChildren(linePlot({ label: `Milliseconds per update in ${name}`, lines, xLabel, yLabel }));
   }
   plot();
 }
 
-const growthWords = (one) => (one.by_points || one.by_updates || { words: 'too few updates to tell' }).words;
+const growthWords = (one) => (one.by_points || one.by_updates || { words: 'too few updates' }).words;
 
 function methodTimes() {
   const stage = (one, name) => one.stages.find((each) => each.name === name) || {};
@@ -49,7 +49,7 @@ function methodTimes() {
   const ms = (label, value) => ({ label, num: true, value, show: (one) => msText(value(one)) });
   const bytes = (label, key) => ({ label, num: true, value: (one) => one[key], show: (one) => mib(one[key]) });
   return dataTable({
-    caption: 'All scenes; milliseconds an update, the first three of a scene apart', rows: DATA.timing,
+    caption: 'All scenes; milliseconds per update, without the first three of each scene', rows: DATA.timing,
     columns: [
       { label: 'Method', value: nameOf }, { label: 'Updates', num: true, value: (one) => one.n_updates },
       ...['p50', 'p95', 'max', 'first'].map((key) => ms(key, (one) => stage(one, 'total')[key])),
@@ -67,7 +67,7 @@ function stageTimes(one) {
   const exponent = (label, key) => ({
     label, num: true, value: (row) => row[key] && row[key].exponent, show: (row) => growth(row[key]) });
   return dataTable({
-    caption: `${nameOf(one)}: milliseconds an update, stage by stage`, rows: one.stages,
+    caption: `${nameOf(one)}: milliseconds per update by stage`, rows: one.stages,
     columns: [
       { label: 'Stage', value: (row) => row.name },
       ...['p50', 'p95', 'max', 'first'].map((key) => ({
@@ -84,7 +84,7 @@ function anytime(section) {
   if (!midway.length) return;
   const place = h('div'), names = [...new Set(midway.map((one) => one.protocol))];
   const protocols = protocolField(names), metric = select('Metric', [], null, draw);
-  section.append(h('h3', null, 'Maps midway'), h('div', { class: 'toolbar' }, protocols, metric), place);
+  section.append(h('h3', null, 'Intermediate maps'), h('div', { class: 'toolbar' }, protocols, metric), place);
   chosen.listeners.push(refresh);
   function refresh() {
     const first = midway.find((one) => one.protocol === protocols.protocol());
@@ -101,8 +101,8 @@ function anytime(section) {
       return { name: nameOf(one), style: styleOf(one.run, one.method), x: points.map(([share]) => 100 * share),
         y: points.map(([, value]) => (isCount(name) ? value : 100 * value)) };
     });
-    place.replaceChildren(linePlot({ label: `${name} of maps midway`, lines,
-      xLabel: 'per cent of the frames', yLabel: isCount(name) ? name : `${name} in per cent` }));
+    place.replaceChildren(linePlot({ label: `${name} of intermediate maps`, lines,
+      xLabel: 'percentage of frames', yLabel: isCount(name) ? name : `${name} in per cent` }));
   }
   refresh();
 }

@@ -115,7 +115,7 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
 def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
     runs_page.open_maps(browser)
     kinds = runs_page.options(browser, "maps", "Colour by")
-    assert kinds == ["colour", "instance", "class", "true class", "error against the truth", "similarity to a text"]
+    assert kinds == ["colour", "instance", "class", "ground-truth class", "error", "similarity to a text"]
     seen = {}
     for kind in kinds:
         runs_page.choose(browser, "maps", "Colour by", kind)
@@ -123,7 +123,7 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
         assert runs_page.text_of(browser, "#maps .legend").strip()
     assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
     runs_page.choose(browser, "maps", "Colour by", kinds[4])
-    assert "right class" in runs_page.text_of(browser, "#maps .legend")
+    assert "correct class" in runs_page.text_of(browser, "#maps .legend")
     runs_page.choose(browser, "maps", "Colour by", kinds[5])
     assert runs_page.options(browser, "maps", "Text") == ["chair", "table"]
     first = runs_page.picture(browser)

@@ -1,18 +1,18 @@
 // The colours of a map's points, and what is said of them beneath the view.
 
 const COLOURINGS = [
-  ['colour', 'colour'], ['instance', 'instance'], ['class', 'class'], ['truth', 'true class'],
-  ['error', 'error against the truth'], ['similarity', 'similarity to a text'],
+  ['colour', 'colour'], ['instance', 'instance'], ['class', 'class'], ['truth', 'ground-truth class'],
+  ['error', 'error'], ['similarity', 'similarity to a text'],
 ];
 const PALE = { wall: [226, 222, 214], floor: [208, 203, 196], ceiling: [236, 236, 232] };
 const NOTHING = [150, 154, 160];
 const HEAT = [[0, 0, 128], [0, 80, 255], [90, 215, 190], [250, 190, 40], [230, 50, 10], [128, 0, 0]];
 const ERRORS = [
-  ['right class', [59, 140, 226]], ['wrong class', [224, 72, 58]], ['truth not scored', [176, 180, 186]],
-  ['no truth within 5 cm', [120, 124, 132]], ['no class', [240, 176, 64]],
+  ['correct class', [59, 140, 226]], ['wrong class', [224, 72, 58]], ['ground truth not scored', [176, 180, 186]],
+  ['no ground truth within 5 cm', [120, 124, 132]], ['no class', [240, 176, 64]],
 ];
 const JUDGED = [
-  ['missed', [219, 41, 140]], ['not missed', [59, 140, 226]], ['not counted', [176, 180, 186]],
+  ['missed', [219, 41, 140]], ['not missed', [59, 140, 226]], ['not evaluated', [176, 180, 186]],
 ];
 const MOST_ENTRIES = 300; // of a legend
 const NEAR_NONE = 0xffff, NOT_SCORED = 0xfffe;
@@ -93,12 +93,12 @@ function painted(map, kind, query, judged) {
   const classes = (none) => [...counts].sort((a, b) => b[1] - a[1])
     .map(([c, n]) => [tint(c), `${c < 0 ? none : map.classes[c]} ${share(n)}`]);
   const legendOf = {
-    colour: () => [[null, 'as the frames saw it']],
+    colour: () => [[null, 'colours from the frames']],
     instance: () => [[null, plural(map.instances.length, 'instance')
-      + (same ? `; ${same} of them ${same > 1 ? 'are objects' : 'is an object'} of the truth, in its colour` : '')],
+      + (same ? `; ${same} of them ${same > 1 ? 'match ground-truth objects and have their colours' : 'matches a ground-truth object and has its colour'}` : '')],
     ...named()],
     class: () => classes('none'),
-    truth: () => classes('not scored or nothing near'),
+    truth: () => classes('not scored or no ground truth nearby'),
     error: () => ERRORS.map(([text, rgb], e) => [rgb, `${text} ${share(counts.get(e) || 0)}`])
       .filter((_, e) => counts.get(e)),
     judged: () => JUDGED.map(([text, rgb], e) => [rgb, `${text} (${nJudged(e)})`]),
@@ -131,7 +131,7 @@ function wordsOf(map, index) {
 // What is known of an object of the truth, as pairs of a name and a text.
 function factsOfTruth(truth, index, judged) {
   const one = truth.instances[index], metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
-  const facts = [['True class', titleOf(truth, one)], ['Points', countText(one.points)]];
+  const facts = [['Ground-truth class', titleOf(truth, one)], ['Points', countText(one.points)]];
   if (one.size) facts.push(['Size', `${metres(one.size, ' × ')} m`], ['Centre', `${metres(one.centre, ', ')} m`]);
   if (judged && judged.counted) facts.push([`In this map (${judged.protocol})`, JUDGED[judgedAt(judged, index)][0]]);
   return facts;
@@ -153,7 +153,7 @@ function factsOfInstance(map, index) {
   const metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
   if (one.class !== undefined) facts.push([`Class (${map.protocol})`, one.class < 0 ? 'none' : map.classes[one.class]]);
   const truth = map.truth ? truthOfInstance(map, index) : null;
-  if (map.truth) facts.push(['Truth there', truth ? `${truth[0]} (${percent(truth[1], 0)} % of its points)` : 'none']);
+  if (map.truth) facts.push(['Ground truth', truth ? `${truth[0]} (${percent(truth[1], 0)} % of its points)` : 'none']);
   if (isNumber(one.score)) facts.push(['Score', one.score.toFixed(3)]);
   facts.push(['Points', countText(one.points)]);
   if (one.size) facts.push(['Size', `${metres(one.size, ' × ')} m`], ['Centre', `${metres(one.centre, ', ')} m`]);
@@ -163,7 +163,7 @@ function factsOfInstance(map, index) {
   }
   if (one.similarity && one.similarity.length) {
     const k = one.similarity.indexOf(Math.max(...one.similarity));
-    facts.push(['Most like', `“${map.queries[k]}” ${(one.similarity[k] / 1000).toFixed(3)}`]);
+    facts.push(['Most similar text', `“${map.queries[k]}” ${(one.similarity[k] / 1000).toFixed(3)}`]);
   }
   return facts;
 }
@@ -177,5 +177,5 @@ function viewOfInstance(map, one, thumbnails) {
   const alt = `Frame ${one.view} with ${titleOf(map, one)}`;
   return h('figure', { class: 'thumb' },
     h('div', { class: 'thumb' }, h('img', { alt, src: `data:image/jpeg;base64,${image}` }), frame),
-    h('figcaption', null, `Frame ${one.view}: where its points are`));
+    h('figcaption', null, `Frame ${one.view}: location of its points`));
 }

@@ -1,9 +1,9 @@
 // One view of a map with its title, the name of what the pointer is on, and its legend.
 
 const DARK_PAPER = [26 / 255, 32 / 255, 39 / 255], LIGHT_PAPER = [246 / 255, 247 / 255, 249 / 255];
-const NO_VIEW = 'This browser has no WebGL 2 (or no DecompressionStream), so the maps are not drawn here. Every number '
-  + 'of the page is complete without it.';
-const VIEW_LOST = 'The browser took the 3D view away; it comes back by itself, or with a reload.';
+const NO_VIEW = 'This browser has no WebGL 2 (or no DecompressionStream), so the maps cannot be drawn. All numbers are '
+  + 'unaffected.';
+const VIEW_LOST = 'The browser lost the 3D context; wait for it to be restored or reload the page.';
 
 // `nameOf(found)`: what is said of what the pointer is on, a name and further lines.
 function mapPane({ eye, keysId, onMove, onPick, nameOf }) {

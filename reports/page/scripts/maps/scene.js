@@ -1,11 +1,11 @@
 // The section of the maps: choices, the views, the list of instances, what is known of one.
 
 const CLICK_ONE = 'Click an instance in the view or in the list to see its name, caption, scores and views.';
-const GROWN = 'An instance of the finished map stands here, whole, from the first frame that shows it; what was merged '
-  + 'into others or dropped on the way is not kept.';
-const NO_POINTS = 'This map has no points.', DAMAGED = 'This map is damaged; make the page again.';
+const GROWN = 'Each instance of the final map appears, complete, from the first frame in which it is seen; instances that '
+  + 'were merged or removed earlier are not shown.';
+const NO_POINTS = 'This map has no points.', DAMAGED = 'This map is damaged; build the page again.';
 const MOST_READ = 6; // maps that are kept unpacked
-// The maps stand behind the script, so that the page is there before them.
+// The maps follow the script, so that the page appears before they are loaded.
 const isWhole = new Promise((done) => {
   if (document.readyState === 'loading') document.addEventListener('DOMContentLoaded', () => done(), { once: true });
   else done();
@@ -13,17 +13,17 @@ const isWhole = new Promise((done) => {
 
 function mapsSection() {
   if (!DATA.maps.length) return;
-  part('maps', 'Maps', 'What each method made of each scene, thinned for this page.', mapsContent);
+  part('maps', 'Maps', 'The map of each method in each scene, downsampled for this page.', mapsContent);
 }
 
 function keysOfView(id) {
   const key = (text) => h('kbd', null, text);
   return h('p', { class: 'keys', id },
-    'The pointer names what it is on, a click or tap chooses it. Drag turns, right or ', key('Shift'), ' drag moves, ',
-    'the wheel zooms once the view was clicked; two fingers zoom and move. Keys: ', key('←↑↓→'), ' turn, with ',
+    'Hover to see a name, click or tap to select. Drag to rotate, right-drag or ', key('Shift'), '-drag to pan, ',
+    'scroll to zoom after a click; pinch or drag with two fingers to zoom and pan. Keys: ', key('←↑↓→'), ' rotate, with ',
     key('Shift'), ' move, ', key('+'), ' ', key('−'), ' zoom, ', key('Home'), ' whole map, ', key('Enter'),
-    ' picks the middle, ', key('N'), ' ', key('P'), ' next and previous instance, ', key('Esc'), ' none. The address ',
-    'of the page carries what is shown here: keep it as a link.');
+    ' selects the centre, ', key('N'), ' ', key('P'), ' next and previous instance, ', key('Esc'), ' clears the selection. The ',
+    'address of the page stores this view: copy it to share.');
 }
 
 const sliderField = (label, value, onInput) => {
@@ -83,7 +83,7 @@ function mapsContent(section) {
     const besides = DATA.maps.map((one, k) => [String(k), one])
       .filter(([k, one]) => one.scene === scene.input.value && Number(k) !== current.index && !one.reason)
       .map(([k, one]) => [k, sideName(one.run, one.method)]);
-    const truths = map && map.beside ? [['truth', 'truth']] : [], before = besideField.input.value;
+    const truths = map && map.beside ? [['truth', 'ground truth']] : [], before = besideField.input.value;
     besideField.setOptions([['', 'nothing'], ...truths, ...besides], asked ? asked.beside : sameBeside(before));
   }
   // The map of the same run and method in the scene that is shown now.
@@ -180,8 +180,8 @@ function mapsContent(section) {
     const known = judged() ? owners.length : 'not known';
     missedField.label.replaceChildren(swatchOf(JUDGED[0][1]), ` Missed objects (${known})`);
     missedField.input.disabled = !owners.length;
-    missedField.title = judged() ? `As the errors of ${judged().protocol} are counted: objects in which no mask lies by `
-      + 'more than half, of which none holds more than half, and which no parts make up' : '';
+    missedField.title = judged() ? `By the error analysis of ${judged().protocol}: objects without a mask that lies more than half in them, `
+      + 'covers more than half of them, or is part of a set that makes them up' : '';
     const isWanted = owners.length > 0 && missedField.input.checked;
     const found = isWanted ? await truthBeside() : null;
     if (of !== map) return;
@@ -191,7 +191,7 @@ function mapsContent(section) {
   }
   function missedWords(index) {
     const words = truth ? wordsOf(truth, index) : null;
-    return words && [words[0], 'missed by this map'];
+    return words && [words[0], 'missed by this prediction'];
   }
   function applyWalls() {
     for (const { view } of [pane, other]) if (view) view.fade(wallsField.input.checked);
@@ -219,12 +219,12 @@ function mapsContent(section) {
     const step = Number(grow.value), last = growth.frame.length - 1, frame = growth.frame[step];
     const known = map.instances.filter((one) => isNumber(one.born)), unknown = map.instances.length - known.length;
     const here = known.filter((one) => one.born <= step).length;
-    const held = growth.held ? `; the method held ${growth.held[step]}` : '';
+    const held = growth.held ? `; the method had ${growth.held[step]}` : '';
     const text = `Update ${growth.update[step]} of ${growth.update[last]}, frame ${frame}: ${here} of `
       + `${plural(map.instances.length, 'instance')} seen${held}.`;
     grow.setAttribute('aria-valuetext', text);
-    growthNote.textContent = [text, GROWN, unknown ? `Of ${unknown} no frame is recorded; they stand throughout.` : '',
-      'Points of no instance stand throughout.'].filter(Boolean).join(' ');
+    growthNote.textContent = [text, GROWN, unknown ? `${unknown} without a recorded frame; always shown.` : '',
+      'Points without an instance are always shown.'].filter(Boolean).join(' ');
     if (pane.view) pane.view.growTo(step);
     const beside = other.map && other.map.growth;
     if (other.view) other.view.growTo(!beside || step === last ? NO_OWNER : stepOf(beside, frame));
@@ -249,7 +249,7 @@ function mapsContent(section) {
     const wanted = (isTruth && asTruth[colouring.input.value]) || colouring.input.value;
     const kinds = colouringsOf(other.map).map(([kind]) => kind);
     const kind = wanted === 'judged' || kinds.includes(wanted) ? wanted : kinds[0];
-    const heading = isTruth ? 'as the truth has it' : `by ${sideName(one.run, one.method)}`;
+    const heading = isTruth ? 'ground truth' : `by ${sideName(one.run, one.method)}`;
     other.paint(`${current.scene.scene} ${heading}`, kind, Number(queryField.input.value) || 0, judged());
   }
 
@@ -258,7 +258,7 @@ function mapsContent(section) {
     listedBy = orderOfList();
     rows = map.instances.map((one, index) => ({ one, index, selected: index === picked }));
     if (!rows.length) {
-      list.replaceChildren(h('p', { class: 'intro' }, 'This map has one feature a point and no instances.'));
+      list.replaceChildren(h('p', { class: 'intro' }, 'This map has one feature per point and no instances.'));
       return;
     }
     const query = Number(queryField.input.value) || 0;
@@ -271,7 +271,7 @@ function mapsContent(section) {
       columns.push(number('Score', score, (row) => (isNumber(score(row)) ? score(row).toFixed(2) : '–')));
     }
     columns.push(number('Points', (row) => row.one.points, (row) => countText(row.one.points)));
-    list.replaceChildren(dataTable({ caption: 'Instances; a row chooses one', filter: 'instances', tall: true, columns,
+    list.replaceChildren(dataTable({ caption: 'Instances; click a row to select', filter: 'instances', tall: true, columns,
       rows, sortBy: bySimilarity ? 1 : columns.length - 1, descending: true,
       onRow: (row) => pick(row.index === picked ? -1 : row.index, true) }));
   }
