@@ -50,7 +50,7 @@ MORE = {
     "dev registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
     "[running/registry.md](running/registry.md).",
     "dev registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
-    "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
+    "check": "The gate for CI: [Regression check in CI](running/regression-check.md), `action.yml`.",
     "query ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
     "query make": "`--protocols rooms-retrieval` scores maps by such: [objects.md](questions/objects.md).",
     "query audit": "What people look for: [human-evaluation.md](questions/human-evaluation.md).",
