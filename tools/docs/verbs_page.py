@@ -50,9 +50,9 @@ MORE = {
     "dev registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
     "[Registry of results](running/registry.md).",
     "dev registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
-    "check": "The gate for CI: [Regression check in CI](running/regression-check.md), `action.yml`.",
+    "check": "See [Regression check in CI](running/regression-check.md), `action.yml`.",
     "query ask": "By the built-in solver or a language model: [Questions about a scene](questions/reasoning.md).",
-    "query make": "`--protocols rooms-retrieval` scores maps by such: [Several texts per object](questions/objects.md).",
+    "query make": "Score maps with `--protocols rooms-retrieval`: [Several texts per object](questions/objects.md).",
     "query audit": "What people look for: [Human evaluation](questions/human-evaluation.md).",
     "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
     "[Human evaluation](questions/human-evaluation.md).",
