@@ -144,7 +144,7 @@ def test_scripts_are_whole_and_no_input_is_text_of_one(action: Any) -> None:
 def test_every_input_is_of_use_and_documented_where_it_is_new(action: Any) -> None:
     steps = str(action["runs"]["steps"])
     assert all(f"inputs.{name}" in steps for name in action["inputs"])
-    page = (ROOT / "docs" / "running" / "ci-gate.md").read_text()
+    page = (ROOT / "docs" / "running" / "regression-check.md").read_text()
     assert all(f"`{name}" in page for name in ("cache", "artifact", "table", "artifact-url"))
 
 

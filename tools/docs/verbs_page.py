@@ -37,26 +37,26 @@ MORE = {
     "dataset and drawn. Killed, it goes on where it was. `--methods all` is OpenSU3D and the seven "
     "baselines; `opensu3d@scheme4` or `opensu3d@top_m=1` is a variant beside its base; `--anytime "
     "0.25 0.5` scores the maps midway too. Many scenes on many machines: "
-    "[running/clusters.md](running/clusters.md); what a run leaves behind: "
-    "[running/run-folder.md](running/run-folder.md); GPUs: [running/gpu.md](running/gpu.md).",
+    "[Clusters](running/clusters.md); what a run leaves behind: "
+    "[Run folder](running/run-folder.md); GPUs: [GPU](running/gpu.md).",
     "ablate": "A sweep as variants in one run; `--beside all opensu3d@scheme4` puts other methods into the same "
     "run: the five tables of the paper from one ([results.md](numbers/results.md)).",
     "report tables": "The paper's tables, with the figures as reported beside, in Markdown, LaTeX, CSV or HTML; "
     "`report verify` recomputes every cell.",
     "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
     "report rerun": "A recording a scene with frames, masks, maps, truth and the map's growth, for rerun's "
-    "viewer: [running/rerun.md](running/rerun.md).",
+    "viewer: [Rerun export](running/rerun.md).",
     "report bundle": "Anybody scores it anew by `report verify`; a registry takes it in.",
     "dev registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
-    "[running/registry.md](running/registry.md).",
+    "[Registry of results](running/registry.md).",
     "dev registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
-    "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
-    "query ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
-    "query make": "`--protocols rooms-retrieval` scores maps by such: [objects.md](questions/objects.md).",
-    "query audit": "What people look for: [human-evaluation.md](questions/human-evaluation.md).",
+    "check": "See [Regression check in CI](running/regression-check.md), `action.yml`.",
+    "query ask": "By the built-in solver or a language model: [Questions about a scene](questions/reasoning.md).",
+    "query make": "Score maps with `--protocols rooms-retrieval`: [Several texts per object](questions/objects.md).",
+    "query audit": "What people look for: [Human evaluation](questions/human-evaluation.md).",
     "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
-    "[human-evaluation.md](questions/human-evaluation.md).",
-    "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](questions/human-evaluation.md).",
+    "[Human evaluation](questions/human-evaluation.md).",
+    "sheets score": "The paper's Tables IV and V with agreement: [Human evaluation](questions/human-evaluation.md).",
     "compare": "Exact sign-flip test with the smallest p that so many scenes allow, corrected where much is "
     "compared, and the paired difference with its interval; other data, rules or encoders are "
     "refused: [statistics.md](numbers/statistics.md).",
@@ -66,9 +66,9 @@ MORE = {
     "[datasets.md](datasets.md).",
     "datasets make": "In the exact layout of Replica or ScanNet (`.sens`): [datasets.md](datasets.md).",
     "models list": "Where files are looked for, sizes, licences: [methods/models.md](methods/models.md).",
-    "dev cache list": "What is kept, and which variable says where: [environment.md](running/environment.md).",
-    "dev doctor": "What each line means: [running/environment.md](running/environment.md).",
-    "dev completion": "For bash, zsh and fish: [running/environment.md](running/environment.md).",
+    "dev cache list": "What is kept, and which variable says where: [Environment](running/environment.md).",
+    "dev doctor": "What each line means: [Environment](running/environment.md).",
+    "dev completion": "For bash, zsh and fish: [Environment](running/environment.md).",
 }
 
 
