@@ -1,4 +1,4 @@
-"""What docs/numbers/from-map-to-metric.md works out by hand is what the program computes, and the modules it names are there."""
+"""The example by hand in docs/numbers/from-map-to-metric.md is what the code computes, and its modules exist."""
 
 from __future__ import annotations
 
