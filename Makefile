@@ -56,12 +56,10 @@ bench-methods: $(VENV)/test
 reference: demo
 	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json --across-machines 5 --cost-limit 3
 
-# Draws what docs/architecture.md says of the code from the code, makes docs/verbs.md from the parser and
-# docs/numbers/originals.md from the protocols' files.
+# Generates the tables of docs/architecture.md from the code and docs/verbs.md from the parser.
 architecture: $(VENV)/test
 	$(BIN)/python tools/docs/house.py
 	$(BIN)/python tools/docs/verbs_page.py
-	$(BIN)/python tools/docs/originals_page.py
 
 # The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
 # and --strict would end nothing.

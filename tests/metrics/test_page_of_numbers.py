@@ -1,4 +1,4 @@
-"""What docs/numbers/how-made.md works out by hand is what the program computes, and the modules it names are there."""
+"""The example by hand in docs/numbers/from-map-to-metric.md is what the code computes, and its modules exist."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from places import ROOT
 
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, ap_columns, average_precision
 
-PAGE = (ROOT / "docs" / "numbers" / "how-made.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "numbers" / "from-map-to-metric.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| [A-C] \| ([\d.]+) \| [^|]* \| ([^|]+) \|$", PAGE, re.MULTILINE)
 FOUND = [(float(confidence), float(iou.rpartition("= ")[2])) for confidence, iou in ROWS]
 N_CHAIRS = 3
@@ -47,7 +47,7 @@ def test_the_fractions_of_the_page_are_those_of_its_sum() -> None:
 
 
 def test_every_module_that_the_page_names_is_there() -> None:
-    way = PAGE.split("## The way of a number")[1].split("\n## ")[0]
+    way = PAGE.split("## Steps")[1].split("\n## ")[0]
     named = re.findall(r"`([a-z_]+/[a-z_/]*(?:\.py)?)`", way)
     assert len(named) >= 12
     for place in named:

@@ -11,7 +11,6 @@ import made_objects
 import made_points
 import made_queries
 import numpy as np
-import originals_page
 import pytest
 from places import CASES, ROOT
 
@@ -38,11 +37,6 @@ def test_every_protocol_says_whose_evaluation_it_is_and_its_cases_are_there(name
     assert stated is not None
     for pattern in stated.original.cases:
         assert any(ROOT.glob(pattern)), pattern
-
-
-def test_the_page_of_originals_is_what_the_protocols_say() -> None:
-    assert originals_page.PAGE.read_text() == originals_page.page(), "run make architecture"
-    assert all(f"`{name}`" in originals_page.PAGE.read_text() for name in protocol_names())
 
 
 def own(folder: Path, table: str, base: str = "scannet-instance") -> str:
