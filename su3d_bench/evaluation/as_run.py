@@ -140,7 +140,7 @@ def check_method_name(name: str) -> None:
     """A ``ConfigError`` where predictions cannot be called so."""
     check_folder_name("--name", name)
     if name == CEILING_METHOD:
-        raise ConfigError(f"--name: '{name}' is what the truth itself scores; call the predictions otherwise")
+        raise ConfigError(f"--name: '{name}' is reserved for the ground-truth ceiling; choose another name")
 
 
 def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
@@ -151,14 +151,14 @@ def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
 def _refuse_other_runs(out: Path) -> None:
     """A ``StoreError`` where ``out`` holds something that no evaluation wrote, before anything is scored."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise StoreError(f"{shown(out)}: is no folder; choose another with --out")
+        raise StoreError(f"{shown(out)}: is not a folder; choose another with --out")
     RunFolder(out).refuse_other_content()
     if (
         atomic.is_file(out / "run.json")
         and not records.read_record(records.RunRecord, out / "run.json", shown(out)).predictions
     ):
         raise StoreError(
-            f"{shown(out)}: holds a run, and no evaluation of predictions made elsewhere; choose another with --out"
+            f"{shown(out)}: holds a run that is not an evaluation of external predictions; choose another with --out"
         )
 
 
@@ -171,7 +171,7 @@ def _refuse_other_evaluation(out: Path, record: records.RunRecord, metrics: reco
         other = "numbers, though of the same files" if there.code == record.code else "numbers of another version"
     if other is not None:
         raise StoreError(
-            f"{shown(out)}: holds another evaluation (other {other}); choose another folder with --out, or remove it"
+            f"{shown(out)}: holds a different evaluation (other {other}); choose another folder with --out, or remove it"
         )
 
 

@@ -53,7 +53,7 @@ def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
     if request.queries is not None:
         truths.take_queries(request.queries)
     if not truths.matches:
-        raise PredictionError(f"{shown(request.predictions[0])}: has no prediction of a scene of {truths.where}")
+        raise PredictionError(f"{shown(request.predictions[0])}: has no prediction for any scene of {truths.where}")
 
     # Score.
     file_confidences = _count_file_confidences(request, sources)
@@ -106,12 +106,12 @@ def _open_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
 def _refuse_values_without_texts(request: Request, *, is_text: bool) -> None:
     if request.truth_values is not None and not is_text:
         raise ConfigError(
-            f"evaluate: {FLAG} says what the texts of --ground-truth hold; leave it out, there are none here"
+            f"evaluate: {FLAG} describes the text files of --ground-truth; remove it, no text files are used here"
         )
 
 
 def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool:
-    """Whether the confidences of the files count even where a protocol has 1 for every mask."""
+    """Whether confidences in the files are used where a protocol sets 1 for every mask."""
     if request.confidences is not None:
         return request.confidences == "file"
     return all(source.reader.name == "scannet-text" for source in sources)
@@ -134,7 +134,7 @@ class Scoring:
     def __init__(
         self, truths: SceneTruths, named: Sequence[str], texts: TextFeatures | None, *, file_confidences: bool
     ) -> None:
-        """Choose the protocols that may score these truths; named ones that cannot are an error."""
+        """Select the protocols that can score this ground truth; fail if a named one cannot."""
         self.rules: dict[str, ProtocolRules] = {}
         self.outcomes: dict[str, SceneOutcomes] = {}
         self.unfit: dict[str, str] = {}
@@ -150,7 +150,7 @@ class Scoring:
             else:
                 self.unfit[rules.name] = reason
         if not self.rules:
-            raise ConfigError(f"no protocol scores {truths.where}; see su3d-bench protocols")
+            raise ConfigError(f"no protocol can score {truths.where}; see su3d-bench protocols")
 
     def rules_of(self, scene: str) -> list[ProtocolRules]:
         """The rules under which a scene has a score."""
@@ -231,7 +231,7 @@ class Scoring:
             further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
             given = fitness.labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
             if kept.labels not in (None, given):
-                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
+                return f"gives {given} per point, but earlier scenes {kept.labels}; use the same number in all scenes"
             kept.labels = given
         kept.n_masks += facts.n
         kept.n_several += facts.n_several

@@ -1,4 +1,4 @@
-"""What an evaluation is asked for; its numbers with what must stand beside them, and their JSON form."""
+"""Evaluation requests and results, and their JSON form."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Request:
 
 
 def own_name(out: Path | None) -> str:
-    """What predictions are called that nobody named: as the folder of their run, where they become one."""
+    """The default name of predictions, used as the folder name in a run."""
     return "predictions" if out is None else out.resolve().name
 
 
@@ -59,7 +59,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """A scene under a protocol: its counts, those of the ceiling, those of every mask under every class, facts."""
+    """One scene under one protocol: counts of the prediction, of the ceiling and of every mask under every class."""
 
     score: SceneScore
     ceiling: SceneScore | None = None
@@ -70,7 +70,7 @@ class SceneOutcome:
 
 @dataclass
 class SceneOutcomes:
-    """What the scenes gave under one protocol so far."""
+    """Outcomes so far under one protocol."""
 
     scores: dict[str, SceneScore] = field(default_factory=dict)
     ceilings: dict[str, SceneScore | None] = field(default_factory=dict)
@@ -132,14 +132,14 @@ class ProtocolEvaluation:
 
     @property
     def confidences(self) -> tuple[float, float] | None:
-        """The lowest and the highest confidence in the files; None where there is none."""
+        """The lowest and highest confidence in the files; None without confidences."""
         lows = [facts.lowest_score for facts in self.facts.values() if facts.lowest_score is not None]
         highs = [facts.highest_score for facts in self.facts.values() if facts.highest_score is not None]
         return (min(lows), max(highs)) if lows else None
 
     @property
     def contested(self) -> float | None:
-        """Of the points in masks, the share that is in several; None where no mask has a point."""
+        """The fraction of masked points that are in several masks; None if no mask has points."""
         n_covered = sum(facts.n_covered for facts in self.facts.values())
         return sum(facts.n_contested for facts in self.facts.values()) / n_covered if n_covered else None
 
@@ -186,7 +186,7 @@ class Evaluation:
     remarks: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """The value of the ``--json`` file: fractions in full precision, null where a value is undefined."""
+        """The content of the ``--json`` file: fractions in full precision, null where undefined."""
         return {
             "schema": SCHEMA,
             "formats": list(self.formats),
@@ -198,7 +198,7 @@ class Evaluation:
 
 
 def formed(rules: ProtocolRules, kept: SceneOutcomes, *, file_confidences: bool) -> ProtocolEvaluation:
-    """The numbers of all scenes under one protocol."""
+    """The results of all scenes under one protocol."""
     result = combine(rules, kept.scores)
     ceilings = {scene: ceiling for scene, ceiling in kept.ceilings.items() if ceiling is not None}
     is_whole = len(ceilings) == len(kept.scores)
@@ -251,7 +251,7 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
     n = len(kept.scores) + len(kept.skipped) + len(kept.unscored)
     if kept.skipped:
         lines.append(
-            f"{len(kept.skipped)} of {n} scenes have no prediction and are left out, as the original evaluator does; "
+            f"{len(kept.skipped)} of {n} scenes have no prediction and are skipped, as in the original evaluator; "
             f"their objects do not count as missed: {some_names(kept.skipped)}"
         )
     if kept.missed:
@@ -268,23 +268,23 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
     if evaluation.with_ones is not None:
         shown = ", ".join(f"{name} {100 * evaluation.with_ones[name]:.1f}" for name in rules.headline)
         return [
-            "the confidences in the files count, as the official script takes them; numbers published under this "
-            f"protocol have 1 for every mask, which gives {shown}"
+            "the confidences in the files are used, as in the official script; numbers published under this "
+            f"protocol use 1 for every mask, which gives {shown}"
         ]
     if rules.confidence == "ones" and not file_confidences:
         differ = (
-            f"; those of the files, {confidences[0]:g} to {confidences[1]:g}, do not count"
+            f"; those in the files ({confidences[0]:g} to {confidences[1]:g}) are ignored"
             if confidences[0] < confidences[1]
             else ""
         )
-        return [f"the protocol has 1 for every confidence{differ}: AP of a class is then recall (1 + precision) / 2"]
+        return [f"all confidences are 1{differ}: AP equals recall x (1 + precision) / 2"]
     if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
-        return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP of a class is then recall (1 + precision) / 2"]
+        return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP equals recall x (1 + precision) / 2"]
     return []
 
 
 def some_names(names: Sequence[str]) -> str:
-    """The first five of ``names``, and how many more there are."""
+    """The first five of ``names`` and the number of further ones."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 

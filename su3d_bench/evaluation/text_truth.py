@@ -1,8 +1,4 @@
-"""Ground truth in text files: class ids, class id * 1000 + instance, or numbers of objects alone.
-
-ScanNet's scripts read one file as class ids or as class id * 1000 + instance, by what they evaluate; OpenSUN3D's has
-numbers alone. Which of them a file holds is told from its values only where no other reading is possible.
-"""
+"""Ground truth in text files: class ids, class id * 1000 + instance, or object numbers only."""
 
 from __future__ import annotations
 
@@ -213,13 +209,13 @@ class TextTruths(SceneTruths):
 def text_scenes(folder: Path) -> dict[str, Path]:
     """Scene -> its file in a folder of ground truth."""
     if not folder.is_dir():
-        raise DataError(f"{shown(folder)}: no such folder; give the one with <scene>.txt, one value a point")
+        raise DataError(f"{shown(folder)}: no such folder; give the one with <scene>.txt, one value per point")
     with converted(PredictionError, DataError):
         files = scene_files(folder, (".txt",))
     if odd := next((name for name in files if not name.isprintable()), None):
         raise DataError(f"{shown(folder)}: holds a file '{printable(odd, 80)}'; name files after scenes")
     if not files:
-        raise DataError(f"{shown(folder)}: has no .txt file; expected <scene>.txt, one value a point")
+        raise DataError(f"{shown(folder)}: has no .txt file; expected <scene>.txt, one value per point")
     return files
 
 
@@ -229,11 +225,13 @@ def read_values(path: Path) -> Int64Array:
     with converted(PredictionError, DataError), reading(where, DataError):
         values = integer_lines(file_bytes(path), where).astype(np.int64)
     if not 0 < len(values) <= MOST_POINTS:
-        raise DataError(f"{where}: has {len(values)} values; expected one a point of the scene")
+        raise DataError(f"{where}: has {len(values)} values; expected one per point of the scene")
     is_wrong = (values < 0) | (values > LARGEST_VALUE)
     if is_wrong.any():
         line = int(np.argmax(is_wrong))
-        raise DataError(f"{where}:{line + 1}: {int(values[line])} is no class id * 1000 + instance; expected 0 or more")
+        raise DataError(
+            f"{where}:{line + 1}: {int(values[line])} is not class id * 1000 + instance; expected 0 or more"
+        )
     return values
 
 

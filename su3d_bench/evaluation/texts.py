@@ -59,7 +59,7 @@ class GivenTexts:
         return digest_file(self._given.path)
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise PredictionError(f"{shown(self._given.path)}: has features of texts, not of images")
+        raise PredictionError(f"{shown(self._given.path)}: has text features, not image features")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         rows = [self._row_of.get(text, self._row_of.get(self._class_of.get(text, text), -1)) for text in texts]
@@ -77,7 +77,7 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
         arrays = read_npz(path, ("names", "features", "encoder"))
     names, features = arrays.get("names"), arrays.get("features")
     if names is None or features is None:
-        raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features a name")
+        raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features per name")
     are_arrays = names.ndim == 1 and names.dtype.kind == "U" and features.ndim == 2 and features.dtype.kind == "f"
     if not are_arrays or not 0 < len(names) == len(features) <= MOST_NAMES or not np.isfinite(features).all():
         raise DataError(
@@ -87,7 +87,7 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
     texts = tuple(str(name) for name in names)
     if len(set(texts)) < len(texts):
         twice = Counter(texts).most_common(1)[0][0]
-        raise DataError(f"{where}: '{printable(twice, 80)}' stands there twice; give each name once")
+        raise DataError(f"{where}: '{printable(twice, 80)}' occurs twice; give each name once")
     maker = arrays.get("encoder")
     if maker is not None and (maker.ndim != 0 or maker.dtype.kind != "U"):
         raise DataError(f"{where}: 'encoder' is {maker.shape} {maker.dtype.kind}; expected one text")
@@ -115,9 +115,9 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
         return embedded
     how = "give features of its class names with --text-features FILE.npz (names, features)"
     if rules.encoder is None:
-        return f"no encoder of {n_dimensions} dimensions is here to name the features with; {how}"
+        return f"no encoder with {n_dimensions} dimensions is available to classify the features; {how}"
     if (encoder := _real_encoder(rules.encoder)) is None:
-        return f"needs the encoder '{rules.encoder}' to name the features with, which is not here; {how}"
+        return f"needs the encoder '{rules.encoder}' to classify the features, which is not available; {how}"
     if encoder.dim != n_dimensions:
         return (
             f"the features have {n_dimensions} dimensions, those of the encoder '{rules.encoder}' {encoder.dim}; {how}"
@@ -159,9 +159,9 @@ def named_texts(rules: ProtocolRules, queries: Path | None) -> dict[str, tuple[s
     ``ConfigError`` where it compares none, where it has classes and a file is given, or has none and there is no file.
     """
     if rules.prompt is None and not rules.prompts:
-        raise ConfigError(f"protocol '{rules.name}' compares no features with texts; there is nothing to encode")
+        raise ConfigError(f"protocol '{rules.name}' does not compare features with texts; there is nothing to encode")
     if rules.classes and queries is not None:
-        raise ConfigError(f"protocol '{rules.name}' has classes of its own as texts; leave --queries out")
+        raise ConfigError(f"protocol '{rules.name}' uses its classes as texts; remove --queries")
     if not rules.classes and queries is None:
         raise ConfigError(
             f"protocol '{rules.name}' has no texts of its own; give them with --queries FILE: .toml or .csv as "

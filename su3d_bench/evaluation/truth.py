@@ -155,7 +155,7 @@ class DatasetTruths(SceneTruths):
             return question_truth(rules, self._dataset, scene, truth)
         assert self._queries is not None
         if scene not in self._queries:
-            raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
+            raise GroundTruthMissing(f"{self.where}/{scene}: the query file has no queries for this scene")
         truth = self._truth(scene, self._dataset.variants[0])
         dataset, where = self._dataset, f"{self.where}/{scene}"
         is_grouped = rules.kind == "grounding" and isinstance(dataset, NamesCategories)
@@ -183,7 +183,7 @@ def _dataset_of(sources: Sequence[Source]) -> str:
         return of_names.pop()
     hint = dataset_of_names(names)
     what = f"--dataset {hint}" if hint else "--dataset NAME"
-    raise ConfigError(f"evaluate: against which ground truth? name one with {what} or --ground-truth DIR")
+    raise ConfigError(f"evaluate: no ground truth given; name it with {what} or --ground-truth DIR")
 
 
 def open_dataset(name: str) -> Any:
@@ -271,7 +271,7 @@ def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRel
     if request.dataset is not None:
         if request.dataset not in each:
             hint = suggest(request.dataset, each)
-            raise ConfigError(f"{where}: has no labels of '{request.dataset}', only of {', '.join(each)}{hint}")
+            raise ConfigError(f"{where}: has no labels for '{request.dataset}', only for {', '.join(each)}{hint}")
         return each[request.dataset]
     if len(each) == 1:
         return next(iter(each.values()))
@@ -282,7 +282,7 @@ def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRel
         if any(one.partition("/")[0] == name or _names_one(one, release.scenes()) for one in asked)
     ]
     if len(fitting) != 1:
-        raise ConfigError(f"{where}: has labels of {', '.join(each)}; say of which with --dataset NAME")
+        raise ConfigError(f"{where}: has labels for {', '.join(each)}; choose one with --dataset NAME")
     return each[fitting[0]]
 
 
