@@ -29,7 +29,7 @@ ENOUGH = "size=64m"
 WRONG_INPUT = 2  # exit code of the command: nothing that it could do
 KINDS = {
     "run folder on a full disk": "the disk is full; free some space",
-    "cache on a full disk": "the perception cache cannot be written (No space left on device)",
+    "cache on a full disk": "cannot write the perception cache (No space left on device)",
     "disk that turns read-only": "the folder is read-only; choose another with --out",
 }
 

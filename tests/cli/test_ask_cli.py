@@ -147,10 +147,10 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
         (f"query text {SCENE} x --run runs/made --method opensud", "by opensud; did you mean 'opensu3d'?"),
         (f"query ask {SCENE} x --names refined", "has no labels n'; make them with su3d-bench runs refine"),
         (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers of metres"),
-        (f"query ask {SCENE} x --solver llm --offline", "holds no reply to this ask request"),
+        (f"query ask {SCENE} x --solver llm --offline", "no stored reply to this ask request"),
         (
             f"query ask {SCENE} x --solver llm --base-url http://a:b@c/v1",
-            "--base-url: language.base_url = 'http://a:b@c/v1': holds a name, a password or a query; keys belong in",
+            "--base-url: language.base_url = 'http://a:b@c/v1': contains credentials or a query; set keys in",
         ),
         (
             f"query ask {SCENE} x --solver llm --set perception.cache=false",

@@ -233,7 +233,7 @@ def test_a_map_without_features_cannot_be_queried(capsys: pytest.CaptureFixture[
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "text", "painted/a", "sofa", "--method", "oracle"]) == 2
-    assert "query: this map has no features to compare a text with" in capsys.readouterr().err
+    assert "query: the map has no features to compare with text" in capsys.readouterr().err
 
 
 # what options of several verbs do

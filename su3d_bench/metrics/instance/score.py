@@ -21,7 +21,7 @@ from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, pre
 from su3d_bench.metrics.protocols.kinds import AP_NAMES
 from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
-CONSTANT_CONFIDENCE = "every confidence is"
+CONSTANT_CONFIDENCE = "all confidences are"
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
 OBJECT = 1  # the one label that all have where the protocol has no classes
 NO_OBJECT = 0

@@ -80,7 +80,7 @@ def test_sentences_are_read_from_the_files_of_scanrefer_and_nr3d(tmp_path: Path)
     assert read_foreign_queries(tmp_path / "nr3d.csv") == {"scene0011_00": (TextQuery("the chair, brown", (5,)),)}
     asked = {"scene_id": "scene0011_00", "situation": "", "question": "Is it red?", "question_id": 1}
     (tmp_path / "v1_questions_val.json").write_text(json.dumps({"questions": [asked]}))
-    with pytest.raises(DataError, match="SQA3D names no objects"):
+    with pytest.raises(DataError, match="SQA3D has no answer objects"):
         read_foreign_queries(tmp_path / "v1_questions_val.json")
 
 

@@ -90,5 +90,5 @@ def test_offline_answers_from_the_kept_replies_alone(
     folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(llm(server, "--offline")) == 2
-    assert "holds no reply to this ask request of model 'tiny'" in capsys.readouterr().err
+    assert "no stored reply to this ask request of model 'tiny'" in capsys.readouterr().err
     assert server.n_asked == 0
