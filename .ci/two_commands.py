@@ -169,7 +169,9 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     server.files[f"/sam/{SAM}"] = Served(sam.content, breaks_after=[50_000])
     expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "the same command goes on from there")
     assert not here(place), "something damaged is taken for whole"
-    expect("the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (agrees with: published SHA-256)")
+    expect(
+        "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
+    )
     assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was taken up"
     assert here(place) == {*HUB, "sam-vit-h", "ram-plus"}
 
@@ -189,7 +191,7 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
     server.files[f"/{REPLICA}"] = Served(archive.content, breaks_after=[len(archive.content) // 2])
     expect("break in the middle", fetch("replica", *once), 2, "the same command goes on from there")
     assert not (place.data / "Replica").exists()
-    expect("the same again", fetch("replica", *once), 0, "(no checksum is stated; recorded)")
+    expect("the same again", fetch("replica", *once), 0, "(no published checksum; recorded)")
     expect("checked", place.run("datasets", "check", "replica/*", "--quick"), 0, "replica/office4")
 
 

@@ -171,7 +171,7 @@ def _refuse_other_evaluation(out: Path, record: records.RunRecord, metrics: reco
         other = "numbers, though of the same files" if there.code == record.code else "numbers of another version"
     if other is not None:
         raise StoreError(
-            f"{shown(out)}: holds a different evaluation (other {other}); choose another folder with --out, or remove it"
+            f"{shown(out)}: holds a different evaluation (other {other}); choose another --out, or remove the folder"
         )
 
 

@@ -125,7 +125,7 @@ def test_the_command_prints_marks_the_best_and_says_what_is_left_out(
     assert main(["report", "leaderboard", str(runs), "--intervals"]) == 0
     shown = capsys.readouterr()
     assert "| collector " in shown.out and "**" in shown.out and "Left out: ann/first" in shown.out
-    assert "3 entries in 2 rankings, 1 left out" in shown.err
+    assert "3 entries in 2 rankings, 1 excluded" in shown.err
     page = tmp_path / "board.html"
     assert main(["report", "leaderboard", str(runs), "--format", "html", "--out", str(page)]) == 0
     assert page.read_text().startswith("<!")

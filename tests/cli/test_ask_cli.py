@@ -134,7 +134,7 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run"]) == 0
-    assert "nothing to pay" in capsys.readouterr().out
+    assert "no cost" in capsys.readouterr().out
     assert server.n_asked == 0
     assert not Path("runs/made/language").exists()
 
@@ -145,8 +145,8 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
         (f"query ask {SCENE} ' '", "the question is empty"),
         ("query ask rooms/none x", "no run in runs/ holds rooms/none by opensu3d"),
         (f"query text {SCENE} x --run runs/made --method opensud", "by opensud; did you mean 'opensu3d'?"),
-        (f"query ask {SCENE} x --names refined", "has no labels n'; make them with su3d-bench runs refine"),
-        (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers of metres"),
+        (f"query ask {SCENE} x --names refined", "no labels n'; create them with su3d-bench runs refine"),
+        (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers (metres)"),
         (f"query ask {SCENE} x --solver llm --offline", "no stored reply to this ask request"),
         (
             f"query ask {SCENE} x --solver llm --base-url http://a:b@c/v1",
@@ -154,7 +154,7 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
         ),
         (
             f"query ask {SCENE} x --solver llm --set perception.cache=false",
-            "only perception.language.KEY=VALUE is of use here",
+            "only perception.language.KEY=VALUE can be set here",
         ),
     ],
 )
@@ -195,7 +195,7 @@ def test_labels_n_prime_by_a_model_are_asked_for_once(
     assert main(words) == 0
     said = capsys.readouterr()
     assert "10  bed -> furniture" in said.out
-    assert "label n stays for 1 instance: the model refused" in said.err
+    assert "label n unchanged for 1 instance: the model refused" in said.err
     records = (job.path / "refined_names.json").read_bytes()
     assert server.n_asked == 4
     assert main([*words, "--offline"]) == 0
@@ -209,7 +209,7 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     server.answer = lambda body: Answered("tile wall" if "basin" in body["messages"][1]["content"] else "furniture")
     words = ["runs", "refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
     assert main(words) == 0
-    assert "30  left out: 'tile wall' is background" in capsys.readouterr().out
+    assert "30  excluded: 'tile wall' is background" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "How many things are there?", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])

@@ -75,7 +75,7 @@ def test_what_is_cleared_is_of_the_cache_alone_and_replies_only_by_name(
     assert "perception: 1 file, 0.0 MB would be removed" in capsys.readouterr().out
     assert held(capsys) == before
     assert main(["dev", "cache", "clear", "all"]) == 0
-    assert "su3d-bench dev cache clear replies removes them" in capsys.readouterr().err
+    assert "to remove them: su3d-bench dev cache clear replies" in capsys.readouterr().err
     assert held(capsys) == {"perception": 0, "model-digests": 0, "runs": 0, "replies": 1}
     assert main(["dev", "cache", "clear", "replies"]) == 0
     assert sum(held(capsys).values()) == 0

@@ -96,9 +96,9 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             f"query text {PAINTED}/a x",
             f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
-        ("query text rooms/living0 '  '", "the text is empty; say what to look for"),
+        ("query text rooms/living0 '  '", "the text is empty; use for example"),
         ("query text rooms/living0 x --run r", "r: holds no run; name the folder of one: su3d-bench runs list"),
-        ("query text 'a plant' rooms/living0", "'a plant' is no scene: the scene comes first, then the text;"),
+        ("query text 'a plant' rooms/living0", "'a plant' is not a scene; give the scene first, then the text:"),
         ("run living0", "no scene matches 'living0'; did you mean 'rooms/living0'?"),
         ("run rooms", "'rooms' is a dataset; name its scenes, such as 'rooms/*'"),
         ("run --methods oracle rooms/living0", "--methods rooms/living0: is a scene; write it before the"),
@@ -262,7 +262,7 @@ def test_json_is_a_switch_or_names_a_file(words: list[str], is_printed: bool, fi
 
 
 def test_json_takes_no_other_file_for_its_own() -> None:
-    with pytest.raises(ConfigError, match=r"report verify: --json paper\.tex: a file for JSON ends in \.json"):
+    with pytest.raises(ConfigError, match=r"report verify: --json paper\.tex: expected a file that ends in \.json"):
         build_parser().parse_args(["report", "verify", "--json", "paper.tex"])
 
 

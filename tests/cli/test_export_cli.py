@@ -101,7 +101,7 @@ def test_the_only_method_of_a_limited_run_is_meant_and_called_partial(
     assert Path("part/scenes/painted.a/oracle/prediction.npz").is_file()  # the ceiling
     assert main(["runs", "export", "part", "--to", "openlex3d", "--out", "x"]) == 0
     assert len(np.load("x/painted/a/embeddings.npy")) == 4
-    assert "painted/a: partial: the map is of the first 2 updates of the scene\n" in capsys.readouterr().err
+    assert "painted/a: partial: the map uses only the first 2 updates\n" in capsys.readouterr().err
 
 
 def test_predictions_of_other_programs_are_exported(
@@ -124,9 +124,9 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     run_folder: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     r = run_folder
-    assert "holds the maps of collector, oracle; choose one with --method" in error_of(capsys, r, "--to", "openlex3d")
+    assert "has maps of collector, oracle; choose one with --method" in error_of(capsys, r, "--to", "openlex3d")
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "colector")
-    assert "holds no map of the method 'colector'; did you mean 'collector'?" in message
+    assert "no map of method 'colector'; did you mean 'collector'?" in message
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "collector", "--scenes", "painted/z")
     assert "no scene of r matches 'painted/z'; did you mean" in message
     assert "has no features" in error_of(capsys, r, "--to", "openlex3d", "--method", "oracle")

@@ -45,7 +45,7 @@ SLIPS: dict[str, tuple[str, int, str]] = {
         2,
         f"{OTHER}method collector@drop=1 is new, protocol rooms-instance is not asked for now)",
     ),
-    "removed without a word": ("runs remove runs/demo", 2, "su3d-bench: runs remove: nobody is there to be"),
+    "removed without a word": ("runs remove runs/demo", 2, "su3d-bench: runs remove: no terminal to ask for"),
     "removed through a link": ("runs remove link --yes", 2, "su3d-bench: link: is a link; name the folder"),
     "compared with itself": ("compare runs/demo runs/demo", 2, "su3d-bench: runs/demo: both sides are the same"),
     "a table over its record": (

@@ -39,7 +39,7 @@ def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.Captu
     text = told(capsys, "show", "conceptgraphs-detector")
     assert "[method.conceptgraphs-detector]" in text
     assert "# mAcc 38.72, F-mIoU 35.82: ConceptGraphs (Gu et al.), Table II" in text
-    assert "# as reported, each in its own set-up; no two need be comparable" in text
+    assert "# published results; set-ups differ, so they may not be comparable" in text
     value = json.loads(told(capsys, "show", "conceptgraphs-detector", "--json"))
     assert len(value["published"]) == len(figures_of(method="conceptgraphs-detector"))
     assert value["settings"]

@@ -58,7 +58,7 @@ def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
     lines = {line.split()[0]: line for line in out.splitlines()}
     assert set(lines) == set(MODELS)
     assert lines["clip-vit-h-14"].split()[1:] == ["encoder", "3.9", "GB", "MIT", "missing", "(profile", "paper)"]
-    assert f"{len(MODELS)} missing; su3d-bench models check clip-vit-h-14 says what to fetch" in err
+    assert f"{len(MODELS)} missing; su3d-bench models check clip-vit-h-14 shows what to download" in err
 
 
 def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,7 +81,7 @@ def test_check_names_what_is_wrong_and_answers_1(found: Path, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["models", "check"], "none of the models is here"),
+        (["models", "check"], "no models found"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),
         (["models", "warm", "clip-vit-b-32"], "run: su3d-bench models fetch clip-vit-b-32"),
         (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
@@ -137,7 +137,7 @@ def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: P
 
 def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
-    assert "which is not here" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))
+    assert "which is not available" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))
     shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")
     encoder = encoder_for(rules, CLIP_DIM, None, is_own=False)
     assert isinstance(encoder, Encoder)

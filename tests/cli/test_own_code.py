@@ -180,7 +180,7 @@ def test_the_method_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[
     (text,) = [block for block in blocks("docs/own-code.md", "python") if "class " in block]
     Path("my_method.py").write_text(text)
     assert main(["methods", "check", METHOD]) == 0
-    assert "instances, with features: nothing found wrong" in capsys.readouterr().out
+    assert "instances, with features: OK" in capsys.readouterr().out
 
 
 def results(folder: str) -> dict[tuple[str, str], dict[str, float]]:
@@ -196,7 +196,7 @@ def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: py
     Path("mine.toml").write_text(Path("mine.toml").read_text().replace("rooms-instance", "replica-openmask3d"))
     scenes, methods = "own/my_rooms.py:MyRooms/*", "merge_all.py:MergeAll"
     assert main(["datasets", "check", scenes]) == 0
-    assert capsys.readouterr().out.count("nothing found wrong") == 2
+    assert capsys.readouterr().out.count("OK") == 2
     words = ["run", "--scenes", scenes, "--methods", methods, "--profile", "oracle", "--jobs", "1", "--out", "run"]
     assert main([*words, "--no-pictures", "--protocols", "mine.toml"]) == 0
     assert results("run")["merge-all", "mine"]["AP25"] == 1.0
@@ -216,7 +216,7 @@ def test_the_method_runs_on_the_built_in_rooms() -> None:
         (["methods", "new", "there.py"], "is there already"),
         (["methods", "new", "my_method.txt"], "must end in .py"),
         (["protocols", "new", "mine.py"], "must end in .toml"),
-        (["datasets", "new", "3.py"], "no name can be made"),
+        (["datasets", "new", "3.py"], "is not a valid name"),
     ],
 )
 def test_nothing_is_overwritten_and_no_file_gets_another_form(

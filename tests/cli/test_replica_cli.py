@@ -70,7 +70,7 @@ def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothi
     assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scenes"] == [
-        {"scene": "bathroom0", "status": "was there already", "address": "replica/bathroom0"}
+        {"scene": "bathroom0", "status": "already present", "address": "replica/bathroom0"}
     ]
 
 
@@ -94,10 +94,10 @@ def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["datasets", "make", "rooms", "--layout", "replica"], "datasets make --layout replica: say where with --out"),
-        (["datasets", "make", "replica"], "datasets make replica: its scenes are not made here; known: rooms"),
+        (["datasets", "make", "rooms", "--layout", "replica"], "datasets make --layout replica: name the folder with --out"),
+        (["datasets", "make", "replica"], "datasets make replica: scenes of this dataset cannot be generated; known: rooms"),
         (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
-        (["datasets", "make", "rooms", "--scenes", "replica/*"], "'replica/*' is no scene of it; expected 'rooms/...'"),
+        (["datasets", "make", "rooms", "--scenes", "replica/*"], "no scene 'replica/*'; expected 'rooms/...'"),
         (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),
         ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file stands where a folder should be"),
     ],

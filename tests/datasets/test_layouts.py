@@ -124,7 +124,7 @@ def test_the_verb_makes_each_layout_and_the_same_command_again_does_nothing(
     assert capsys.readouterr().out.split() == [ROOM, "made", address]
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scenes"] == [
-        {"scene": ROOM, "status": "was there already", "address": address}
+        {"scene": ROOM, "status": "already present", "address": address}
     ]
     assert main([*words, "--set", "n_frames=3"]) == 2
     said = capsys.readouterr()

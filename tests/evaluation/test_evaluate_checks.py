@@ -38,7 +38,7 @@ def test_empty_double_and_foreign_masks_are_warned_of_with_their_index(tmp_path:
     assert "1 of class 1 (wall); the first is mask 4" in said(
         found, f"{where}1 of 5 masks has a class that is not scored"
     )
-    assert said(found, "every confidence is 1")
+    assert said(found, "all confidences are 1")
     assert found["duplicates"] == {"near": 3, "identical": 1}
 
 

@@ -148,7 +148,7 @@ def test_the_dataset_is_told_from_the_names_of_the_scenes(release: Path, dataset
 
 
 def test_predictions_of_several_datasets_are_scored_one_dataset_at_a_time(release: Path) -> None:
-    with pytest.raises(ConfigError, match=r"lex: has labels of scannetpp, hm3d; say of which with --dataset NAME$"):
+    with pytest.raises(ConfigError, match=r"lex: has labels for scannetpp, hm3d; choose one with --dataset NAME$"):
         found(release, ".")
     for asked in ({"dataset": "hm3d"}, {"scenes": (HM3D,)}, {"scenes": ("hm3d/*",)}):
         result = found(release, ".", **asked)

@@ -114,7 +114,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     assert {entry["profile"] for entry in entries.values()} == {"made elsewhere"} and not board["refused"]
     answered(capsys, "check", "--learn", RUN, "--out", "reference.json")
     assert answered(capsys, "check", RUN, "--against", "reference.json").startswith("passed")
-    assert "predictions made elsewhere bring no times" in answered(capsys, "report", "timing", RUN, code=2)
+    assert "imported predictions have no timings" in answered(capsys, "report", "timing", RUN, code=2)
     words = ("sheets", "make", RUN, "--kind", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
     answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
     assert Path("sheets").is_dir()
@@ -141,7 +141,7 @@ def test_the_same_again_leaves_the_folder_as_it_is_and_another_evaluation_is_ref
     before = files_of(RUN)
     capsys.readouterr()
     assert both() == 0
-    assert f"run folder: {RUN} (held this evaluation already, and is as it was)" in capsys.readouterr().err
+    assert f"run folder: {RUN} (unchanged: has this evaluation already)" in capsys.readouterr().err
     others = (
         ([*BOTH, "--protocol", "rooms-instance", "--out", RUN], "protocols"),
         (["evaluate", "predA", "--name", "mine", *BOTH[4:], *PROTOCOLS, "--out", RUN], "methods"),
@@ -170,7 +170,7 @@ def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys:
     Path(RUN, "run.json").write_text(json.dumps(record))
     capsys.readouterr()
     assert both() == 2
-    assert f"{RUN}: holds a run, and no evaluation of predictions made elsewhere" in capsys.readouterr().err
+    assert f"{RUN}: holds a run that is not an evaluation of external predictions" in capsys.readouterr().err
 
 
 @pytest.fixture

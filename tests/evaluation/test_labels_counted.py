@@ -134,4 +134,7 @@ def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: 
         return scoring._score(rules, name, ScenePrediction(name, "x", Path("x"), content), ContentFacts.of(content))
 
     assert [scored("a", ranked), scored("b", ranked)] == [None, None]
-    assert scored("c", named) == "gives one label of a point, and the top 5 labels in the scenes before; give all alike"
+    assert (
+        scored("c", named)
+        == "gives one label per point, but earlier scenes the top 5 labels; use the same number in all scenes"
+    )

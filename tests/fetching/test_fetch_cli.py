@@ -71,7 +71,7 @@ def test_nothing_is_fetched_before_its_licence_is_accepted(
     words = ["models", "fetch", "sam-vit-h", "--sources", sam(server, tmp_path)]
     code, _, err = called(words, capsys)
     assert code == 2 and not server.asked
-    assert err.splitlines()[-1].endswith("of sam-vit-h was not accepted; read it, then add --accept sam-vit-h")
+    assert err.splitlines()[-1].endswith("of sam-vit-h not accepted; read it, then add --accept sam-vit-h")
     assert "MIT: https://example.org/licence" in err.splitlines()[0]  # size and licence are shown first
     assert called([*words, "--accept", "GPL"], capsys)[0] == 2
     for accepted in ("sam-vit-h", "mit", "models"):
@@ -84,11 +84,11 @@ def test_a_checkpoint_comes_to_where_models_are_looked_for_and_is_not_fetched_tw
 ) -> None:
     words = ["models", "fetch", "sam-vit-h", "--accept", "MIT", "--sources", sam(server, tmp_path)]
     code, out, _ = called(words, capsys)
-    assert code == 0 and "(agrees with: published SHA-256)" in out
+    assert code == 0 and "(verified against: published SHA-256)" in out
     assert (tmp_path / "models/sam-vit-h" / SAM).is_file() and left(tmp_path / "models") == NOTHING_LEFT
     n_asked = len(server.asked)
     code, out, _ = called(words, capsys)
-    assert code == 0 and "was there already" in out and len(server.asked) == n_asked
+    assert code == 0 and "already present" in out and len(server.asked) == n_asked
 
 
 def test_nothing_that_is_damaged_is_taken_for_a_model_and_the_next_call_goes_on(
@@ -196,7 +196,7 @@ def test_replica_comes_to_where_it_is_read_and_its_check_passes(
 ) -> None:
     data = tmp_path / "data"
     code, out, err = called(replica, capsys)
-    assert code == 0 and out.count("(no checksum is stated; recorded)") == 4
+    assert code == 0 and out.count("(no published checksum; recorded)") == 4
     assert f"that of this first download is recorded in {data}/.fetched/record.json" in err
     assert called(["datasets", "check", "replica/*"], capsys)[0] == 0
     assert left(data) == NOTHING_LEFT
@@ -204,7 +204,7 @@ def test_replica_comes_to_where_it_is_read_and_its_check_passes(
     meshes = {f"replica_v1/room_0/habitat/{name}" for name in ("mesh_semantic.ply", "info_semantic.json")}
     assert {name for name in found if name.startswith("replica_v1")} == meshes
     n_asked = len(server.asked)
-    assert "was there already" in called(replica, capsys)[1] and len(server.asked) == n_asked
+    assert "already present" in called(replica, capsys)[1] and len(server.asked) == n_asked
 
 
 def test_what_no_publisher_states_is_held_against_the_first_download(
@@ -219,7 +219,7 @@ def test_what_no_publisher_states_is_held_against_the_first_download(
     assert code == 2 and f"that of the first download was {first}" in err and "record.json" in err
     server.files["/replica_v1_0.tar.gz.partab"] = part
     code, out, _ = called(replica, capsys)
-    assert code == 0 and "agrees with: SHA-256 of the first download" in out
+    assert code == 0 and "verified against: SHA-256 of the first download" in out
     assert called(["datasets", "check", "replica/*", "--quick"], capsys)[0] == 0
 
 
@@ -286,7 +286,7 @@ def test_scans_come_by_the_users_own_script_and_are_read(
     code, out, _ = called([*words, "--accept", "scannet"], capsys)
     assert code == 0 and out.count("recorded") == len(SUFFIXES) + 1
     assert_is_read(tmp_path, capsys)
-    assert "was there already" in called(words, capsys)[1]
+    assert "already present" in called(words, capsys)[1]
     assert not server.asked
 
 

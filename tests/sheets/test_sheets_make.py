@@ -161,7 +161,7 @@ def test_sheets_are_made_from_the_command_line(
     assert main(["sheets", "make", "run", "--kind", "annotation", "--out", "labels", "--quiet"]) == 0
     for wrong, line in (
         (words, "painted/a: no ground truth to generate questions from"),
-        ([*words, "--questions", "paper"], "asks nothing of a scene of this run"),
+        ([*words, "--questions", "paper"], "no question about a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
         (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "leave it out"),
     ):

@@ -1,4 +1,4 @@
-"""Which axis of a recording points up: guessed from cameras and level surfaces, said in rgbd.toml, turned to z."""
+"""Which axis of a recording points up: guessed from cameras and level surfaces, said in rgbd.toml, rotated to z."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
     said = 'z is taken to be up, but y seems to be (the cameras were held so); set up = "y" in rgbd.toml, or up = "z"'
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
-    assert "  up            taken to be z; y seems to be, the cameras were held so" in out and said in out
+    assert "  up            assumed z; y seems to be, the cameras were held so" in out and said in out
     assert main(["datasets", "show", "rgbd/walk", "--quiet", "--out", str(tmp_path / "walk.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["up"]["axis"] == "y"
     look = look_at(Rgbd(tmp_path), "walk")
@@ -110,4 +110,4 @@ def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
     write_recording(tmp_path, "y", up="y")
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
-    assert "  up            y, rgbd.toml says so; turned to z" in out and "seems to be" not in out
+    assert "  up            y, rgbd.toml says so; rotated to z" in out and "seems to be" not in out

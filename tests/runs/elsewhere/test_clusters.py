@@ -85,7 +85,7 @@ def test_a_run_on_a_cluster_that_is_asked_to_end_ends_in_order(cluster: Any) -> 
     workers_of(cluster.doomed)
     driver.send_signal(signal.SIGTERM)
     _, said = driver.communicate(timeout=WHILE_LOADED_S)
-    assert (driver.returncode, said) == (143, "su3d-bench: ended by SIGTERM; the same command takes it up again\n")
+    assert (driver.returncode, said) == (143, "su3d-bench: stopped by SIGTERM; the same command resumes\n")
     assert json.loads(Path("ended/run.json").read_text())["status"] == "interrupted"
 
 

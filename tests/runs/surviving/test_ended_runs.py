@@ -139,7 +139,7 @@ def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
         return
     how = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
     assert (code, run.log.read_text().splitlines()[-1]) == (
-        128 + number, f"su3d-bench: {how}; the same command takes it up again"
+        128 + number, f"su3d-bench: {how}; the same command resumes"
     )  # fmt: skip
     assert '"status": "interrupted"' in (run.place / "out" / "run.json").read_text()
     assert "Traceback" not in run.log.read_text()
