@@ -139,7 +139,7 @@ def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.
     rows = samples([run]).rows
     n_predicted = sum(row.kind == "predicted" for row in rows)
     printed = capsys.readouterr()
-    assert printed.out == f"{file}: {n_predicted} predicted instances, {len(rows) - n_predicted} true\n"
+    assert printed.out == f"{file}: {n_predicted} predicted instances, {len(rows) - n_predicted} ground-truth\n"
     assert {row["protocol"] for row in json.loads((tmp_path / "rows.json").read_text())} == {
         "rooms-instance", "rooms-semantic",
     }  # fmt: skip

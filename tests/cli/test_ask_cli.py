@@ -213,7 +213,7 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     assert main(["query", "ask", SCENE, "How many things are there?", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
-    assert told["names"] == "labels n' by tiny, without 1 that it leaves out"
+    assert told["names"] == "labels n' by tiny, without 1 excluded instances"
     assert main([*words, "--background-names", "bed"]) == 0
     assert "left out" not in capsys.readouterr().out
     assert main([*words, "--max-map-fraction", "0.05", "--json"]) == 0

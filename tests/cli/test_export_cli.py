@@ -128,7 +128,7 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "colector")
     assert "no map of method 'colector'; did you mean 'collector'?" in message
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "collector", "--scenes", "painted/z")
-    assert "no scene of r matches 'painted/z'; did you mean" in message
+    assert "r: no scene matches 'painted/z'; did you mean" in message
     assert "has no features" in error_of(capsys, r, "--to", "openlex3d", "--method", "oracle")
     message = error_of(capsys, r, "--to", "scannet", "--method", "oracle")
     assert "whose classes? name a protocol with --protocol" in message

@@ -64,7 +64,7 @@ def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
 def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check"]) == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[0] == f"clip-vit-b-32 (transformers): {found}: whole"
+    assert out.splitlines()[0] == f"clip-vit-b-32 (transformers): {found}: OK"
     assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["problems"] == []

@@ -213,7 +213,7 @@ def test_the_method_runs_on_the_built_in_rooms() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["methods", "new", "there.py"], "is there already"),
+        (["methods", "new", "there.py"], "exists; choose another name"),
         (["methods", "new", "my_method.txt"], "must end in .py"),
         (["protocols", "new", "mine.py"], "must end in .toml"),
         (["datasets", "new", "3.py"], "is not a valid name"),

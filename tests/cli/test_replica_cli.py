@@ -65,7 +65,7 @@ def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothi
     words = [*MAKE, "--layout", "replica", "--out", "made"]
     assert main(words) == 0
     said = capsys.readouterr()
-    assert said.out.split() == ["bathroom0", "made", "replica/bathroom0"]
+    assert said.out.split() == ["bathroom0", "generated", "replica/bathroom0"]
     assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in said.err
     assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
     assert main([*words, "--json"]) == 0
@@ -76,7 +76,7 @@ def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothi
 
 def test_native_layout_puts_the_scan_into_the_data_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main([*MAKE, "--out", "native"]) == 0
-    assert capsys.readouterr().out.split() == ["bathroom0", "made", "rooms/bathroom0"]
+    assert capsys.readouterr().out.split() == ["bathroom0", "generated", "rooms/bathroom0"]
     assert len(list((tmp_path / "native").rglob("bathroom0.npz"))) == 1
 
 
@@ -94,8 +94,8 @@ def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["datasets", "make", "rooms", "--layout", "replica"], "datasets make --layout replica: name the folder with --out"),
-        (["datasets", "make", "replica"], "datasets make replica: scenes of this dataset cannot be generated; known: rooms"),
+        (["datasets", "make", "rooms", "--layout", "replica"], "--layout replica: name the folder with --out"),
+        (["datasets", "make", "replica"], "replica: scenes of this dataset cannot be generated"),
         (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
         (["datasets", "make", "rooms", "--scenes", "replica/*"], "no scene 'replica/*'; expected 'rooms/...'"),
         (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),

@@ -104,10 +104,10 @@ def test_queries_are_encoded_from_every_form_in_which_they_come(
 REFUSED = [
     (["--protocol", "rooms-semantic"], "protocol 'rooms-semantic' has no encoder; choose one with --encoder: embedded"),
     (["--protocol", "rooms-semantic", "--encoder", "embeded"], "unknown encoder 'embeded'; did you mean 'embedded'?"),
-    (["--protocol", "class-agnostic-open3dis"], "compares no features with texts; there is nothing to encode"),
-    (["--protocol", "rooms-semantic", "--queries", "q.txt"], "has classes of its own as texts; leave --queries out"),
+    (["--protocol", "class-agnostic-open3dis"], "does not compare features with texts; there is nothing to encode"),
+    (["--protocol", "rooms-semantic", "--queries", "q.txt"], "uses its classes as texts; remove --queries"),
     (["--protocol", "query-ap", "--queries", "q.txt", "--encoder", "embedded"], "q.txt: is not there"),
-    (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "texts.txt"], "expected a file that ends in .npz"),
+    (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "t.txt"], "expected a file that ends in .npz"),
 ]  # fmt: skip
 
 

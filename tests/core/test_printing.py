@@ -106,4 +106,4 @@ def shell(command: str) -> subprocess.CompletedProcess[str]:
 def test_who_does_not_read_the_answer_leaves_the_code_as_it_is(command: str, code: int, n_lines: int) -> None:
     done = shell(command)
     assert (done.returncode, done.stderr.count("\n")) == (code, n_lines), done.stderr
-    assert not n_lines or done.stderr.startswith("su3d-bench: stdout: write error (No space left on device; ")
+    assert not n_lines or done.stderr.startswith("su3d-bench: stdout: write error (No space left on device); ")

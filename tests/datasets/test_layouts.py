@@ -121,7 +121,7 @@ def test_the_verb_makes_each_layout_and_the_same_command_again_does_nothing(
     words += ["--out", str(tmp_path / "made")]
     assert main(words) == 0
     address = f"{LAYOUTS[name].reader}/{ADDRESS[name]}"
-    assert capsys.readouterr().out.split() == [ROOM, "made", address]
+    assert capsys.readouterr().out.split() == [ROOM, "generated", address]
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scenes"] == [
         {"scene": ROOM, "status": "already present", "address": address}

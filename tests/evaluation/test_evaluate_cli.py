@@ -55,11 +55,11 @@ def test_the_json_file_has_the_promised_form(capsys: pytest.CaptureFixture[str])
 
 
 WRONG = {
-    "": "evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS",
+    "": "evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS",
     "pred --out runs/mine --name ../up --ground-truth gt": "--name: '../up' cannot be the name of a folder",
     "prde --ground-truth gt": "prde: no such file or folder; give the folder of the predictions",
-    "pred": "evaluate: against which ground truth? name one with --dataset scannet or --ground-truth DIR",
-    "pred --ground-truth .": ".: has no .txt file; expected <scene>.txt, one value a point",
+    "pred": "evaluate: no ground truth given; name it with --dataset scannet or --ground-truth DIR",
+    "pred --ground-truth .": ".: has no .txt file; expected <scene>.txt, one value per point",
     "pred --ground-truth gt --protocol scannet-instances": "unknown protocol 'scannet-instances'; did you mean",
     "pred --ground-truth gt --format scanet-text": "unknown format 'scanet-text'; did you mean 'scannet-text'?",
     "pred --ground-truth gt --scenes scene0009_00": "no scene of gt matches 'scene0009_00'; did you mean",

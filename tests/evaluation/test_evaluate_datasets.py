@@ -154,7 +154,7 @@ def test_predictions_of_several_datasets_are_scored_one_dataset_at_a_time(releas
         result = found(release, ".", **asked)
         assert list(result["protocols"]["openlex3d-queries"]["per_scene"]) == [HM3D]
     assert any("of another dataset: scannetpp/0a76e06478" in line for line in result["remarks"])
-    with pytest.raises(ConfigError, match=r"lex: has no labels of 'replica', only of scannetpp, hm3d"):
+    with pytest.raises(ConfigError, match=r"lex: has no labels for 'replica', only for scannetpp, hm3d"):
         found(release, ".", dataset="replica")
 
 

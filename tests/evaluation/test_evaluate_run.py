@@ -149,12 +149,12 @@ def test_the_same_again_leaves_the_folder_as_it_is_and_another_evaluation_is_ref
     )
     for words, what in others:
         assert main(words) == 2
-        line = f"su3d-bench: {RUN}: holds another evaluation (other {what}); choose another folder with --out"
+        line = f"su3d-bench: {RUN}: holds a different evaluation (other {what}); choose another --out"
         assert capsys.readouterr().err.startswith(line)
     mask = next(Path("predB").glob("masks/a_0.txt"))
     mask.write_text(mask.read_text().replace("1", "0", 1))
     assert both() == 2
-    assert "holds another evaluation (other predictions)" in capsys.readouterr().err
+    assert "holds a different evaluation (other predictions)" in capsys.readouterr().err
     assert files_of(RUN) == before
     assert not [name for name in Path("runs").iterdir() if name.name != "both"]  # nothing is left of what was refused
 

@@ -137,7 +137,7 @@ def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
     if number == signal.SIGKILL:
         assert code == -signal.SIGKILL
         return
-    how = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    how = "interrupted" if number == signal.SIGINT else f"stopped by {number.name}"
     assert (code, run.log.read_text().splitlines()[-1]) == (
         128 + number, f"su3d-bench: {how}; the same command resumes"
     )  # fmt: skip
