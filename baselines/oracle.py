@@ -1,4 +1,4 @@
-"""The ground truth itself through the same evaluation steps: the truth's score of every protocol."""
+"""The ground truth itself through the same evaluation steps: GT ceiling of every protocol."""
 
 from __future__ import annotations
 

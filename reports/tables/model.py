@@ -14,12 +14,12 @@ def few_scenes(n_scenes: int) -> str | None:
     """What must stand beneath intervals over so few scenes; None where they are enough, or where none has any.
 
     >>> few_scenes(4)
-    'intervals over 4 scenes are rough, as all over fewer than 10: docs/numbers/statistics.md'
+    'intervals from fewer than 10 scenes are unreliable (here: 4): docs/numbers/statistics.md'
     """
     if not 1 < n_scenes < FEW_SCENES:
         return None
     return (
-        f"intervals over {n_scenes} scenes are rough, as all over fewer than {FEW_SCENES}: docs/numbers/statistics.md"
+        f"intervals from fewer than {FEW_SCENES} scenes are unreliable (here: {n_scenes}): docs/numbers/statistics.md"
     )
 
 

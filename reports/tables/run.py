@@ -172,12 +172,12 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, truth's score 97.1)``, by commas."""
+    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, GT ceiling 97.1)``, by commas."""
     parts = []
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]
         if result["ceiling"] is not None:
-            remarks.append(f"truth's score {percent(result['ceiling'].get(name))}")
+            remarks.append(f"GT ceiling {percent(result['ceiling'].get(name))}")
         parts.append(f"{name} {_value_text(result, name)} ({', '.join(remarks)})")
     return ", ".join(parts)
 
@@ -188,7 +188,7 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     title = f"{first['protocol']} (version {first['version']})"
     if metrics["is_partial"]:
         title += f": PARTIAL, only the first {counted(int(metrics['limit']), 'frame')} of each scene"
-    header = ["method", *names, f"truth's score ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
+    header = ["method", *names, f"GT ceiling ({' / '.join(names)})", "scenes", "coverage @ 2.5 / 5 / 10 cm"]
     body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
     body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]
@@ -287,7 +287,7 @@ def _numbers(scored: Mapping[str, Any]) -> list[list[str]]:
     rows = [["", *(NAMES.get(name, name) for name in names)]]
     rows.append(["result", *(with_interval(metrics[name], intervals.get(name)) for name in names)])
     other = ("mean of scenes", scored["scene_mean"]) if is_pooled else ("scenes pooled", scored["pooled"])
-    others = [other, ("the truth's score", scored["ceiling"])]
+    others = [other, ("GT ceiling", scored["ceiling"])]
     others.append(("every mask under every class", scored["every_mask_every_class"]))
     others.insert(1, ("with every confidence 1", scored["every_confidence_1"]))
     others += list(scored["groups"].items())

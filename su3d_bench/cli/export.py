@@ -268,7 +268,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
     if name is None:
         if len({(rules.ground_truth, rules.classes) for rules in fitting.values()}) != 1:
             known = ", ".join(fitting) or "none fits"
-            raise ConfigError(f"{dataset.name}: several class lists; choose a protocol with --protocol ({known})")
+            raise ConfigError(f"{dataset.name}: no default protocol; choose one with --protocol ({known})")
         return next(iter(fitting.values()))
     is_own = run is not None and not name.endswith(".toml") and name not in protocol_names()
     finished = read_run(run) if run is not None and is_own else None

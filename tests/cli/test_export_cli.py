@@ -131,7 +131,7 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     assert "r: no scene matches 'painted/z'; did you mean" in message
     assert "has no features" in error_of(capsys, r, "--to", "openlex3d", "--method", "oracle")
     message = error_of(capsys, r, "--to", "scannet", "--method", "oracle")
-    assert "whose classes? name a protocol with --protocol" in message
+    assert "no default protocol; choose one with --protocol" in message
     message = error_of(capsys, r, "--to", "scannet", "--method", "oracle", "--protocol", "rooms-semantic")
     assert "--protocol rooms-semantic: has no classes of instances" in message
     message = error_of(capsys, r, "--to", "openlex3d", "--protocol", "rooms-instance", "--method", "collector")

@@ -163,7 +163,10 @@ def test_sheets_are_made_from_the_command_line(
         (words, "painted/a: no ground truth to generate questions from"),
         ([*words, "--questions", "paper"], "no question about a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
-        (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "not valid for annotation"),
+        (
+            ["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"],
+            "not valid for annotation",
+        ),
     ):
         assert main(wrong) == 2
         assert line in capsys.readouterr().err
