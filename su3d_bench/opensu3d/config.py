@@ -1,6 +1,6 @@
-"""What OpenSU3D's paper fixes and what it leaves open, each as a named parameter with its default.
+"""Parameters of OpenSU3D: those the paper fixes and those it leaves open, with their defaults.
 
-Defaults are the paper's (section IV-A) where it states one; a comment says so where the choice is ours.
+Defaults are the paper's (section IV-A) where it states one; comments mark our own choices.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Fusion:
 _NARROW = (0.8, 1.0, 1.2)
 _WIDE = (1.0, 2.0, 4.0)
 # Scheme 4 is the "combination of updated multiview and multiscale features fusion formulation", so it keeps scheme 3's
-# crops; the paper names those for scheme 3 alone, which leaves the narrow ones possible too.
+# crops; the paper names these for scheme 3 only, so the narrow ones remain possible.
 SCHEMES: dict[Scheme, Fusion] = {
     "scheme1": Fusion("direct", "direct", _NARROW),
     "scheme2": Fusion("direct", "global", _NARROW),
@@ -46,15 +46,15 @@ INCREMENT = 0.2  # "a scaling ratio increment of 0.2"
 
 
 def crop_levels(k: int) -> tuple[float, ...]:
-    """The crop ratios of ``k`` levels: S_r = [0.8, 1, 1.2] for 3, and larger crops for more, as the paper says.
+    """The crop ratios of ``k`` levels: S_r = [0.8, 1, 1.2] for 3, with larger crops for more, as in the paper.
 
-    One level is the best-fit crop alone, which its equations compare with.
+    One level is only the best-fit crop, the reference of the fusion equations.
 
     >>> crop_levels(1), crop_levels(3), crop_levels(5)
     ((1.0,), (0.8, 1.0, 1.2), (0.8, 1.0, 1.2, 1.4, 1.6))
     """
     if not isinstance(k, int) or not 1 <= k <= 20:
-        raise ValueError(f"crop levels are a whole number from 1 to 20, not {k!r}")
+        raise ValueError(f"crop levels must be an integer from 1 to 20 ({k!r})")
     if k == 1:
         return (BEST_FIT_RATIO,)
     return tuple(round(_NARROW[0] + INCREMENT * level, 10) for level in range(k))
@@ -72,15 +72,15 @@ class OpenSU3DConfig(BaseModel):
 
     stride: int = Field(default=40, ge=1)
     border_px: float = Field(default=20.0, ge=0)
-    # The paper's 20 px belong to 1200x680 images; other widths take the same share of the image. 0: pixels as they are.
+    # The paper's 20 px belong to 1200x680 images; other widths use the same fraction of the width. 0: no ring.
     border_reference_width: int = Field(default=1200, ge=0)
     border_shape: Literal["disc", "square"] = "disc"
-    # What a ring's pixels that lie in another mask become in the map: points of no instance, for M' holds the ring and
-    # Eq. 1 back-projects M'; points of that mask's instance, once the matching has gone without them; or none at all.
+    # Ring pixels that lie in another mask: points of no instance in the map, because M' holds the ring and
+    # Eq. 1 back-projects M'; points of that mask's instance, excluded from matching; or no points.
     border_pixels: Literal["background", "owner", "drop"] = "background"
-    # Points of pixels in no mask: Eq. 1 back-projects every pixel.
+    # Pixels in no mask: Eq. 1 back-projects every pixel.
     background_pixels: Literal["keep", "drop"] = "keep"
-    # The head nouns of what is left out: the paper's "walls" are "brick wall" to a tagger, and "wall lamp" is a lamp.
+    # Head nouns of excluded labels: a tagger calls the paper's "walls" "brick wall"; "wall lamp" is a lamp.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling", "ground", "roof")
     max_box_fraction: Fraction = 0.95
     scheme: Scheme = "scheme1"
@@ -91,18 +91,18 @@ class OpenSU3DConfig(BaseModel):
     depth_min: float = Field(default=0.0, ge=0)
     depth_max: Metres = 10.0
     eps: Metres = 0.02
-    # The frame cloud holds one point a voxel of this side and an ID; unset, of eps, and 0 for every pixel.
+    # Voxel size of the frame cloud, one point per voxel and ID; unset: eps; 0: every pixel.
     frame_voxel: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     overlap_threshold: float = Field(default=0.3, ge=0)
     overlap_rule: OverlapRule = "smaller-segment"
-    # Which point goes where a new one meets a voxel of eps that is held: the scene's ("set of points from P'_scene can
-    # also be deleted to retain constant sparsity"), the new one, or neither.
+    # Which point is dropped when a new one meets an occupied voxel of side eps: the scene's ("set of points from
+    # P'_scene can also be deleted to retain constant sparsity"), the new one, or neither.
     density: Density = "scene"
     dbscan_eps: Metres = 0.1
     dbscan_min_points: int = Field(default=20, ge=1)
     split_fraction: Fraction = 0.8
-    # The paper ranks views, not instances, and the set-up that it takes for AP, OpenMask3D's, gives 1 to every mask.
-    # The others are made of the detector's scores of an instance's views; top-m-sum is the sum of the best m over m.
+    # The paper ranks views, not instances; the AP set-up it uses (OpenMask3D's) gives every mask confidence 1.
+    # The other rules use the detector scores of an instance's views; top-m-sum is the sum of the best m over m.
     instance_score: InstanceScore = "ones"
 
     @model_validator(mode="after")
@@ -110,20 +110,20 @@ class OpenSU3DConfig(BaseModel):
         fusion = self.fusion
         if fusion.multi_scale == "weighted" and BEST_FIT_RATIO not in fusion.crop_ratios:
             raise ValueError(
-                f"crop_ratios {fusion.crop_ratios} hold no 1.0; weighted multi-scale fusion compares with that crop"
+                f"crop_ratios: 1.0 is missing ({fusion.crop_ratios}); weighted multi-scale fusion needs that crop"
             )
         if self.border_pixels == "background" and self.background_pixels == "drop":
             raise ValueError(
-                "border_pixels 'background' makes points of rings that background_pixels 'drop' leaves out; set "
+                "border_pixels: 'background' conflicts with background_pixels 'drop'; set "
                 "border_pixels to 'drop' or 'owner'"
             )
         if self.depth_min >= self.depth_max:
-            raise ValueError(f"depth_min {self.depth_min} m is not below depth_max {self.depth_max} m")
+            raise ValueError(f"depth_min ({self.depth_min} m) must be below depth_max ({self.depth_max} m)")
         return self
 
     @property
     def voxel_of_frame(self) -> float:
-        """Side in metres of the voxels of the frame cloud, 0 for none."""
+        """Voxel size of the frame cloud in metres, 0 for none."""
         return self.eps if self.frame_voxel is None else self.frame_voxel
 
     @property
@@ -137,12 +137,12 @@ class OpenSU3DConfig(BaseModel):
         )
 
     def effective(self) -> dict[str, Any]:
-        """The settings with what follows from others written out, so that equal behaviour is equal."""
+        """The settings with derived values filled in, so that equal behaviour compares equal."""
         return {**self.model_dump(exclude={"scheme"}), "frame_voxel": self.voxel_of_frame, **asdict(self.fusion)}
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """What perception must supply, and which regions it leaves out."""
+        """Required perception outputs and excluded regions."""
         return PerceptionNeeds(
             masks="grounded",
             crop_ratios=self.fusion.crop_ratios,
@@ -152,6 +152,6 @@ class OpenSU3DConfig(BaseModel):
         )
 
     def border_in(self, image_width: int) -> int:
-        """Width of the ring in pixels of an image ``image_width`` wide."""
+        """Width of the ring in pixels for an image ``image_width`` pixels wide."""
         scale = image_width / self.border_reference_width if self.border_reference_width else 1.0
         return round(self.border_px * scale)

@@ -1,4 +1,4 @@
-"""The cloud of one image P_frame: back-projected pixels, each with the detection it belongs to."""
+"""The point cloud of one image (P_frame): back-projected pixels with their detections."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ NO_DETECTION = -1
 
 @dataclass(frozen=True)
 class IdImage:
-    """``ids`` (H, W) int32: the detection of each pixel, NO_DETECTION in a ring and in no mask; this is M'.
+    """``ids`` (H, W) int32: the detection of each pixel, NO_DETECTION in rings and outside masks; this is M'.
 
-    ``owner`` (H, W) int32 is the same before the rings were cut: it differs from ``ids`` in the rings alone.
+    ``owner`` (H, W) int32 is the same without rings: it differs from ``ids`` only in the rings.
     """
 
     ids: Int32Array
@@ -30,8 +30,8 @@ class IdImage:
 def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) -> IdImage:
     """The ID image of ``masks`` (K, H, W).
 
-    Larger masks are painted first, equal ones in order, so that where masks overlap the smaller one shows. Each mask
-    takes the ring of ``border_px`` around it from what was painted before.
+    Larger masks are painted first, equal ones in order, so that the smaller of two overlapping masks is visible. Each
+    mask erases a ring of ``border_px`` around it from the masks painted before.
     """
     from su3d_bench.opensu3d import kernels
 
@@ -48,7 +48,7 @@ def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) ->
 
 
 def _reach(radius: int, shape: Literal["disc", "square"]) -> Int64Array:
-    """How far the ring of one pixel goes along the rows 0, 1, ... ``radius`` off."""
+    """Half-width of the ring of one pixel, 0, 1, ... ``radius`` rows away."""
     rows = np.arange(radius + 1)
     furthest = np.array([isqrt(radius * radius - int(row) ** 2) for row in rows], np.int64)
     return np.full(radius + 1, radius, np.int64) if shape == "square" else furthest
@@ -56,11 +56,11 @@ def _reach(radius: int, shape: Literal["disc", "square"]) -> Int64Array:
 
 @dataclass(frozen=True)
 class FrameCloud:
-    """World points (N, 3) m, those inside masks first, then those of border rings, then those of no mask.
+    """World points (N, 3) in metres: inside masks, then in border rings, then outside masks.
 
-    ``owner`` (N,) holds detection indices, NO_DETECTION in no mask; the first ``n_inside`` points are the segments that
-    are matched and counted, the others have no instance in the ID image. ``n_swallowed`` detections lie in rings of
-    others with every pixel that smaller masks leave them, ``n_too_far`` pixels beyond ``depth_max``.
+    ``owner`` (N,) holds detection indices, NO_DETECTION outside masks; the first ``n_inside`` points are the segments
+    that are matched and counted, the others have no instance in the ID image. ``n_swallowed``: detections whose visible
+    pixels all lie in rings of other detections; ``n_too_far``: pixels beyond ``depth_max``.
     """
 
     points: Float64Array
@@ -73,7 +73,7 @@ class FrameCloud:
 def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> FrameCloud:
     """P_frame of one image.
 
-    Unless ``frame_voxel`` is 0 it is reduced to the first point of each voxel and detection (in and out of rings).
+    Unless ``frame_voxel`` is 0, only the first point per voxel and detection (inside and outside rings) remains.
     """
     painted = paint(masks, config.border_in(frame.depth_m.shape[1]), config.border_shape)
     pixels = valid_depth(frame.depth_m, config.depth_min, config.depth_max)
@@ -97,7 +97,7 @@ def _cloud(
 
     rings = {"owner": kernels.OWNED, "background": kernels.BACKGROUND, "drop": kernels.DROPPED}
     cloud: tuple[Float64Array, Int32Array, NDArray[np.int8]] = kernels.cloud(
-        np.require(frame.depth_m, requirements=["C", "W"]),  # one kind of array: no second compilation
+        np.require(frame.depth_m, requirements=["C", "W"]),  # one array layout: avoids a second compilation
         pixels,
         *ray_parts(frame.intrinsics, frame.camera_to_world, *frame.depth_m.shape),
         np.ascontiguousarray(frame.camera_to_world[:3, 3], np.float64),

@@ -10,13 +10,13 @@ from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.clusters import ABSENT, slot_of
 
 LABEL_SHIFT = 40  # a view spans fewer voxels than 2**39, at any voxel that a depth image can fill
-OWNED, BACKGROUND, DROPPED = 0, 1, 2  # what the pixels of a ring become
-UNUSED = -9  # no label: those are at least ABSENT * 3 + 2
+OWNED, BACKGROUND, DROPPED = 0, 1, 2  # treatment of ring pixels
+UNUSED = -9  # not a label: labels are at least ABSENT * 3 + 2
 
 
 @njit(cache=True, nogil=True)
 def extents(masks, areas, bounds):  # type: ignore[no-untyped-def]
-    """Writes the pixels of each mask (K, H, W) uint8 and its bounds: first row, last, first column, last."""
+    """Write the pixel count of each mask (K, H, W) uint8 and its bounds: first and last row, first and last column."""
     n_masks, height, width = masks.shape
     for k in range(n_masks):
         areas[k] = 0
@@ -42,10 +42,10 @@ def extents(masks, areas, bounds):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def paint(mask, k, bounds, reach, ids, owner):  # type: ignore[no-untyped-def]
-    """Paints one mask (H, W) uint8 into ``ids`` and ``owner``, and a ring of ABSENT around it into ``ids``.
+    """Paint one mask (H, W) uint8 into ``ids`` and ``owner``, and a ring of ABSENT around it into ``ids``.
 
-    ``reach[d]``: how far the ring goes along a row that lies ``d`` rows off. Each run of the mask marks where it begins
-    and ends to count in the rows around it, so that a row's ring is the running sum of its marks.
+    ``reach[d]``: half-width of the ring ``d`` rows away. Each run of the mask marks its start and end in the rows
+    around it, so that the ring of a row is the running sum of its marks.
     """
     height, width = mask.shape
     border = len(reach) - 1
@@ -86,7 +86,7 @@ def _grown(table, keys, n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _label_row(pixels, ids, owner, rings, drop_background, labels):  # type: ignore[no-untyped-def]
-    """Owner * 3 + rank of each pixel of a row, UNUSED where it makes no point; ranks as in ``cloud``."""
+    """Owner * 3 + rank of each pixel of a row, UNUSED where it gives no point; ranks as in ``cloud``."""
     for column in range(len(pixels)):
         k = owner[column]
         is_ring = k != ABSENT and ids[column] == ABSENT
@@ -106,9 +106,9 @@ def _place_row(depth_m, row_part, of_column, origin, points):  # type: ignore[no
 
 @njit(cache=True)
 def _mark_new(points, voxel, labels, above_labels, cells, above_cells, is_new):  # type: ignore[no-untyped-def]
-    """Whether each pixel of a row differs in voxel or label from those left of it and above, which came before.
+    """Whether each pixel of a row differs in voxel or label from its left and upper neighbours, which precede it.
 
-    ``cells`` takes the voxels (3, W), as floats: so every step here is done for many pixels at once.
+    ``cells`` receives the voxels (3, W) as floats, so that every step is vectorised.
     """
     width = len(labels)
     for axis in range(3):
@@ -136,8 +136,8 @@ def cloud(  # type: ignore[no-untyped-def]
 ):
     """Points, owners and ranks (0 in a mask, 1 in a ring, 2 in no mask) of ``pixels``.
 
-    ``rings``: OWNED, BACKGROUND or DROPPED. Rows come first to last; with ``voxel`` above 0 only the first point of
-    each voxel, owner and rank is kept.
+    ``rings``: OWNED, BACKGROUND or DROPPED. Rows are in order; with ``voxel`` above 0 only the first point per
+    voxel, owner and rank is included.
     """
     height, width = depth_m.shape
     row_points = np.empty((3, width))
@@ -178,10 +178,14 @@ def cloud(  # type: ignore[no-untyped-def]
     return points[:n], owners[:n], ranks[:n]
 
 
-VOXELS = 512  # of a block
+VOXELS = 512  # per block
 UNKNOWN = -2
-SCENE, FRAME, ALL = 0, 1, 2  # which point goes where a new one meets a held voxel: the scene's, the frame's, none
-STEPS = (0, -1, 1, -2, 2)  # from a query's own voxel, the nearest first
+SCENE, FRAME, ALL = (
+    0,
+    1,
+    2,
+)  # which point is dropped when a new one meets an occupied voxel: the scene's, the frame's, neither
+STEPS = (0, -1, 1, -2, 2)  # relative to the voxel of the query, nearest first
 
 
 @njit(cache=True, inline="always")
@@ -196,7 +200,7 @@ def _voxel(x, eps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
-    """Enters the first ``n_blocks`` blocks into an empty ``table``."""
+    """Insert the first ``n_blocks`` blocks into an empty ``table``."""
     for block in range(n_blocks):
         table[slot_of(table, keys, keys[block, 0], keys[block, 1], keys[block, 2])] = block
 
@@ -205,10 +209,10 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
 def insert(  # type: ignore[no-untyped-def]
     new_points, new_ids, start, eps, density, placed, counts, ids, born, points, following, keys, heads, table
 ):
-    """Enters new points from ``start`` on; stops where the blocks run out and gives the point it stopped at.
+    """Insert new points from ``start`` on; stop when the blocks run out and return the point reached.
 
-    ``counts`` holds the number of points, of blocks and of all points that ever came; ``placed`` takes the map index
-    of each point that was entered, that of a point that went where it took its place, ABSENT for the others.
+    ``counts`` holds the number of points, of blocks and of all points inserted so far; ``placed`` receives the map
+    index of each inserted point (that of the point it replaced, if any), ABSENT for the others.
     """
     bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
     for i in range(start, len(new_points)):
@@ -246,10 +250,10 @@ def insert(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
-    """Of one axis: squared distance from ``x`` to the voxels 2 below to 2 above its own, into ``gaps`` (5,).
+    """Write the squared distance along one axis from ``x`` to the voxels -2 to +2 of its own into ``gaps`` (5,).
 
-    Rounded down, so that no voxel is passed over for rounding: the second ones can hold a point within eps where ``x``
-    lies on the border of its voxel, up to rounding.
+    Rounded down, so that rounding never skips a voxel: the outer ones can hold a point within eps if ``x`` lies on the
+    border of its voxel, up to rounding.
     """
     slack = abs(x) * 1e-15
     below, above = x - voxel * eps, (voxel + 1) * eps - x
@@ -263,13 +267,13 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def nearest(queries, eps, answer, born, points, following, keys, heads, table):  # type: ignore[no-untyped-def]
-    """Writes the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT where there is none.
+    """Write the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT if there is none.
 
-    Of equally near points the one that came first wins. Gives the number of voxels that were looked into.
+    The oldest of equally near points wins. Returns the number of voxels visited.
     """
     visited = 0
     gaps_x, gaps_y, gaps_z = np.empty(5), np.empty(5), np.empty(5)
-    around = np.full((3, 3, 3), UNKNOWN, np.int32)  # the blocks about that of the last query
+    around = np.full((3, 3, 3), UNKNOWN, np.int32)  # blocks around that of the last query
     mx, my, mz = np.int64(0), np.int64(0), np.int64(0)
     for i in range(len(queries)):
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
@@ -331,9 +335,9 @@ def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, 
 def count_inside(  # type: ignore[no-untyped-def]
     lower, upper, row_of_id, eps, n_blocks, counts, ids, points, following, keys, heads, table
 ):
-    """Adds to ``counts[row_of_id[id]]`` the points of each id in the closed box; gives the number of blocks visited.
+    """Add the points of each id in the closed box to ``counts[row_of_id[id]]``; return the number of blocks visited.
 
-    Walks the block coordinates of the box, or the blocks themselves where they are fewer.
+    Iterates over the block coordinates of the box, or over all blocks if they are fewer.
     """
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     for a in range(3):

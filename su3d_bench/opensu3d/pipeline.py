@@ -22,7 +22,7 @@ from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_in
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 
 logger = logging.getLogger(__name__)
-logger.setLevel(logging.INFO)  # what is left out goes to the log of its scene
+logger.setLevel(logging.INFO)  # dropped points are logged per scene
 
 
 class OpenSU3D:
@@ -33,10 +33,10 @@ class OpenSU3D:
     Config = OpenSU3DConfig
     about = MethodAbout(
         paper="Mohiuddin et al.: OpenSU3D: Open World 3D Scene Understanding using Foundation Models",
-        source="written from the paper; no code of its authors was read",
+        source="written from the paper without reading the authors' code",
         licence="that of this project",
         needs=("masks of named objects with scores", "an encoder of images and texts"),
-        status="each step is tested on hand-worked cases; never run beside the original, and no figure of its paper "
+        status="each step is tested on hand-worked cases; not compared with the original, and no number of its paper "
         "has been reproduced",
     )
     presets: ClassVar[Mapping[str, Mapping[str, str]]] = {
@@ -44,7 +44,7 @@ class OpenSU3D:
         "owner": {"border_pixels": "owner"},
         **{f"score-{rule}": {"instance_score": rule} for rule in ("mean", "max", "top-m-sum")},
     }
-    # The paper's letters, as its ablation (Table I) varies them.
+    # The paper's symbols, as varied in its ablation (Table I).
     short_names: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
         "m": ("top_m", lambda value: value),
         "k": ("crop_ratios", crop_levels),
@@ -65,8 +65,8 @@ class OpenSU3D:
         self._seeds: dict[int, int] = {}
         self._next_id = NO_INSTANCE + 1
         self._n_detections = 0
-        self._losses: Counter[str] = Counter()  # of all updates
-        self.losses: dict[str, int] = {}  # of the last update
+        self._losses: Counter[str] = Counter()  # over all frames
+        self.losses: dict[str, int] = {}  # of the last frame
         self.postprocess_ms: float | None = None  # of the last ``finish``
 
     @property
@@ -75,26 +75,26 @@ class OpenSU3D:
 
     @property
     def caveat(self) -> str | None:
-        """Where its confidences come from, unless they are 1."""
+        """Source of the confidences, unless all are 1."""
         rule = self.config.instance_score
-        return None if rule == "ones" else f"confidence of an instance: {CONFIDENCES[rule]}; the paper defines none"
+        return None if rule == "ones" else f"instance confidence: {CONFIDENCES[rule]}; not defined in the paper"
 
     @property
     def n_points(self) -> int:
-        """Points of the map so far, those of no instance included."""
+        """Number of map points so far, including those without an instance."""
         return len(self._map)
 
     @property
     def n_instances(self) -> int:
-        """Scene ids given so far, before post-processing."""
+        """Number of scene ids assigned so far, before post-processing."""
         return self._next_id - 1 - NO_INSTANCE
 
     def start(self, scene: SceneInfo) -> None:
-        """Forgets the scene before; of the new one nothing needs to be known."""
+        """Reset the state; nothing about the new scene is needed."""
         self._clear()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Fuses one image into the map; costs what the view costs, however large the map is."""
+        """Fuse one image into the map; the cost depends on the view, not on the size of the map."""
         detections.check_of(frame)
         with timer.stage("backproject"):
             cloud = frame_cloud(frame, detections.masks, self.config)
@@ -109,13 +109,13 @@ class OpenSU3D:
         self._n_detections += len(detections)
 
     def _track(self, cloud: FrameCloud, matched: Int64Array, detections: Detections) -> Int32Array:
-        """Scene id of each detection, NO_INSTANCE for those without a point; enters them into Q."""
+        """Scene id of each detection, NO_INSTANCE for those without points; also added to Q."""
         scene_id_of = np.full(len(detections), NO_INSTANCE, np.int32)
         if cloud.n_inside == 0:
             return scene_id_of
         overlaps = tracking.count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
-        # An axis at a time: over rows of three, numpy's minimum is ten times slower.
+        # One axis at a time: numpy's minimum over rows of three is ten times slower.
         lower = np.array([axis.min() for axis in cloud.points.T]) - self.config.eps
         upper = np.array([axis.max() for axis in cloud.points.T]) + self.config.eps
         inside = np.append(self._map.count_inside(lower, upper, wanted), 0)
@@ -123,16 +123,14 @@ class OpenSU3D:
         ratios = tracking.overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
         ids, self._next_id = tracking.assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
         if self._next_id > IDS:
-            raise DataError(
-                f"frame {detections.frame_index}: the map has more than {IDS - 1:,} instances to tell apart"
-            )
+            raise DataError(f"frame {detections.frame_index}: the map has more than {IDS - 1:,} instances")
         scene_id_of[overlaps.segments] = ids
         for detection, scene_id in zip(overlaps.segments, ids, strict=True):
             self._table[int(scene_id)].append(tracking.View(len(self._images), int(detection)))
         return scene_id_of
 
     def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:
-        ids = np.append(scene_id_of, NO_INSTANCE).astype(np.int32)[cloud.owner]  # NO_DETECTION is the last
+        ids = np.append(scene_id_of, NO_INSTANCE).astype(np.int32)[cloud.owner]  # NO_DETECTION is the last entry
         placed = self._map.insert(cloud.points, ids)
         self._plant(cloud, placed, scene_id_of)
         hit = placed.copy()
@@ -141,7 +139,7 @@ class OpenSU3D:
         self._images.append(tracking.record_of(detections, self.config.fusion, cloud.owner, hit, self._scratch))
 
     def _plant(self, cloud: FrameCloud, placed: Int64Array, scene_id_of: Int32Array) -> None:
-        """Keeps of each new scene id the map point in the middle of its first mask: the cluster there bears the id."""
+        """Store the map point at the centre of each new id's first mask: the cluster there gets the id."""
         for detection, scene_id in enumerate(scene_id_of.tolist()):
             if scene_id == NO_INSTANCE or scene_id in self._seeds:
                 continue
@@ -152,7 +150,7 @@ class OpenSU3D:
                 self._seeds[scene_id] = int(placed[own[np.argmin((offsets**2).sum(axis=1))]])
 
     def finish(self) -> Instances:
-        """The instances of the map so far, and its points of no instance."""
+        """The instances of the current map and its points without an instance."""
         start = time.perf_counter()
         by_age = self._map.by_age
         points, ids = self._map.points[by_age], self._map.ids[by_age]
@@ -162,13 +160,13 @@ class OpenSU3D:
         return instances
 
     def close(self) -> None:
-        """Forgets the scene, says in the log what was left out of it, and gives memory and disk space back."""
+        """Reset the state, log dropped points, and free memory and disk space."""
         n_swallowed, n_too_far = self._losses["n_swallowed"], self._losses["n_too_far"]
         if n_swallowed:
             of_all = n_swallowed, self._n_detections, self.config.border_px
-            logger.info("opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)", *of_all)
+            logger.info("opensu3d: %d of %d detections lie entirely in the rings of others (border_px %g)", *of_all)
         if n_too_far:
             depth_max = self.config.depth_max
-            logger.info("opensu3d: %d pixels lie beyond depth_max %g m and are left out", n_too_far, depth_max)
+            logger.info("opensu3d: %d pixels beyond depth_max (%g m) were dropped", n_too_far, depth_max)
         self._clear()
         self._scratch.close()

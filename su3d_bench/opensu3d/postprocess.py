@@ -15,18 +15,18 @@ from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, fuse_views
 
 NOISE = -1
-# Ids of clusters are above those of scene segments, which they show: 7000012 is a part of 12.
+# Cluster ids are above scene-segment ids and contain them: 7000012 is a part of 12.
 IDS = 1_000_000
 CONFIDENCES: Mapping[InstanceScore, str] = {
-    "mean": "the mean score of its views",
-    "max": "the highest score of its views",
-    "top-m-sum": "the sum of its top m views' scores over m",
+    "mean": "mean score of its views",
+    "max": "highest score of its views",
+    "top-m-sum": "sum of the scores of its top m views over m",
 }
 
 
 @dataclass(frozen=True)
 class Segment:
-    """One instance to be: its ``id``, its points, the oldest first, and its views in the order they came."""
+    """A candidate instance: ``id``, points (oldest first) and views (in order)."""
 
     id: int
     points: Int64Array
@@ -34,7 +34,7 @@ class Segment:
 
 
 def caption_of(name: str) -> str:
-    """The caption of an object that nothing more is known of: "an {object} in a scene", with the right article."""
+    """Default caption of an object: "an {object} in a scene", with the right article."""
     return f"{with_article(name.strip() or 'object')} in a scene"
 
 
@@ -46,7 +46,7 @@ def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
 
 
 def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
-    """Labels of the clusters that become instances: at least ``split_fraction`` of the largest, largest first."""
+    """Labels of clusters that become instances: at least ``split_fraction`` of the largest; largest first."""
     sizes = np.bincount(labels[labels != NOISE])
     order = np.argsort(-sizes, kind="stable")
     return [int(label) for label in order if sizes[label] >= split_fraction * sizes[order[0]]]
@@ -61,10 +61,9 @@ def segments_of(
     images: Sequence[ImageRecord],
     config: OpenSU3DConfig,
 ) -> list[Segment]:
-    """Instances after clustering, the largest cluster of each scene segment before all others; noise is left out.
+    """Instances after clustering, the largest cluster of each scene segment first; noise is dropped.
 
-    ``index`` (N,) is each point's index in the map, by which views know what they hit, and by which clusters are told
-    apart: see ``id_of``.
+    ``index`` (N,) is the map index of each point, which identifies view hits and clusters (see ``id_of``).
     """
     order = np.argsort(ids, kind="stable")
     kept: list[Segment] = []
@@ -86,10 +85,10 @@ def segments_of(
 
 
 def id_of(scene_id: int, places: Int64Array, seed: int | None) -> int:
-    """The id of the cluster of segment ``scene_id`` whose points have the indices ``places``, ascending, in the map.
+    """The id of the cluster of segment ``scene_id`` with the ascending map indices ``places``.
 
-    The segment's own where its ``seed`` is among them, else one of the cluster's first place: a place stays what it is
-    however the map grows, so an id never passes to another object, whenever and how often the map is asked for.
+    The segment's own id if its ``seed`` is among them, else one derived from the cluster's first index: indices never
+    change as the map grows, so an id never moves to another object, however often the map is requested.
     """
     at = np.searchsorted(places, -1 if seed is None else seed)
     is_home = seed is not None and at < len(places) and places[at] == seed
@@ -113,7 +112,7 @@ def best_views(views: tuple[View, ...], images: Sequence[ImageRecord], m: int) -
 
 
 def instance_score(scores: Float64Array, rule: InstanceScore, m: int) -> float:
-    """Confidence of an instance: 1, or what the ``rule`` makes of the detector's scores of its views."""
+    """Confidence of an instance: 1, or computed by ``rule`` from the detector scores of its views."""
     if rule == "ones":
         return 1.0
     if rule == "max":
@@ -130,7 +129,7 @@ def to_instances(
     images: Sequence[ImageRecord],
     config: OpenSU3DConfig,
 ) -> Instances:
-    """The map: points of instances and of no instance; points that clustering dropped as noise are left out."""
+    """The map: points with and without an instance, excluding points that clustering dropped as noise."""
     of_segments = np.concatenate([np.zeros(0, np.int64), *(segment.points for segment in segments)])
     is_kept = ids == 0
     is_kept[of_segments] = True

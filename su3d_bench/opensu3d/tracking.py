@@ -1,4 +1,4 @@
-"""Ids of a frame's masks: overlaps with the map, the table of detections Q, and the features of an instance fused."""
+"""Mask ids by overlap with the map, the detection table Q, and feature fusion per instance."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from su3d_bench.opensu3d.config import BEST_FIT_RATIO, Fusion, MultiScale, Multi
 
 @dataclass(frozen=True)
 class Overlaps:
-    """The scene segment that each frame segment shares most points with.
+    """The scene segment with which each frame segment shares most points.
 
     ``segments`` (F,) the frame segments present, ascending; ``n_frame`` (F,) their points; ``best`` (F,) scene ids, 0
-    where nothing overlaps; ``shared`` (F,) matched pairs with that scene segment.
+    if nothing overlaps; ``shared`` (F,) matched pairs with that scene segment.
     """
 
     segments: Int32Array
@@ -32,7 +32,7 @@ class Overlaps:
 def count_overlaps(segment: Int32Array, matched_id: Int32Array) -> Overlaps:
     """Overlaps from the frame segment (N,) of each point and the id (N,) of the scene point it matched, 0 for none.
 
-    Of two scene segments that share equally many points the lower id is the best.
+    Of two scene segments that share equally many points, the lower id is best.
     """
     segments, n_frame = np.unique(segment, return_counts=True)
     best = np.zeros(len(segments), np.int32)
@@ -41,7 +41,7 @@ def count_overlaps(segment: Int32Array, matched_id: Int32Array) -> Overlaps:
     keys = (segment[pairs].astype(np.int64) << 32) | matched_id[pairs]
     keys, counts = np.unique(keys, return_counts=True)
     row = np.searchsorted(segments, keys >> 32)
-    # By row, then most shared points, then lowest id: the first entry of a row is its best.
+    # Sorted by row, most shared points, lowest id: the first entry of a row is its best.
     order = np.lexsort((keys & 0xFFFFFFFF, -counts, row))
     rows, first = np.unique(row[order], return_index=True)
     best[rows] = (keys[order][first] & 0xFFFFFFFF).astype(np.int32)
@@ -50,10 +50,10 @@ def count_overlaps(segment: Int32Array, matched_id: Int32Array) -> Overlaps:
 
 
 def overlap_ratios(overlaps: Overlaps, n_scene: Int64Array, rule: OverlapRule) -> Float64Array:
-    """Overlap ratio (F,) of each frame segment with its best scene segment; 0 where nothing overlaps.
+    """Overlap ratio (F,) of each frame segment with its best scene segment; 0 if nothing overlaps.
 
     ``n_scene`` (F,): points of the best scene segment inside the crop. The rule ``as-printed`` is the paper's equation
-    to the letter, max(c_s) / min(c_f, max(c_s)), which is never below 1.
+    verbatim, max(c_s) / min(c_f, max(c_s)), which is never below 1.
     """
     if rule == "as-printed":
         denominator = np.minimum(overlaps.n_frame, overlaps.shared)
@@ -67,8 +67,8 @@ def overlap_ratios(overlaps: Overlaps, n_scene: Int64Array, rule: OverlapRule) -
 def assign_ids(overlaps: Overlaps, ratios: Float64Array, threshold: float, next_id: int) -> tuple[Int32Array, int]:
     """Scene id (F,) of each frame segment and the next unused id.
 
-    A ratio of at least ``threshold`` takes the best scene segment's id (several may take one); the others get new ids
-    in the order of the segments.
+    A segment with a ratio of at least ``threshold`` gets the id of its best scene segment (ids may repeat); others get
+    new ids in segment order.
     """
     joined = (ratios >= threshold) & (overlaps.best > 0)
     n_new = int(np.count_nonzero(~joined))
@@ -77,7 +77,7 @@ def assign_ids(overlaps: Overlaps, ratios: Float64Array, threshold: float, next_
     return ids, next_id + n_new
 
 
-EPSILON = 1e-8  # the paper's: keeps the cosine of a zero vector at 0
+EPSILON = 1e-8  # as in the paper: the cosine of a zero vector is 0
 
 
 def cosine(a: Float64Array, b: Float64Array) -> NDArray[np.float64]:
@@ -92,7 +92,7 @@ def fuse_scales(
     """f_MS (K, D) of the features (K, R, D) of R crops.
 
     ``direct`` is (1/k) sum_i f_i; ``weighted`` is (1/k) sum_i cos(f_1, f_i) f_i, where f_1 is the best-fit crop: the
-    one at ratio 1.0, wherever it stands in ``crop_ratios``.
+    one at ratio 1.0, at any position in ``crop_ratios``.
     """
     features = np.asarray(crops, np.float64)
     if equation == "direct":
@@ -114,24 +114,24 @@ def fuse_views(multi_scale: Float64Array, global_features: Float64Array, equatio
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One mask of one image: ``position`` counts the images given so far, ``detection`` is the row in that image."""
+    """One mask of one image: ``position`` is the index of the image, ``detection`` the row in that image."""
 
     position: int
     detection: int
 
 
-# Q: scene id -> the views merged into it, in the order they came.
+# Q: scene id -> views merged into it, in order.
 TrackingTable = defaultdict[int, list[View]]
 
 
 @dataclass(frozen=True, slots=True)
 class ImageRecord:
-    """What one image said of its detections, kept for names, captions, scores and features.
+    """Names, captions, scores and features of the detections of one image.
 
-    ``rows`` (K,) are those of the file or image that they came from.
-    What is large lies in a scratch file, so that memory does not grow with the images: ``multi_scale`` (K, D), the f_MS
-    of its K detections, ``global_feature`` (1, D), its f_G, and ``hits``, the map points that detections hit, those of
-    detection k in rows ``hit_indptr[k]`` to ``hit_indptr[k + 1]``.
+    ``rows`` (K,) are the rows in the source file or image. Large arrays are in a scratch file, so that memory does not
+    grow with the number of images: ``multi_scale`` (K, D), the f_MS of the K detections, ``global_feature`` (1, D),
+    the f_G, and ``hits``, the map points hit, those of detection k in rows ``hit_indptr[k]`` to
+    ``hit_indptr[k + 1]``.
     """
 
     frame_index: int
@@ -146,11 +146,11 @@ class ImageRecord:
 
     @property
     def n_dimensions(self) -> int:
-        """D of its features."""
+        """Feature dimension D."""
         return self.global_feature.shape[1]
 
     def source_of(self, detection: int) -> tuple[int, int]:
-        """The frame of ``detection`` and its row in the file or image that it came from."""
+        """The frame of ``detection`` and its row in the source file or image."""
         return self.frame_index, int(self.rows[detection])
 
     def feature_of(self, detection: int) -> Float64Array:
@@ -164,7 +164,7 @@ class ImageRecord:
         return feature
 
     def hits_of(self, detection: int) -> Int64Array:
-        """Map points that the mask of ``detection`` hit, ascending."""
+        """Map points hit by the mask of ``detection``, ascending."""
         first, last = (int(end) for end in self.hit_indptr[detection : detection + 2])
         return self.hits.rows(first, last).astype(np.int64)
 
@@ -172,7 +172,7 @@ class ImageRecord:
 def record_of(
     detections: Detections, fusion: Fusion, segment: Int32Array, hit: Int64Array, scratch: Scratch
 ) -> ImageRecord:
-    """Keeps what one image said; ``segment`` and ``hit`` pair each detection with a map point it hit, -1 for none."""
+    """Store the detections of one image; ``segment`` and ``hit`` pair each with a map point hit, -1 for none."""
     columns = [_column(detections, ratio) for ratio in fusion.crop_ratios]
     features = fuse_scales(detections.crop_features[:, columns], fusion.crop_ratios, fusion.multi_scale)
     is_hit = hit >= 0
@@ -181,7 +181,7 @@ def record_of(
         detections.frame_index,
         np.array([detections.row_of(k) for k in range(len(detections))], np.int64),
         detections.scores.astype(np.float64),
-        # one text a name, not one an image
+        # one string per name, not per image
         tuple(map(sys.intern, map(str, detections.names))),
         tuple(map(sys.intern, map(str, detections.captions))),
         scratch.put(features),
@@ -192,7 +192,7 @@ def record_of(
 
 
 def _distinct(values: Int64Array) -> Int64Array:
-    """The different ``values``, ascending; np.unique takes ten times as long for want of a sort."""
+    """The distinct ``values``, ascending; ten times faster than np.unique."""
     ordered = np.sort(values)
     is_first = np.ones(len(ordered), np.bool_)
     np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])

@@ -1,4 +1,4 @@
-"""The scene cloud P_scene: points with instance ids in a voxel hash that grows, matches and counts without a scan."""
+"""The scene cloud P_scene: points with instance ids in a growing voxel hash, matched and counted without full scans."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import Density
 
 NO_INSTANCE = 0
-# Voxel coordinates are exact integers far beyond this; a coordinate above it is a pose in the wrong unit.
+# Larger coordinates indicate poses in the wrong unit; voxel coordinates stay exact integers far beyond.
 FARTHEST_M = 1e7
-ROWS_OF_A_THREAD = 20_000  # some 2 ms of work; a thread takes 0.1 ms to start
+ROWS_OF_A_THREAD = 20_000  # about 2 ms of work; starting a thread takes 0.1 ms
 
 
 class VoxelMap:
     """Points (float64, metres) with ids, hashed by voxels of side ``eps``.
 
-    Arrays double when they are full; every other step costs what the view costs, however many points the map holds. A
-    point that is deleted gives its place in the arrays to the one that takes its voxel, so that memory is bounded by
-    the voxels that were seen, unless ``density`` is ``all``.
+    Arrays double when full; the cost of every other step depends on the view, not on the size of the map. A deleted
+    point's slot goes to the point that takes its voxel, so memory is bounded by the number of voxels observed unless
+    ``density`` is ``all``.
     """
 
     def __init__(self, eps: float, density: Density = "scene") -> None:
@@ -50,12 +50,12 @@ class VoxelMap:
 
     @property
     def _arrays(self) -> tuple[NDArray[Any], ...]:
-        """What every kernel walks over."""
+        """The arrays passed to every kernel."""
         return self._points, self._following, self._keys, self._heads, self._table
 
     @property
     def n_bytes(self) -> int:
-        """What the arrays take, their spare room included."""
+        """Size of the arrays in bytes, spare capacity included."""
         return sum(array.nbytes for array in vars(self).values() if isinstance(array, np.ndarray))
 
     @property
@@ -65,7 +65,7 @@ class VoxelMap:
 
     @property
     def by_age(self) -> Int64Array:
-        """Index of each point (N,), the one that came first before all others."""
+        """Index of each point (N,), the oldest first."""
         return np.argsort(self._born[: len(self)], kind="stable")
 
     @property
@@ -74,18 +74,18 @@ class VoxelMap:
         return self._ids[: len(self)]
 
     def ids_of(self, indices: Int64Array) -> Int32Array:
-        """Instance id of each point (N,) of the map, NO_INSTANCE for index -1."""
+        """Instance id of each map point (N,), NO_INSTANCE for index -1."""
         ids = np.full(len(indices), NO_INSTANCE, np.int32)
         is_there = indices >= 0
         ids[is_there] = self._ids[indices[is_there]]
         return ids
 
     def nearest(self, queries: Float64Array) -> Int64Array:
-        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the oldest."""
+        """Index of the nearest point strictly within eps of each query, -1 if none; ties: the oldest."""
         return self.nearest_counted(queries)[0]
 
     def nearest_counted(self, queries: Float64Array) -> tuple[Int64Array, int]:
-        """As ``nearest``, with the number of voxels that were looked into."""
+        """As ``nearest``, with the number of voxels visited."""
         from su3d_bench.opensu3d import kernels as _kernels
 
         queries = checked_points(queries)
@@ -103,7 +103,7 @@ class VoxelMap:
     def count_inside_counted(
         self, lower: Float64Array, upper: Float64Array, wanted: Int32Array
     ) -> tuple[Int64Array, int]:
-        """As ``count_inside``, with the number of blocks that were looked for."""
+        """As ``count_inside``, with the number of blocks visited."""
         from su3d_bench.opensu3d import kernels as _kernels
 
         counts = np.zeros(len(wanted), np.int64)
@@ -116,10 +116,10 @@ class VoxelMap:
         return counts, int(visited)
 
     def insert(self, points: Float64Array, ids: Int32Array) -> Int64Array:
-        """Adds points in order; gives the map index that each took, -1 where it was left out.
+        """Add points in order; return the map index of each, -1 if dropped.
 
-        Where one meets a voxel that is held, ``density`` says which goes: the held point (``scene``), which stays only
-        where it has an instance and the new one has none; the new one (``frame``); neither (``all``).
+        In an occupied voxel ``density`` decides which point is dropped: the old one (``scene``), unless it has an
+        instance and the new one has none; the new one (``frame``); neither (``all``).
         """
         from su3d_bench.opensu3d import kernels as _kernels
 
@@ -155,9 +155,9 @@ class VoxelMap:
 
 
 def in_threads(work: Callable[[slice], int], n: int) -> list[int]:
-    """Answers of ``work`` on the parts of ``n`` rows, one a thread; every row's answer is its own, however many.
+    """Results of ``work`` on chunks of ``n`` rows, one per thread; independent of the number of threads.
 
-    As many threads as numba may use: NUMBA_NUM_THREADS, else the cores. A few rows are not worth a thread.
+    Uses NUMBA_NUM_THREADS threads (default: the number of cores), and only one for few rows.
     """
     from numba import config
 
@@ -178,20 +178,20 @@ def _grown(array: NDArray[Any], capacity: int, used: int) -> NDArray[Any]:
 
 
 def doubled(capacity: int, n: int) -> int:
-    """``capacity``, doubled until ``n`` things have room."""
+    """``capacity``, doubled until it is at least ``n``."""
     while capacity < n:
         capacity *= 2
     return capacity
 
 
 def checked_points(points: Float64Array) -> Float64Array:
-    """``points`` (N, 3) as the maps take them; a ``DataError`` where one is not finite or lies beyond FARTHEST_M."""
+    """``points`` (N, 3) as the map stores them; ``DataError`` if one is not finite or beyond FARTHEST_M."""
     points = np.ascontiguousarray(points, np.float64)
-    # min and max are nan or infinite where any coordinate is
+    # min and max are NaN or infinite if any coordinate is
     if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):
         worst = points[np.argmax(~(np.abs(points) <= FARTHEST_M).all(axis=1))]
         raise DataError(
-            f"point cloud: a point lies at {worst.tolist()} m; coordinates must be finite and within {FARTHEST_M:.0e} m"
-            " (are the poses and the depth in metres?)"
+            f"point cloud: point at {worst.tolist()} m; coordinates must be finite and within {FARTHEST_M:.0e} m"
+            " (are poses and depth in metres?)"
         )
     return points

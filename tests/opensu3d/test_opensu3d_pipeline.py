@@ -104,7 +104,7 @@ def test_name_and_score_come_from_the_views() -> None:
     for rule, expected in (("mean", 1.75 / 3), ("max", 0.75), ("top-m-sum", 1.75 / 5)):
         scored = run(views, CONFIG.model_copy(update={"instance_score": rule})).finish()
         assert scored.scores.tolist() == [pytest.approx(expected)]
-        assert "the paper defines none" in (OpenSU3D(CONFIG.model_copy(update={"instance_score": rule})).caveat or "")
+        assert "not defined in the paper" in (OpenSU3D(CONFIG.model_copy(update={"instance_score": rule})).caveat or "")
     assert OpenSU3D().caveat is None
 
 
@@ -171,8 +171,8 @@ def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: 
     method.close()
     said = [record.getMessage() for record in caplog.records]
     assert said == [
-        "opensu3d: 1 of 3 detections lie whole in the rings of others (border_px 12)",
-        f"opensu3d: {n_too_far} pixels lie beyond depth_max 2.5 m and are left out",
+        "opensu3d: 1 of 3 detections lie entirely in the rings of others (border_px 12)",
+        f"opensu3d: {n_too_far} pixels beyond depth_max (2.5 m) were dropped",
     ]
     method = run([look(TWINS, 0)])
     method.close()
