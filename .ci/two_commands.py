@@ -154,7 +154,7 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     """Each named damage gives its line, and no model is seen before it is whole."""
     once = ("--accept", "models", "--retries", "0", "--quiet")
     before = len(server.asked)
-    expect("licence not accepted", fetch("models", "--for", "paper"), 2, "was not accepted")
+    expect("licence not accepted", fetch("models", "--for", "paper"), 2, "not accepted")
     assert len(server.asked) == before
     stores = [path for path in server.files if path.startswith("/store/")]
     store = max(stores, key=lambda path: len(server.files[path].content))

@@ -53,7 +53,7 @@ def test_ranks_that_two_scenes_cannot_tell_apart_stay_open(runs: Path, capsys: p
     assert main(["report", "leaderboard", str(runs), "--intervals"]) == 0
     text = capsys.readouterr().out
     assert "| rank " in text and "| 1 to 2 " in text
-    assert "Intervals over 2 scenes are rough" in text
+    assert "Intervals from fewer than 10 scenes are unreliable (here: 2)" in text
 
 
 def test_ranks_are_those_of_the_scenes_and_a_ceiling_has_none(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

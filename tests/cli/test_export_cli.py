@@ -133,9 +133,9 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     message = error_of(capsys, r, "--to", "scannet", "--method", "oracle")
     assert "no default protocol; choose one with --protocol" in message
     message = error_of(capsys, r, "--to", "scannet", "--method", "oracle", "--protocol", "rooms-semantic")
-    assert "--protocol rooms-semantic: has no classes of instances" in message
+    assert "--protocol rooms-semantic: no instance classes" in message
     message = error_of(capsys, r, "--to", "openlex3d", "--protocol", "rooms-instance", "--method", "collector")
-    assert "belongs to --to scannet" in message
+    assert "only valid with --to scannet" in message
     assert "r/none: no such file or folder" in error_of(capsys, "r/none", "--to", "scannet")
     assert "is no run folder" in error_of(capsys, "data", "--to", "scannet", "--method", "oracle")
     assert "unknown --to 'openlex'; did you mean 'openlex3d'?" in error_of(capsys, r, "--to", "openlex")

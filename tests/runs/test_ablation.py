@@ -34,7 +34,7 @@ def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself
         (["m"], "expected KEY=VALUE"),
         (["m="], "expected KEY=VALUE"),
         (["m=0"], "--vary m=0: input should be greater"),
-        (["k=0.5"], "crop levels are a whole number"),
+        (["k=0.5"], "crop levels must be an integer"),
         (["m=" + ",".join(map(str, range(1, 1100)))], "1099 variants; at most 1000"),
     ],
 )

@@ -89,10 +89,10 @@ def press(browser: Chromium, *keys: str, k: int = 0) -> None:
 
 def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser: Chromium) -> None:
     opened(browser)
-    assert options(browser, "maps", "Beside") == ["nothing", "truth", "collector@noise_m=0.3"]
+    assert options(browser, "maps", "Compare with") == ["nothing", "ground truth", "collector@noise_m=0.3"]
     assert browser.run("document.querySelectorAll('#maps .pane')[1].hidden")
-    for text in ("truth", "collector@noise_m=0.3"):
-        choose(browser, "Beside", text)
+    for text in ("ground truth", "collector@noise_m=0.3"):
+        choose(browser, "Compare with", text)
         browser.until(f"document.querySelectorAll('#maps .title')[1].textContent.includes({json.dumps(text)})")
         before = [picture(browser, 0), picture(browser, 1)]
         assert before[0] != before[1]
@@ -103,7 +103,7 @@ def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser
         press(browser, "ArrowUp", "-", k=0)
         assert picture(browser, 0) != turned[0]
         assert picture(browser, 1) != turned[1]
-    choose(browser, "Beside", "nothing")
+    choose(browser, "Compare with", "nothing")
     browser.until("document.querySelectorAll('#maps .pane')[1].hidden")
 
 
@@ -129,17 +129,17 @@ def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> 
 def test_growth_shows_the_instances_that_frames_had_shown_by_then(browser: Chromium) -> None:
     opened(browser)
     note = "document.querySelector('#maps [role=status].keys').innerText"
-    assert browser.run(note).startswith("Update 6 of 6, frame 5: 3 of 3 instances seen; the method held 4.")
-    assert "what was merged into others or dropped on the way is not kept" in browser.run(note)
+    assert browser.run(note).startswith("Update 6 of 6, frame 5: 3 of 3 instances seen; the method had 4.")
+    assert "instances that were merged or removed earlier are not shown" in browser.run(note)
     whole = picture(browser)
-    slide(browser, "Grown to", 2)
+    slide(browser, "Timeline", 2)
     assert browser.run(note).startswith("Update 3 of 6, frame 2: 2 of 3 instances seen")
     early = picture(browser)
     assert early != whole
-    slide(browser, "Grown to", 3)
+    slide(browser, "Timeline", 3)
     assert browser.run(note).startswith("Update 4 of 6, frame 3: 3 of 3 instances seen")
     assert picture(browser) == whole
-    assert browser.run(f"{field('Grown to')}.getAttribute('aria-valuetext')").startswith("Update 4 of 6")
+    assert browser.run(f"{field('Timeline')}.getAttribute('aria-valuetext')").startswith("Update 4 of 6")
 
 
 def address(browser: Chromium) -> str:
@@ -151,13 +151,13 @@ def test_the_address_follows_what_is_changed_and_brings_it_back(browser: Chromiu
     opened(browser)
     assert address(browser) == ""  # nobody has changed anything
     n_steps = browser.run("history.length")
-    choose(browser, "Beside", "truth")
+    choose(browser, "Compare with", "ground truth")
     browser.until("!document.querySelectorAll('#maps .pane')[1].hidden")
     choose(browser, "Colour by", "class")
-    slide(browser, "Cut above", 90)
-    slide(browser, "Grown to", 2)
+    slide(browser, "Clip height", 90)
+    slide(browser, "Timeline", 2)
     press(browser, "n", "ArrowLeft", "+")
-    browser.run(f"{field('Near walls fade')}.click()")
+    browser.run(f"{field('Fade near walls')}.click()")
     link = address(browser)
     assert browser.run("history.length") == n_steps
     shown = "document.querySelector('#maps .detail h3').innerText"
@@ -171,9 +171,9 @@ def test_the_address_follows_what_is_changed_and_brings_it_back(browser: Chromiu
     browser.until(READ.format(text=json.dumps("painted/a by")))
     assert browser.run(shown) == chosen
     assert browser.run(f"{field('Colour by')}.value") == "class"
-    assert browser.run(f"{field('Cut above')}.value") == "90"
-    assert browser.run(f"{field('Grown to')}.value") == "2"
-    assert not browser.run(f"{field('Near walls fade')}.checked")
+    assert browser.run(f"{field('Clip height')}.value") == "90"
+    assert browser.run(f"{field('Timeline')}.value") == "2"
+    assert not browser.run(f"{field('Fade near walls')}.checked")
     assert browser.run("Math.abs(document.getElementById('maps').getBoundingClientRect().top) < 200")
     press(browser, "n", "p")
     assert address(browser) == link

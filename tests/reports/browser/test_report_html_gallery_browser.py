@@ -166,9 +166,9 @@ def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, pa
     assert abs(anew.run("document.getElementById('maps').getBoundingClientRect().top")) < 200
     shown = {
         name: anew.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
-        for name in ("Scene", "Map", "Beside")
+        for name in ("Scene", "Map", "Compare with")
     }
-    assert shown == {"Scene": told["scene"], "Map": told["method"], "Beside": "truth"}
+    assert shown == {"Scene": told["scene"], "Map": told["method"], "Compare with": "ground truth"}
     colour = anew.run(f"{SELECT.format(part='maps', label='Colour by')}.value")
     assert colour == ("class" if kind == "label" else "instance")
     told_there = anew.run("document.querySelector('#maps .detail').innerText")

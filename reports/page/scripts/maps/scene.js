@@ -40,11 +40,11 @@ function mapsContent(section) {
   const scenes = [...new Set(DATA.maps.map((one) => one.scene))], sceneText = new Map(), read = new Map();
   const scene = select('Scene', scenes.map((name) => [name, name]), scenes[0], () => { listMaps(); load(); });
   const which = select('Map', [], null, () => load());
-  const besideField = select('Beside', [['', 'nothing']], '', () => showBeside());
+  const besideField = select('Compare with', [['', 'nothing']], '', () => showBeside());
   const colouring = select('Colour by', [], 'instance', paint), queryField = select('Text', [], null, paint);
-  const cutField = sliderField('Cut above', '84', applyCut), cut = cutField.input;
-  const growField = sliderField('Grown to', '0', applyGrowth), grow = growField.input;
-  const missedField = checkField('Missed objects', showGhosts), wallsField = checkField('Near walls fade', applyWalls);
+  const cutField = sliderField('Clip height', '84', applyCut), cut = cutField.input;
+  const growField = sliderField('Timeline', '0', applyGrowth), grow = growField.input;
+  const missedField = checkField('Missed objects', showGhosts), wallsField = checkField('Fade near walls', applyWalls);
   const growthNote = h('p', { class: 'keys', role: 'status' });
   queryField.hidden = true;
   growField.hidden = true;
