@@ -137,7 +137,7 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     message = error_of(capsys, r, "--to", "openlex3d", "--protocol", "rooms-instance", "--method", "collector")
     assert "only valid with --to scannet" in message
     assert "r/none: no such file or folder" in error_of(capsys, "r/none", "--to", "scannet")
-    assert "is no run folder" in error_of(capsys, "data", "--to", "scannet", "--method", "oracle")
+    assert "only valid for a run folder" in error_of(capsys, "data", "--to", "scannet", "--method", "oracle")
     assert "unknown --to 'openlex'; did you mean 'openlex3d'?" in error_of(capsys, r, "--to", "openlex")
     # the second scene cannot be read: the first is not left behind
     Path("r/scenes/painted.b/collector/prediction.npz").write_bytes(b"PK")

@@ -163,7 +163,7 @@ def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, pa
     anew.press("Enter")
     heading = "document.querySelector('#maps .detail h3')"
     anew.until(f"{heading} !== null && !document.querySelector('#maps .panes[aria-busy]')")
-    assert abs(anew.run("document.getElementById('maps').getBoundingClientRect().top")) < 200
+    anew.until("Math.abs(document.getElementById('maps').getBoundingClientRect().top) < 200")
     shown = {
         name: anew.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
         for name in ("Scene", "Map", "Compare with")
