@@ -1,4 +1,4 @@
-"""The ground truth itself through the same evaluation steps: GT ceiling of every protocol."""
+"""The ground truth as a prediction: it gives the ground-truth ceiling of every protocol."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, GT ceiling 97.1)``, by commas."""
+    """One line per method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, GT ceiling 97.1)``, by commas."""
     parts = []
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]

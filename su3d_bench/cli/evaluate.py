@@ -33,8 +33,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.option(
         "--truth-values",
-        "what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
-        "objects alone (0 for none), as in the OpenSUN3D challenge",
+        "values in --ground-truth: class ids, label * 1000 + instance, or object numbers",
         choices=("classes", "instances", "numbers"),
     )
     parser.shared("--protocols", "--scenes")
@@ -42,7 +41,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
+        "source of confidences if a protocol sets them all to 1 (default: file for ScanNet text)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

@@ -45,7 +45,7 @@ def add_new(verbs: Verbs, what: str) -> None:
     if what == REGISTRY:
         parser.option("file DIR", "folder to create")
     else:
-        parser.option("file FILE", "file to create; its name becomes the name of the class")
+        parser.option("file FILE", f"file to create; its name becomes that of the {what}")
 
 
 def call(arguments: argparse.Namespace) -> None:

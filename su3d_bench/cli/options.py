@@ -213,7 +213,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         ),
         option(
             "--queries FILE",
-            "file of queries (.toml, .csv, .txt, ScanRefer, Nr3D or OpenLex3D), for protocols without classes",
+            "queries for protocols without classes (.toml, .csv, .txt, ScanRefer, Nr3D, OpenLex3D)",
         ),
         option("--executor WHERE", "where jobs run: inline, processes, ray or slurm (default: processes)"),
         option(

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output, questions
-from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import ConfigError, PredictionError, StoreError
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,9 +39,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("scene", "scene, such as rooms/living0")
     parser.option("question", "question in English")
     parser.shared("--run", "--method")
-    parser.option(
-        "--solver", "built-in (geometry) or llm (a language model)", choices=("built-in", "llm"), default="built-in"
-    )
+    parser.option("--solver", SHARED["--solver"]["help"], choices=("built-in", "llm"), default="built-in")
     parser.option(
         "--names",
         "labels n, or n' of runs refine (default: n' if available)",
@@ -149,7 +147,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
             raise StoreError(f"{job.path}: no labels n'; create them with su3d-bench runs refine")
         return None, "labels n"
     n_left_out = sum(bool(name.left_out) for name in records.names)
-    without = f", without {n_left_out} excluded instances" if n_left_out else ""
+    without = f", without {counted(n_left_out, 'excluded instance')}" if n_left_out else ""
     return records.refined, f"labels n' by {records.model or 'vote'}{without}"
 
 

@@ -277,9 +277,9 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
             if confidences[0] < confidences[1]
             else ""
         )
-        return [f"all confidences are 1{differ}: AP equals recall x (1 + precision) / 2"]
+        return [f"the protocol sets all confidences to 1{differ}: AP per class is recall x (1 + precision) / 2"]
     if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
-        return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP equals recall x (1 + precision) / 2"]
+        return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP per class is recall x (1 + precision) / 2"]
     return []
 
 

@@ -1,4 +1,8 @@
-"""Ground truth in text files: class ids, class id * 1000 + instance, or object numbers only."""
+"""Ground truth in text files: class ids, class id * 1000 + instance, or object numbers only.
+
+ScanNet's scripts read a file as class ids or as class id * 1000 + instance, depending on the evaluation; OpenSUN3D's
+files have object numbers only. The values decide only if a single reading is possible.
+"""
 
 from __future__ import annotations
 
@@ -229,9 +233,7 @@ def read_values(path: Path) -> Int64Array:
     is_wrong = (values < 0) | (values > LARGEST_VALUE)
     if is_wrong.any():
         line = int(np.argmax(is_wrong))
-        raise DataError(
-            f"{where}:{line + 1}: {int(values[line])} is not class id * 1000 + instance; expected 0 or more"
-        )
+        raise DataError(f"{where}:{line + 1}: {int(values[line])} is negative; expected class id * 1000 + instance")
     return values
 
 

@@ -72,7 +72,7 @@ class OpenSU3DConfig(BaseModel):
 
     stride: int = Field(default=40, ge=1)
     border_px: float = Field(default=20.0, ge=0)
-    # The paper's 20 px belong to 1200x680 images; other widths use the same fraction of the width. 0: no ring.
+    # The paper's 20 px belong to 1200x680 images; other widths use the same fraction of the width. 0: do not scale.
     border_reference_width: int = Field(default=1200, ge=0)
     border_shape: Literal["disc", "square"] = "disc"
     # Ring pixels that lie in another mask: points of no instance in the map, because M' holds the ring and

@@ -180,11 +180,8 @@ def cloud(  # type: ignore[no-untyped-def]
 
 VOXELS = 512  # per block
 UNKNOWN = -2
-SCENE, FRAME, ALL = (
-    0,
-    1,
-    2,
-)  # which point is dropped when a new one meets an occupied voxel: the scene's, the frame's, neither
+# The point that is dropped when a new one meets an occupied voxel: the scene's, the frame's, neither.
+SCENE, FRAME, ALL = 0, 1, 2
 STEPS = (0, -1, 1, -2, 2)  # relative to the voxel of the query, nearest first
 
 
@@ -267,7 +264,7 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def nearest(queries, eps, answer, born, points, following, keys, heads, table):  # type: ignore[no-untyped-def]
-    """Write the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT if there is none.
+    """Write the nearest map point strictly within ``eps`` of each query into ``answer``, or ABSENT.
 
     The oldest of equally near points wins. Returns the number of voxels visited.
     """

@@ -147,7 +147,7 @@ class RegionsOnDemand(CropsOnDemand):
         self._regions = OfLastFrame(regions_of)
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
-        """The mask and score of the region that contains most of ``points``; an empty mask and 0 if there is none.
+        """The mask and score of the region that contains most of ``points``; or an empty mask and 0.
 
         The score is the region's score times the share of points inside it.
         """

@@ -281,7 +281,7 @@ class OracleSegmenter:
         return Regions(stacked, mask_boxes(stacked), np.ones(len(pairs), np.float32), tuple(n for _, n in pairs))
 
 
-ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; an upper bound, not a result"
+ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; a ceiling, not a result"
 
 
 class OraclePerception:

@@ -161,9 +161,7 @@ def build_perception(
         encoder = load_encoder(config.models, default=own, cache=cache, job_index=job_index)
     if resolved == "oracle":
         if mesh is None:
-            raise ConfigError(
-                f"{scene.dataset}/{scene.scene}: profile 'oracle' needs an annotated mesh, but there is none"
-            )
+            raise ConfigError(f"{scene.dataset}/{scene.scene}: no annotated mesh, which profile 'oracle' needs")
         return OraclePerception(config.oracle, mesh, encoder, cache)
     assert mesh is None, "ground truth may reach the oracle only"
     if resolved == "stored":

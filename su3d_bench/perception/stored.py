@@ -43,9 +43,7 @@ MOST_MASK_BYTES = 512 << 20  # of all masks of an image, a byte a pixel: 400 of 
 def check_masks(n: int, shape: tuple[int, ...], where: str) -> None:
     """Refuses more masks (H, W) than any image has, which take far more memory than their file, before they do."""
     if n > MOST_REGIONS or n * shape[0] * shape[1] > MOST_MASK_BYTES:
-        raise DataError(
-            f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one region per object in the image"
-        )
+        raise DataError(f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one region per object")
 
 
 class StoredConfig(BaseModel):

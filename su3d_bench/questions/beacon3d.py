@@ -447,7 +447,7 @@ def _what_was_judged(judged: Judged) -> str:
     line = f"judge: {model}, asked for {asked} that match no right one, with a prompt of this program's own"
     if not judged.n_open:
         return line
-    return f"{line}; {judged.n_open} replies without a score, shown as a range"
+    return f"{line}; {counted(judged.n_open, 'reply')} without a score, shown as a range"
 
 
 def answered_json(answered: Answered) -> dict[str, Any]:

@@ -62,9 +62,7 @@ def audit_table(verdicts: Sequence[Verdict]) -> Table:
     """Share of correct questions for each kind, followed by the incorrect ones; ``DataError`` if none is judged."""
     judged = [one for one in verdicts if one.verdict]
     if not judged:
-        raise DataError(
-            f"none of the {len(verdicts)} questions is judged; fill the column 'verdict' with {', '.join(VERDICTS)}"
-        )
+        raise DataError(f"none of {len(verdicts)} questions is judged; fill 'verdict' with {', '.join(VERDICTS)}")
     kinds = [ALL, *sorted({one.kind for one in judged})]
     of_kind = {kind: [one.verdict for one in judged if kind in (ALL, one.kind)] for kind in kinds}
     faults = [one for verdict in (WRONG, ARGUABLE) for one in judged if one.verdict == verdict]

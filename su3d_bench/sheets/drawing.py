@@ -406,8 +406,7 @@ class Figures:
         return [drawn_map(self._source.instances(scene, method)) for method in self._source.methods]
 
     def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
-        """One camera for all ``maps``, chosen in the first: from above or from the corner that shows most of
-        ``wanted``."""
+        """One camera for all ``maps``, chosen in the first: from above, or the corner that shows most of ``wanted``."""
         first = maps[0]
         place = 0
         if self._view == "corner":

@@ -193,12 +193,12 @@ def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
 
 
 def read_sheet(path: Path) -> Sheet:
-    """The set in a ``sheet.json``; ``DataError`` if ``sheets make`` did not write it so."""
+    """The set in a ``sheet.json``; ``DataError`` if the file is not one of ``sheets make``."""
     return read_record(path, Sheet)
 
 
 def read_key(path: Path) -> Key:
-    """The key in a ``key.json``; ``DataError`` if ``sheets make`` did not write it so."""
+    """The key in a ``key.json``; ``DataError`` if the file is not one of ``sheets make``."""
     return read_record(path, Key)
 
 
@@ -213,17 +213,14 @@ def write_record(path: Path, record: DataclassInstance) -> Path:
 
 
 def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> Record:
-    """The record of a JSON file written by the command ``maker``; ``DataError`` if it is another file or was
-    changed."""
+    """The record of a JSON file of the command ``maker``; ``DataError`` for any other or changed file."""
     where = printable(str(path), 200)
     content = parsed_json(read_bytes(path, where, f"pass a file written by su3d-bench {maker}", MOST_BYTES), where)
     if not isinstance(content, dict) or "digest" not in content:
         raise DataError(f"{where}: not a file written by su3d-bench {maker}")
     digest, schema = content.pop("digest"), content.pop("schema_version", None)
     if schema != SCHEMA:
-        raise DataError(
-            f"{where}: schema {printable(str(schema), 20)} is not supported (expected {SCHEMA}); create it again"
-        )
+        raise DataError(f"{where}: schema is {printable(str(schema), 20)}, expected {SCHEMA}; create the file again")
     if digest != digest_json(content):
         raise DataError(f"{where}: changed since su3d-bench {maker} wrote it; restore it or create it again")
     try:

@@ -269,9 +269,7 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
     Raises ``ConfigError``, before anything is written, where the folders hold another set, or answers.
     """
     if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
-        raise ConfigError(
-            f"--key {printable(str(key_folder), 200)}: is inside the folder of the sheets; choose a separate folder"
-        )
+        raise ConfigError(f"--key {printable(str(key_folder), 200)}: is among the sheets; choose a separate folder")
     title = items.KINDS_OF_SHEETS[made.sheet.kind].title
     files: dict[Path, bytes] = {}
     for share in made.sheet.annotators:

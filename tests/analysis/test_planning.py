@@ -97,7 +97,7 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
     assert "two seeds: no interval" in text
-    assert "(here: 3)" in text
+    assert "intervals from fewer than 10 scenes are unreliable (here: 3)" in text
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
     assert main(["report", "power", "seed-0"]) == 0

@@ -134,7 +134,7 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run"]) == 0
-    assert "no cost" in capsys.readouterr().out
+    assert "no language model is used: no cost" in capsys.readouterr().out
     assert server.n_asked == 0
     assert not Path("runs/made/language").exists()
 
@@ -213,7 +213,7 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     assert main(["query", "ask", SCENE, "How many things are there?", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
-    assert told["names"] == "labels n' by tiny, without 1 excluded instances"
+    assert told["names"] == "labels n' by tiny, without 1 excluded instance"
     assert main([*words, "--background-names", "bed"]) == 0
     assert "left out" not in capsys.readouterr().out
     assert main([*words, "--max-map-fraction", "0.05", "--json"]) == 0

@@ -61,7 +61,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "datasets show": ("rooms/bathroom0 --set rooms.width=160 rooms.height=120 --out room.png", 0, "room.png"),
     "datasets make": ("rooms --layout replica --scenes bathroom0 --set n_frames=2 --jobs 1 --out made", 0, ""),
     "methods list": ("", 0, "opensu3d"),
-    "methods check": ("oracle", 0, "OK"),
+    "methods check": ("oracle", 0, "55 instances, without features: OK"),
     "methods show": ("opensu3d", 0, "opensu3d"),
     "models list": ("", 0, "clip-vit-h-14"),
     "models check": ("clip-vit-h-14", 1, "clip-vit-h-14"),

@@ -196,7 +196,7 @@ def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: py
     Path("mine.toml").write_text(Path("mine.toml").read_text().replace("rooms-instance", "replica-openmask3d"))
     scenes, methods = "own/my_rooms.py:MyRooms/*", "merge_all.py:MergeAll"
     assert main(["datasets", "check", scenes]) == 0
-    assert capsys.readouterr().out.count("OK") == 2
+    assert capsys.readouterr().out.count(" s: OK\n") == 2
     words = ["run", "--scenes", scenes, "--methods", methods, "--profile", "oracle", "--jobs", "1", "--out", "run"]
     assert main([*words, "--no-pictures", "--protocols", "mine.toml"]) == 0
     assert results("run")["merge-all", "mine"]["AP25"] == 1.0

@@ -94,8 +94,14 @@ def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["datasets", "make", "rooms", "--layout", "replica"], "--layout replica: name the folder with --out"),
-        (["datasets", "make", "replica"], "replica: scenes of this dataset cannot be generated"),
+        (
+            ["datasets", "make", "rooms", "--layout", "replica"],
+            "datasets make --layout replica: name the folder with --out",
+        ),
+        (
+            ["datasets", "make", "replica"],
+            "datasets make replica: scenes of this dataset cannot be generated; known: rooms",
+        ),
         (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
         (["datasets", "make", "rooms", "--scenes", "replica/*"], "no scene 'replica/*'; expected 'rooms/...'"),
         (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),

@@ -90,7 +90,8 @@ def test_whoever_sits_at_a_terminal_is_asked(
     monkeypatch.setattr(sys, "stdin", Terminal(reply))
     assert main(["runs", "remove", "runs/one"]) == 0
     said = capsys.readouterr()
-    assert said.err.startswith("runs/one: complete, 0.") and "painted/a by collector\nremove permanently?" in said.err
+    assert said.err.startswith("runs/one: complete, 0.")
+    assert "MB, painted/a by collector\nremove permanently?" in said.err
     assert said.out.startswith("nothing was removed" if is_there else "removed runs/one: complete")
     assert Path("runs/one").exists() == is_there
     assert sorted(os.listdir("runs")) == (["one", "two"] if is_there else ["two"])

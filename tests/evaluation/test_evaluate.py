@@ -164,7 +164,7 @@ def test_scenes_without_a_prediction_are_left_out_loudly_under_the_originals_nam
     found = numbers(tmp_path)
     assert found["metrics"]["ap"] == 1.0
     assert found["skipped_scenes"] == ["scene0001_01", "scene0002_00"]
-    assert said(found, "2 of 3 scenes have no prediction and are skipped")
+    assert said(found, "2 of 3 scenes have no prediction and are skipped, as in the original evaluator")
 
 
 def test_a_protocol_of_the_user_counts_missing_scenes(tmp_path: Path) -> None:

@@ -130,4 +130,4 @@ def test_where_the_protocol_has_1_for_every_confidence_both_numbers_are_told(tmp
     assert by_rule["every_confidence_1"] is None
     assert by_command(tmp_path, "replica-openmask3d", "--confidences", "protocol") == by_rule
     assert as_in_files["warnings"][0].startswith("the confidences in the files are used")
-    assert by_rule["warnings"][0].startswith("all confidences are 1; those in the files (0.001")
+    assert by_rule["warnings"][0].startswith("the protocol sets all confidences to 1; those in the files (0.001")

@@ -97,7 +97,7 @@ def chairs(masks: list[np.ndarray], *scores: float) -> Instances:
 def test_constant_confidences_are_told_where_they_count() -> None:
     alike = chairs(CHAIRS, 0.25, 0.25)
     told = warnings_of("rooms-instance", alike)
-    assert told == "rooms/a: all confidences are 0.25: AP equals recall x (1 + precision) / 2"
+    assert told == "rooms/a: all confidences are 0.25: AP per class is recall x (1 + precision) / 2"
     assert warnings_of("rooms-instance", chairs(CHAIRS, 0.25, 0.5)) == ""
     assert warnings_of("rooms-instance", chairs(CHAIRS[:1])) == ""  # one has no order
     assert warnings_of("replica-openmask3d", alike) == ""

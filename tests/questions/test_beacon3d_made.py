@@ -160,7 +160,7 @@ def test_answers_are_judged_once_and_api_key_is_never_shown(
     assert main([*words, *server]) == 0
     said = capsys.readouterr()
     assert "judge: gpt-4o-2024-08-06, asked for 2 answers" in said.out
-    assert "1 replies without a score" in said.out
+    assert "1 reply without a score" in said.out
     assert chat.n_asked == 2 and {body["model"] for body in chat.bodies} == {"gpt-4o-2024-08-06"}
     (system, user) = next(body["messages"] for body in chat.bodies if "mauve" in str(body))
     assert (

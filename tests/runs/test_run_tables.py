@@ -56,7 +56,9 @@ def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
 
 
 def numbers(*warned: str) -> NumbersRecord:
-    warnings = tuple(f"{scene}: all confidences are 1: AP equals recall x (1 + precision) / 2" for scene in warned)
+    warnings = tuple(
+        f"{scene}: all confidences are 1: AP per class is recall x (1 + precision) / 2" for scene in warned
+    )
     return NumbersRecord(
         scenes=("d/a", "d/b", "d/c"),
         metrics={},

@@ -341,7 +341,7 @@ class BoxMetric(Metric[BoxCounts]):
 def _constant_warning(scores: Float64Array) -> str | None:
     if len(scores) < 2 or scores.min() != scores.max():
         return None
-    return f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP equals recall x precision"
+    return f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP per class is recall x precision"
 
 
 @dataclass(frozen=True)

@@ -232,7 +232,7 @@ def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks
     assert rules.min_region_size is not None
     warnings, scores = list[str](), scored.scores
     if rules.confidence == "prediction" and len(scores) > 1 and scores.min() == scores.max():
-        warnings.append(f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP equals recall x (1 + precision) / 2")
+        warnings.append(f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP per class is recall x (1 + precision) / 2")
     large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
     pairs = duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
     if pairs:

@@ -91,7 +91,7 @@ class Captioner:
             for request, reply, name in zip(requests, replies, tagger_names, strict=True)
         ]
         for reason in dict.fromkeys(caption.reason for caption in captions if caption.source == "fallback"):
-            logger.warning("captions: using the tagger's name and the template caption where the reply was: %s", reason)
+            logger.warning("captions: the tagger's name and a template replace unusable replies: %s", reason)
         return captions
 
 

@@ -289,7 +289,7 @@ class ReplyStore:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Lock the folder against other threads and processes; the lock file is removed."""
+        """Lock the folder against other threads and processes; leaves no lock file behind."""
         try:
             handle = hold_folder(self.folder, waits=True)
         except OSError as error:

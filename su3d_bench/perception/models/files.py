@@ -277,9 +277,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(file_text(path))
     except OSError as error:
-        raise DataError(
-            f"{path}: cannot be read ({error.strerror}); download it from the source of the weights"
-        ) from error
+        raise DataError(f"{path}: cannot be read ({error.strerror}); download it with the weights") from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as JSON ({bounded(error, 80)}); download it again") from error
     if not isinstance(content, dict):

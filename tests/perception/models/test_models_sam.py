@@ -129,5 +129,5 @@ def test_incomplete_checkpoint_fails() -> None:
     for name, tensor in tiny_sam().state_dict().items():
         assert (model.state_dict()[name] == tensor).all(), name
     state.pop("mask_decoder.iou_token.weight")
-    with pytest.raises(DataError, match=r"sam\.pth: is not a checkpoint of this SAM model: .*iou_token"):
+    with pytest.raises(DataError, match=r"sam\.pth: is not a checkpoint of this SAM: .*iou_token"):
         fill_sam(SamModel(tiny_sam().config), state, "sam.pth")

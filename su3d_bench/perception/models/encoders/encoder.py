@@ -321,9 +321,7 @@ def open_clip_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     open_clip = require_open_clip(files.entry.name)
     config = open_clip.get_model_config(files.form.architecture)
     if config is None:
-        raise DataError(
-            f"open_clip {open_clip.__version__} has no '{files.form.architecture}'; install a newer version"
-        )
+        raise DataError(f"open_clip {open_clip.__version__} has no '{files.form.architecture}'; install a newer one")
     transform = ImageTransform(int(config["vision_cfg"]["image_size"]), convention=convention)
     text = config["text_cfg"]
     n_tokens, n_words = text.get("context_length", OPEN_CLIP_TOKENS), text.get("vocab_size", OPEN_CLIP_WORDS)

@@ -204,9 +204,7 @@ def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> Groun
         try:
             tokenizer = transformers.BertTokenizer.from_pretrained(str(files.folder), local_files_only=True)
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError(
-                f"{files.folder}: its tokenizer cannot be read: {bounded(error)}; download it again"
-            ) from error
+            raise DataError(f"{files.folder}: tokenizer unreadable: {bounded(error)}; download it again") from error
         return GroundingDino(on_device(model, device, precision), tokenizer)
 
     return kept(files, (device, precision), load)

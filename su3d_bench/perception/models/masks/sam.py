@@ -241,9 +241,7 @@ def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
     try:
         model.load_state_dict(sam_names(tensors), strict=True)
     except RuntimeError as error:
-        raise DataError(
-            f"{where}: is not a checkpoint of this SAM model: {bounded(error)}; download it again"
-        ) from error
+        raise DataError(f"{where}: is not a checkpoint of this SAM: {bounded(error)}; download it again") from error
     return model
 
 
