@@ -31,11 +31,11 @@ Every command has these options:
 IN_EVERY = {"--help", "--json", "--quiet", "--debug"}
 # Details that do not fit into the help, and the page with more.
 MORE = {
-    "run": "`--methods all` runs OpenSU3D and the seven baselines; `opensu3d@scheme4` (a preset) and `opensu3d@top_m=1` "
-    "are variants of a method. See [Run folder](running/run-folder.md), [Clusters](running/clusters.md) and "
-    "[GPU](running/gpu.md).",
-    "ablate": "Perception is computed once. `--beside all` adds all methods: one run gives the five tables of the paper "
-    "([Results](numbers/results.md)).",
+    "run": "`--methods all` runs OpenSU3D and the seven baselines; `opensu3d@scheme4` (a preset) and "
+    "`opensu3d@top_m=1` are variants of a method. See [Run folder](running/run-folder.md), "
+    "[Clusters](running/clusters.md) and [GPU](running/gpu.md).",
+    "ablate": "Perception is computed once. `--beside all` adds all methods: one run gives the five tables of the "
+    "paper ([Results](numbers/results.md)).",
     "evaluate": "See [Prediction formats](evaluate.md).",
     "reproduce": "See [Reproduce a paper](running/reproduce.md).",
     "report tables": "`report verify` recomputes every cell.",

@@ -145,7 +145,7 @@ def test_tagger_name_is_used_when_the_model_refuses(
         ("object", "an object in a scene"),
     ]
     assert {(one.source, one.reason) for one in found} == {("fallback", reason)}
-    assert [record.getMessage().partition("was: ")[2] for record in caplog.records] == [reason]
+    assert [record.getMessage().partition("unusable replies: ")[2] for record in caplog.records] == [reason]
 
 
 def seen() -> Instances:
