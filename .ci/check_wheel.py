@@ -34,7 +34,7 @@ def built_wheel(folder: Path) -> Path:
     return wheel
 
 
-def bring_kernels(installed: Path) -> None:
+def copy_kernels(installed: Path) -> None:
     """Numba's compiled kernels go with sources that are the same: to compile them again takes a minute.
 
     Numba takes what it kept for a source of the same size and time.

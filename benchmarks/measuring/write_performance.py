@@ -55,7 +55,7 @@ are medians without reading and perception, of the tenth of the updates with the
 largest. The exponent is that of a log-log fit against the points of the method's own map, with its 95 % interval; so
 are those of the stages that grow and take at least a twentieth of that time.
 """
-LEAST_SHARE = 0.05  # of the time without reading and perception, for a stage to be named
+MIN_SHARE = 0.05  # of the time without reading and perception, for a stage to be named
 
 
 def benchmark_sections(benchmarks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -178,7 +178,7 @@ def _growth(growth: Growth | None) -> tuple[str, str]:
 
 
 def _growing_stages(summary: MethodSummary) -> str:
-    least = LEAST_SHARE * _stage(summary, MAP).share
+    least = MIN_SHARE * _stage(summary, MAP).share
     mine = [one for one in summary.stages if one.name not in (*NOT_MAP, MAP, TOTAL) and one.share >= least]
     grown = [(one.name, one.against_points) for one in mine if one.against_points is not None]
     return ", ".join(f"{name} {growth.exponent:.2f}" for name, growth in grown if growth.words == "grows")

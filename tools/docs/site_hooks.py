@@ -7,7 +7,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from pages_of_code import PROTOCOLS, made_pages
+from code_pages import PROTOCOLS, made_pages
 from site_text import DOCS, ROOT, ROOT_PAGES, for_site
 
 from su3d_bench.metrics.protocols.loading import protocol_names

@@ -9,7 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
-from made_documents import ROOT, cell, write_or_check
+from generated_pages import ROOT, cell, write_or_check
 
 from su3d_bench.cli.main import build_parser
 
@@ -28,13 +28,13 @@ Every command has these options:
 `--methods`, `--protocols` and `--scenes` take several values, `--method` and `--protocol` one; either spelling works.
 `--set KEY=VALUE` takes keys such as `opensu3d.top_m`, or `method.opensu3d.top_m` as in a file for `--config`.
 """
-IN_EVERY = {"--help", "--json", "--quiet", "--debug"}
+COMMON_OPTIONS = {"--help", "--json", "--quiet", "--debug"}
 # Details that do not fit into the help, and the page with more.
 MORE = {
     "run": "`--methods all` runs OpenSU3D and the seven baselines; `opensu3d@scheme4` (a preset) and "
     "`opensu3d@top_m=1` are variants of a method. See [Run folder](running/run-folder.md), "
     "[Clusters](running/clusters.md) and [GPU](running/gpu.md).",
-    "ablate": "Perception is computed once. `--beside all` adds all methods: one run gives the five tables of the "
+    "ablate": "Perception is computed once. `--also all` adds all methods: one run gives the five tables of the "
     "paper ([Results](numbers/results.md)).",
     "evaluate": "See [Prediction formats](evaluate.md).",
     "reproduce": "See [Reproduce a paper](running/reproduce.md).",
@@ -91,7 +91,7 @@ def _section(name: str, parser: argparse.ArgumentParser) -> str:
     rows = [
         f"| `{cell(_usage(action))}` | {cell((action.help or '').replace('%%', '%'))} |"
         for action in parser._actions
-        if action.help != argparse.SUPPRESS and not IN_EVERY & set(action.option_strings)
+        if action.help != argparse.SUPPRESS and not COMMON_OPTIONS & set(action.option_strings)
     ]
     table = ["| argument or option | meaning |", "|---|---|", *rows, ""] if rows else []
     text = " ".join(part for part in (_summary(parser), MORE.get(name, "")) if part)

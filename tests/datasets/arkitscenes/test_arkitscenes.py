@@ -54,12 +54,12 @@ def test_a_camera_file_may_be_a_millisecond_off_and_images_without_one_are_left_
 
 def test_depth_of_less_confidence_is_left_out_where_it_is_asked(tmp_path: Path) -> None:
     folder = ark.write_scene(tmp_path)
-    sure, all_of_it = (opened(tmp_path, least_confidence=least).frames(ark.SCENE, 1)[0].depth_m for least in (2, 1))
+    sure, all_of_it = (opened(tmp_path, min_confidence=least).frames(ark.SCENE, 1)[0].depth_m for least in (2, 1))
     assert not sure[:, :4].any() and (sure[:, 4:] == all_of_it[:, 4:]).all() and all_of_it[1:, :4].all()
     for path in (folder / "confidence").iterdir():
         path.unlink()
-    with pytest.raises(DataError, match="confidence/ is missing, which option least_confidence needs"):
-        opened(tmp_path, least_confidence=1).frames(ark.SCENE, 1)
+    with pytest.raises(DataError, match="confidence/ is missing, which option min_confidence needs"):
+        opened(tmp_path, min_confidence=1).frames(ark.SCENE, 1)
 
 
 def test_the_wide_camera_takes_the_scanners_depth_or_the_phones_and_is_made_smaller(tmp_path: Path) -> None:
