@@ -271,11 +271,11 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     names = sorted(table, key=lambda name: name.endswith("difference"))
     yield from aligned(
         [
-            ["per cent of intervals that hold the truth", *(f"{n} scenes" for n in sizes)],
+            ["coverage, %", *(f"{n} scenes" for n in sizes)],
             *([name, *(_marked(table[name][n].per_cent(JACKKNIFE)) for n in sizes)] for name in names),
         ]
     )
-    yield f"\n{n_simulations} simulations a cell (a standard error of {100 * (0.0475 / n_simulations) ** 0.5:.1f})."
+    yield f"\n{n_simulations} simulations per cell (standard error {100 * (0.0475 / n_simulations) ** 0.5:.1f})."
     missed = {name: [n for n in sizes if _is_missed(table[name][n].per_cent(JACKKNIFE))] for name in names}
     yield "In italics: outside 93 to 97." if any(missed.values()) else "All are within 93 to 97."
     for name, of_sizes in missed.items():
@@ -289,11 +289,11 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     few = [n for n in sizes if n <= MAX_BOOTSTRAP]
     yield from aligned(
         [
-            ["", *(f"{kind}, {n}" for kind in (BOOTSTRAP, PSEUDO) for n in few)],
-            *([name, *(_cell(table[name][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few)] for name in names),
+            ["", *(f"{kind}, {n}" for kind in (BOOTSTRAP, PSEUDO) for n in few[2::2])],  # 4 and 20 of the default sizes
+            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in names),
         ]
     )
-    yield f"\nThe bootstrap: {N_RESAMPLES} resamples, {min(N_BOOTSTRAP, n_simulations)} simulations a cell.\n"
+    yield f"\nThe bootstrap: {N_RESAMPLES} resamples, {min(N_BOOTSTRAP, n_simulations)} simulations per cell.\n"
 
 
 def _cell(value: float | None) -> str:
@@ -318,7 +318,7 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     rows = [[f"share of {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
     for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 people", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
-    yield from aligned([["per cent of intervals that hold the truth", *(f"{n} items" for n in ITEMS)], *rows])
+    yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
         "\nShares miss the mark, in italics, because counts are whole numbers: coverage goes up and down with rate and "
