@@ -56,10 +56,9 @@ bench-methods: $(VENV)/test
 reference: demo
 	$(BIN)/su3d-bench check --build-from runs/demo --out .ci/reference.json --machine-tolerance 5 --cost-limit 3
 
-# Generates the tables of docs/architecture.md from the code and docs/verbs.md from the parser.
+# Generates the tables of docs/architecture.md from the code.
 architecture: $(VENV)/test
 	$(BIN)/python tools/docs/architecture.py
-	$(BIN)/python tools/docs/verbs_page.py
 
 # The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
 # and --strict would end nothing.

@@ -130,7 +130,13 @@ def faults_in_browser(site: Path) -> Iterator[str]:
     """A line for each thing that a person who opens the start page from a disk would miss, or see badly."""
     from chromium import Chromium
 
-    opened = ["index.html", "verbs.html", "reference/methods/opensu3d.html", f"{FOUND}.html", "reference/api.html"]
+    opened = [
+        "index.html",
+        "reference/commands/run.html",
+        "reference/methods/opensu3d.html",
+        f"{FOUND}.html",
+        "reference/api.html",
+    ]
     for device, width in WIDTHS.items():
         for colours in ("light", "dark"):
             who = f"Chromium, {device}, {colours}"

@@ -49,14 +49,6 @@ def load_verbs() -> None:
     import matplotlib.figure  # noqa: F401
     import openpyxl  # noqa: F401
 
-    import su3d_bench.analysis.page.contents
-    import su3d_bench.cli.sheets
-    import su3d_bench.cli.sheets_make
-    import su3d_bench.human_eval.scores
-    import su3d_bench.human_eval.sets  # noqa: F401
-    import su3d_bench.predictions.export
-    import su3d_bench.reports.page.page
-
 
 def make_inputs(folder: Path) -> None:
     """A finished run, sheets of it, and answers to them."""

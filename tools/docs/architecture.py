@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from generated_pages import ROOT, write_or_check
-
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")  # root folders, reached through links in the package
 USERS = ("benchmarks", ".ci")  # folders beside the package that import it
@@ -36,7 +35,7 @@ PURPOSE = {
     "baselines": "one folder per method: re-implemented systems, other people's programs, the oracle",
     "runs": "a request to jobs, jobs to scenes, frames to methods; resumed, in processes or on clusters",
     "evaluation": "predictions made elsewhere to numbers",
-    "sheets": "what people judge: made, answered, scored",
+    "human_eval": "sheets for annotators: made, answered, scored",
     "analysis": "finished runs compared, gated, ranked, taken apart",
     "reproducing": "a paper's experiments as recipes: needs, runs, reported beside measured, archives; registries",
     "api": "what a program or a notebook calls: runs and predictions to tables of pandas",
@@ -136,8 +135,15 @@ def page_with(parts: dict[str, str], page: str) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the page, or with ``--check`` say whether it still holds."""
-    return write_or_check(PAGE, page_with(drawn(), PAGE.read_text(encoding="utf-8")), arguments)
+    """Write the page; with ``--check`` only compare it, exit code 1 if it is out of date."""
+    written = PAGE.read_text(encoding="utf-8")
+    page = page_with(drawn(), written)
+    if "--check" not in arguments:
+        PAGE.write_text(page, encoding="utf-8")
+    elif page != written:
+        print(f"{PAGE.relative_to(ROOT)} is out of date; run: make architecture")
+        return 1
+    return 0
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
+from command_pages import command_pages
 from site_text import heading, plain, prose, table
 
 import su3d_bench
@@ -50,6 +51,7 @@ def made_pages() -> dict[str, str]:
         f"{METHODS}/index.md": methods_page(methods),
         **{f"{METHODS}/{method['name']}.md": method_page(method) for method in methods},
         API: api_page(),
+        **command_pages(),
     }
 
 

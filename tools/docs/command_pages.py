@@ -1,22 +1,17 @@
-"""docs/verbs.md, generated from the parser: the summary, examples and options of every command.
-
-``python tools/docs/verbs_page.py`` writes the page; ``--check`` checks that it is up to date.
-"""
+"""Pages of the documentation site that are generated from the parser: one per command, and their index."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
-
-from generated_pages import ROOT, cell, write_or_check
 
 from su3d_bench.cli.main import build_parser
 
-PAGE = ROOT / "docs" / "verbs.md"
+COMMANDS = "reference/commands"
+INDEX = f"{COMMANDS}/index.md"
 HEAD = """# Command-line reference
 
-Generated from the parser by `make architecture`; a test keeps it in sync. `su3d-bench COMMAND --help` shows the same.
+`su3d-bench COMMAND --help` shows the same as these pages, which are generated from it.
 Exit codes: 0 success, 1 check failed, 2 invalid input, 3 some scenes failed, 4 internal error.
 
 Every command has these options:
@@ -64,38 +59,56 @@ MORE = {
 }
 
 
-def page() -> str:
-    verbs = list(_verbs(build_parser()))
-    rows = [
-        f"| [`{name}`](#su3d-bench-{name.replace(' ', '-')}) | {cell(_summary(parser))} |" for name, parser in verbs
-    ]
-    parts = [HEAD, "\n".join(["| command | summary |", "|---|---|", *rows]) + "\n"]
-    return "\n".join([*parts, *(_section(name, parser) for name, parser in verbs)])
+def command_pages() -> dict[str, str]:
+    """One page per command, and their index, by place in the site."""
+    commands = list(_commands(build_parser()))
+    rows = [f"| [`{name}`]({_file(name)}) | {cell(_summary(parser))} |" for name, parser in commands]
+    index = "\n".join([HEAD, "| command | summary |", "|---|---|", *rows, ""])
+    return {INDEX: index} | {place_of_command(name): _page(name, parser) for name, parser in commands}
 
 
-def _verbs(parser: argparse.ArgumentParser, path: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+def place_of_command(name: str) -> str:
+    """The page of a command such as ``report html``."""
+    return f"{COMMANDS}/{_file(name)}"
+
+
+def command_names() -> list[str]:
+    return [name for name, _ in _commands(build_parser())]
+
+
+def _file(name: str) -> str:
+    return f"{name.replace(' ', '-')}.md"
+
+
+def _commands(parser: argparse.ArgumentParser, path: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
     deeper = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
     for action in deeper:
         for name, below in action.choices.items():
-            yield from _verbs(below, f"{path} {name}".strip())
+            yield from _commands(below, f"{path} {name}".strip())
     if not deeper:
         yield path, parser
+
+
+def cell(text: str) -> str:
+    """``text`` as a cell of a Markdown table."""
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
 
 
 def _summary(parser: argparse.ArgumentParser) -> str:
     return parser.description or ""
 
 
-def _section(name: str, parser: argparse.ArgumentParser) -> str:
+def _page(name: str, parser: argparse.ArgumentParser) -> str:
     examples = [line.strip() for line in (parser.epilog or "").splitlines()[1:] if line.strip()]
     rows = [
-        f"| `{cell(_usage(action))}` | {cell((action.help or '').replace('%%', '%'))} |"
+        f"| `{_usage(action)}` | {cell((action.help or '').replace('%%', '%'))} |"
         for action in parser._actions
         if action.help != argparse.SUPPRESS and not COMMON_OPTIONS & set(action.option_strings)
     ]
     table = ["| argument or option | meaning |", "|---|---|", *rows, ""] if rows else []
-    text = " ".join(part for part in (_summary(parser), MORE.get(name, "")) if part)
-    return "\n".join([f"## su3d-bench {name}", "", text, "", "```sh", *examples, "```", "", *table])
+    more = MORE.get(name, "").replace("](", "](../../")
+    text = " ".join(part for part in (_summary(parser), more) if part)
+    return "\n".join([f"# su3d-bench {name}", "", text, "", "```sh", *examples, "```", "", *table])
 
 
 def _usage(action: argparse.Action) -> str:
@@ -111,11 +124,3 @@ def _usage(action: argparse.Action) -> str:
         return f"[{several}]" if action.nargs in ("?", "*") else several
     names = ", ".join(action.option_strings)
     return names if action.nargs == 0 else f"{names} {several}"
-
-
-def main(arguments: list[str]) -> int:
-    return write_or_check(PAGE, page(), arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
