@@ -89,7 +89,7 @@ def test_a_map_is_not_labelled_by_data_from_which_it_was_not_made(
     record["steps"]["predict"]["key"]["data"] = "another"
     mark_complete.write_text(json.dumps(record))
     words = ("--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle")
-    assert "painted/b: its data are not those of the run; run it again" in error_of(capsys, run_folder, *words)
+    assert "painted/b: its data have changed since the run; run it again" in error_of(capsys, run_folder, *words)
 
 
 def test_the_only_method_of_a_limited_run_is_meant_and_called_partial(

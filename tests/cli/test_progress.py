@@ -45,10 +45,10 @@ def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkey
     with bars_on(80, monkeypatch) as bars:
         board = _Board(bars, 4, "")
         assert "starting" in plain_lines(bars)[0]
-        board.report(Event(scene, "opensu3d", activity="making the scene"))
-        assert "making the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
+        board.report(Event(scene, "opensu3d", activity="generating the scene"))
+        assert "generating the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
         board.report(Event(scene, "opensu3d", 0, 160))
-        assert "making the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
+        assert "generating the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
         board.report(Event(scene, "opensu3d", 160, 160, 12))
         first, second = plain_lines(bars)
         assert "12 instances" in second and "making" not in second and "starting" not in first

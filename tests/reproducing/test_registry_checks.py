@@ -55,7 +55,7 @@ def other_data(files: Files) -> None:
     [
         (lambda files: flip_labels(files, JOB), "by opensu3d: its counts are not those of its map"),
         (other_rules, "are not those that scored it"),
-        (other_data, "its data are not those of the run"),
+        (other_data, "its data have changed since the run"),
     ],
 )
 def test_a_tampered_bundle_is_refused_with_its_reason(

@@ -48,7 +48,7 @@ def test_rows_of_several_bundles_stand_in_one_ranking_a_protocol_the_best_first(
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('"version": 2', '"version": 3', "was scored under rooms-semantic version 3, here is version 2"),
+        ('"version": 2', '"version": 3', "was scored under rooms-semantic version 3, now it is version 2"),
         ('"is_partial": false', '"is_partial": true', "is partial"),
     ],
 )
