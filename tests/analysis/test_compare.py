@@ -187,7 +187,7 @@ REFUSED = [
     (("a:oracle", "a:oracle"), "a:oracle: both sides are the same"),
     (("a", "b:colector"), "b: has no scores of the method 'colector'; did you mean 'collector'?"),
     (("a", "b:../../b/scenes/painted.a/collector"), "b: has no scores of the method '../../b/scenes"),
-    (("a", "nowhere"), "nowhere: there is no such folder; name that of a run, such as runs/my-run"),
+    (("a", "nowhere"), "nowhere: no such folder; give the folder of a run, such as runs/my-run"),
 ]
 
 
