@@ -1,1 +1,1 @@
-"""``evaluate``: predictions made elsewhere to numbers."""
+"""``evaluate``: score external predictions."""

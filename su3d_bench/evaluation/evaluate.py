@@ -1,7 +1,7 @@
-"""Predictions made elsewhere to the numbers of the published protocols: load, match to ground truth, score, report.
+"""Score external predictions with the published protocols: load, match to ground truth, score, report.
 
-Scene by scene, so that only one scene's masks are in memory. Wrong input raises a ``Su3dError`` of one line before
-anything is answered; what is merely doubtful goes into the result as warnings.
+Works scene by scene, so that only one scene's masks are in memory. Invalid input raises a one-line ``Su3dError``;
+doubtful input only adds warnings to the result.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "warnings_
 
 
 class EvaluationStore(Protocol):
-    """Who keeps what was read: of each scene its content, None where nothing stands for it, and the files."""
+    """Keeps what was read: the content of each scene, None if it has none, and the files."""
 
     def begin(self, truths: SceneTruths, sources: Sequence[Source], *, counts_file_confidences: bool) -> None: ...
 
@@ -42,7 +42,7 @@ class EvaluationStore(Protocol):
 
 
 def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluation:
-    """The numbers of ``request`` under every protocol that is named, or else that fits; ``kept`` gets each scene."""
+    """The numbers of ``request`` under every named protocol, or all that fit; ``kept`` receives each scene."""
     # Load.
     _check_values_have_texts(request, is_text=request.ground_truth is not None)
     texts = read_text_features(request.text_features)
@@ -84,7 +84,7 @@ def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluatio
 
 
 def warnings_of(result: Evaluation) -> list[str]:
-    """What must be said of an evaluation: formats and truth, remarks on the files, why protocols did not score them."""
+    """Lines on an evaluation: formats, ground truth, remarks on the files, and why protocols did not score them."""
     lines = [f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", *result.remarks]
     reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
@@ -94,7 +94,7 @@ def warnings_of(result: Evaluation) -> list[str]:
 
 
 def _open_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
-    """The ground truth that is asked for: a dataset's, or a folder of labels of OpenLex3D or of text files."""
+    """The requested ground truth: a dataset's, or a folder of OpenLex3D labels or of text files."""
     if request.ground_truth is None:
         return DatasetTruths(request, sources)
     if OpenLexRelease.datasets_at(request.ground_truth):
@@ -118,17 +118,17 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
 
 
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
-    """Each remark with the scenes, of ``n`` that have a prediction, whose files it is about."""
+    """Each remark with the scenes it concerns, out of ``n`` scenes with a prediction."""
     for line, scenes in scenes_of_remark.items():
         which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
         yield f"{'every scene' if len(scenes) == n > 1 else which}: {line}"
 
 
 class Scoring:
-    """Scene after scene under the protocols that are named, or else that fit.
+    """Scores scene after scene under the named protocols, or under all that fit.
 
-    ``rules`` and ``outcomes`` hold, by name, the protocols that are still in and what the scenes gave so far; ``unfit``
-    says why others are out. ``file_confidences``: those of the files count where a protocol has 1 for every mask.
+    ``rules`` and ``outcomes`` hold, by name, the remaining protocols and the outcomes so far; ``unfit`` has the reasons
+    for the others. ``file_confidences``: use those of the files if a protocol sets 1 for every mask.
     """
 
     def __init__(
@@ -153,11 +153,11 @@ class Scoring:
             raise ConfigError(f"no protocol can score {truths.where}; see su3d-bench protocols")
 
     def rules_of(self, scene: str) -> list[ProtocolRules]:
-        """The rules under which a scene has a score."""
+        """The protocols under which a scene has a score."""
         return [rules for name, rules in self.rules.items() if scene in self.outcomes[name].scores]
 
     def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
-        """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
+        """Score one scene; at the first non-empty one, protocols that do not fit are dropped or, if named, raise."""
         facts = scene_scoring.facts_of(prediction.content)
         if any(rules.names_masks for rules in self.rules.values()):
             facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
@@ -169,7 +169,7 @@ class Scoring:
             del self.rules[name], self.outcomes[name]
             self.unfit[name] = reason
         if not self.rules:
-            # the one that most of them have says most: files that are missing for one alone may be nobody's
+            # the most frequent reason says most: files that only one protocol needs may not be used at all
             (first, _), *others = Counter(reasons.values()).most_common()
             more = f" (and {len(others)} more reasons)" if others else ""
             raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
@@ -178,9 +178,9 @@ class Scoring:
             self._first = prediction.content
 
     def add_missed(self, scenes: Sequence[str]) -> Content:
-        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed.
+        """Scenes without a prediction: skipped if the original evaluator skips them, otherwise counted as missed.
 
-        What stands for the prediction of one that is counted.
+        Returns the content used as the prediction of a scene that counts as missed.
         """
         nothing = scene_scoring.empty_like(self._first)
         for name, rules in self.rules.items():
@@ -197,7 +197,7 @@ class Scoring:
         return nothing
 
     def results(self) -> tuple[tuple[ProtocolEvaluation, ...], dict[str, str]]:
-        """The numbers of all scenes, and why the other protocols have none."""
+        """The results per protocol over all scenes, and the reasons why the other protocols have none."""
         not_scored = dict(self.unfit)
         protocols = []
         for name, kept in self.outcomes.items():
@@ -212,7 +212,7 @@ class Scoring:
     def _score(
         self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: compatibility.ContentFacts
     ) -> str | None:
-        """The reason why a scene cannot be scored under the protocol; None where it was."""
+        """The reason why a scene cannot be scored under the protocol; None if it was."""
         has_points, kept = self._truths.has_points, self.outcomes[rules.name]
         reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._is_named and self._first is None:
@@ -266,7 +266,7 @@ class Scoring:
 
 
 def _n_under_several_labels(content: Content) -> int:
-    """How many masks stand there under another label too; 0 where no label is given."""
+    """The number of masks that also occur with another label; 0 if there are no labels."""
     labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
     if labels is None or not isinstance(content, Masks):
         return 0

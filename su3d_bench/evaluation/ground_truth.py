@@ -1,7 +1,7 @@
 """The ground truth of an evaluation: a dataset's, text files in the layout of ScanNet's benchmark, or OpenLex3D's.
 
-Each kind opens its scenes, finds the prediction of each, and says which protocols are meant for it. What only datasets
-need is imported where they are opened: texts are scored before that would be there.
+Each kind opens its scenes, finds the prediction of each, and states which protocols are meant for it. What only
+datasets need is imported when they are opened, so that scoring text files starts faster.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from su3d_bench.runs.scenes import data_root
 from su3d_bench.store.records import TruthRecord
 
 NOT_INTENDED = "is not meant for"
-LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
+LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as in the instance metric
 
 
 @dataclass(frozen=True)
 class VertexTruth:
-    """The truth of a scene whose points have no coordinates: ``values`` (N,) class id * 1000 + instance, or class ids.
+    """Ground truth of points without coordinates: ``values`` (N,) are class id * 1000 + instance, or class ids.
 
-    ``doubts``: what makes it doubtful that the labels are those of the protocol.
+    ``doubts``: reasons to doubt that the labels are those of the protocol.
     """
 
     values: Int64Array
@@ -51,9 +51,9 @@ class VertexTruth:
 
 
 class SceneTruths(ABC):
-    """The truth of every scene of an evaluation, and the prediction of each that has one.
+    """The ground truth of every scene of an evaluation, and the prediction of each that has one.
 
-    ``where`` is what messages call it; ``has_points``: its points have coordinates.
+    ``where`` is its name in messages; ``has_points``: its points have coordinates.
     """
 
     has_points = True
@@ -66,15 +66,15 @@ class SceneTruths(ABC):
     @property
     @abstractmethod
     def record(self) -> TruthRecord:
-        """What a run says that it was held against."""
+        """The ground truth as recorded in a run."""
 
     @property
     def target(self) -> str:
-        """What the addresses of the scenes begin with in the settings of a run."""
+        """The prefix of scene addresses in the settings of a run."""
         return self.dataset_name or GROUND_TRUTH_FILES
 
     def address(self, scene: str) -> str:
-        """The scene as a run calls it."""
+        """The address of the scene in a run."""
         return f"{self.dataset_name or GROUND_TRUTH_FILES}/{scene}"
 
     @abstractmethod
@@ -82,23 +82,23 @@ class SceneTruths(ABC):
         """A key of the data of a scene."""
 
     def add_queries(self, path: Path) -> None:
-        """Score the texts in a file too, over the objects that they speak of."""
+        """Also score the texts in a file, over the objects that they refer to."""
         raise ConfigError("evaluate: --queries needs the objects of a dataset; name one with --dataset")
 
     @abstractmethod
     def incompatibility(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
-        """Why no prediction can be scored under a protocol; None where one can."""
+        """Why no prediction can be scored under a protocol; None if one can."""
 
     @abstractmethod
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth | VertexTruth:
-        """What a protocol scores a scene against; ``GroundTruthMissing`` where there is none in its form."""
+        """The ground truth of a scene for a protocol; ``GroundTruthMissing`` if there is none in its form."""
 
 
 # ---- datasets
 
 
 class DatasetTruths(SceneTruths):
-    """Truth with coordinates, read when it is asked for; that of one scene is kept."""
+    """Ground truth with coordinates, read on demand; that of one scene is cached."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         self._target = request.dataset or _dataset_of(sources)
@@ -176,7 +176,7 @@ def no_queries_reason(*, is_named: bool) -> str:
 
 
 def _dataset_of(sources: Sequence[Source]) -> str:
-    """The dataset that the names of the predictions begin with."""
+    """The dataset prefix of the prediction names."""
     names = [name for source in sources for name in source.scenes]
     of_names = {name.partition("/")[0] for name in names if "/" in name}
     if len(of_names) == 1:
@@ -187,24 +187,24 @@ def _dataset_of(sources: Sequence[Source]) -> str:
 
 
 def open_dataset(name: str) -> Any:
-    """The dataset called ``name`` with its default settings, below the data root."""
+    """The dataset called ``name`` with its default settings, in the data root."""
 
     dataset_class = registry.load("dataset", name)
     return dataset_class(data_root(), dataset_class.Options())
 
 
 def _is_of_one_scene(path: Path) -> bool:
-    """Whether a path stands for its scene alone: a file, or the folder of one method and scene in a run."""
+    """Whether a path has one scene only: a file, or the folder of one method and scene in a run."""
     return path.is_file() or (path / "prediction.npz").is_file()
 
 
 def _are_all(words: Sequence[str], known: Sequence[str]) -> bool:
-    """Whether every one of ``words`` names a scene of the list, and not one that is made on demand."""
+    """Whether every one of ``words`` names a listed scene, not one generated on demand."""
     return bool(words) and all(word.rpartition("/")[2] in known for word in words)
 
 
 def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> list[str]:
-    """The scenes of ``known`` that ``words``, names or patterns, mean; a dataset before a slash is passed over."""
+    """The scenes of ``known`` that match ``words``, names or patterns; a dataset before a slash is ignored."""
     chosen: dict[str, None] = {}
     for word in words:
         pattern = word.rpartition("/")[2]
@@ -217,7 +217,7 @@ def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> lis
 
 
 def dataset_of_names(scenes: Iterable[str]) -> str | None:
-    """The dataset whose scenes have such names; None where that cannot be told.
+    """The dataset whose scenes have such names; None if unknown.
 
     >>> dataset_of_names(["scene0011_00", "scene0011_01"]), dataset_of_names(["a"])
     ('scannet', None)
@@ -234,7 +234,7 @@ def dataset_of_names(scenes: Iterable[str]) -> str | None:
 
 
 class OpenLexTruths(SceneTruths):
-    """OpenLex3D's labels and queries of one dataset, whose own data lie below the data root."""
+    """OpenLex3D's labels and queries of one dataset, whose own data are in the data root."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         assert request.ground_truth is not None
@@ -264,7 +264,7 @@ class OpenLexTruths(SceneTruths):
 
 
 def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRelease:
-    """The labels of the dataset that is named, else of the only one that the scenes or the predictions fit."""
+    """The labels of the named dataset, otherwise of the only one that the scenes or the predictions fit."""
     assert request.ground_truth is not None
     where, folder = shown(request.ground_truth), request.ground_truth
     each = {name: OpenLexRelease(folder, data_root(), name) for name in OpenLexRelease.datasets_at(folder)}

@@ -23,13 +23,14 @@ ValuesForm = Literal["classes", "instances", "numbers"]
 
 @dataclass(frozen=True)
 class Request:
-    """What to score: ``predictions`` are folders or files; everything else may be left out.
+    """What to score: ``predictions`` are folders or files; everything else is optional.
 
-    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``ground_truth_values``: what
-    their values are, where that is not plain from them. ``protocols``: all that fit where none is named. ``scenes``:
-    names or patterns. ``confidences``: where a protocol has 1 for every mask, its own rule, or what the files say;
-    None: what the files say in the official script's format, which that script reads as it stands, and the protocol's
-    rule in all others. ``queries``: a file of texts and the objects that they speak of, for ``query-ap``.
+    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
+    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default all that fit.
+    ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
+    the values in the files ("file"); None: those in the files for the official script's format, as that script does,
+    and the protocol's rule for all others. ``queries``: a file of texts and the objects that they refer to, for
+    ``query-ap``.
     """
 
     predictions: tuple[Path, ...]
@@ -50,7 +51,7 @@ def default_name(out: Path | None) -> str:
 
 
 SCHEMA = 1
-# What the file calls the metrics; the first ones of each kind are its headline.
+# Names of the metrics in the file; the first ones of each kind are its headline.
 KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
     "recall": "acc", "precision": "precision", "IoU": "iou", "F1": "f1", "mPrecision": "mprecision", "mF1": "mf1",
@@ -59,7 +60,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class SceneOutcome:
-    """One scene under one protocol: counts of the prediction, of the ceiling and of every mask under every class."""
+    """One scene under one protocol: counts of the prediction, of the ceiling and of every mask with every class."""
 
     score: SceneScore
     ceiling: SceneScore | None = None
@@ -98,14 +99,14 @@ class SceneOutcomes:
 
 @dataclass(frozen=True)
 class ProtocolEvaluation:
-    """One protocol: ``result`` with the ``ceiling``, and ``every_class``, what every mask under each class would score.
+    """One protocol: ``result``, the ``ceiling``, and ``every_class``, the score of every mask with every class.
 
-    ``with_ones``: what 1 for every confidence gives, where the protocol has that and the files' own count.
+    ``with_ones``: the metrics with 1 for every confidence, if the protocol sets that but those in the files are used.
 
-    ``missed`` scenes have no prediction and count as missed, ``skipped`` ones are left out as the original does.
+    ``missed`` scenes have no prediction and count as missed, ``skipped`` ones are skipped as in the original evaluator.
     ``scores`` and ``ceilings`` are by scene, ``unscored`` has a reason for each of the others; ``encoder``: name and
-    digest of what named the features. ``coverage``: by radius in metres the share of scored points with a predicted
-    point that near, None without coordinates. ``labels``: how many of a mask or point count, None where none does.
+    digest of the encoder that classified the features. ``coverage``: by radius in metres, the share of scored points
+    with a predicted point within it, None without coordinates. ``labels``: which labels count, None if none do.
     """
 
     rules: ProtocolRules
@@ -177,7 +178,7 @@ class ProtocolEvaluation:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All protocols; ``not_scored`` has a reason for each of the others, ``remarks`` are of the files themselves."""
+    """All protocols; ``not_scored`` has a reason for each of the others, ``remarks`` concern the files."""
 
     protocols: tuple[ProtocolEvaluation, ...]
     not_scored: Mapping[str, str]
@@ -226,16 +227,16 @@ def formed(rules: ProtocolRules, kept: SceneOutcomes, *, file_confidences: bool)
         ),
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
-    # of kind 'instance' said above, for all scenes at once
+    # for kind 'instance' already reported above, for all scenes at once
     lines += [line for line in result.warnings if not (rules.needs_instances and CONSTANT_CONFIDENCE in line)]
     return replace(evaluation, warnings=tuple(dict.fromkeys(lines)))
 
 
 def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | None:
-    """The metrics with 1 for every confidence; None where the protocol, or the files themselves, have that anyway.
+    """The metrics with 1 for every confidence; None if the protocol does not set 1, or the files already have only 1.
 
-    Which predictions hit does not depend on confidences, but a hit that is met twice takes the better one; with 1 for
-    all there is no better one.
+    Which predictions match does not depend on confidences, but an instance matched twice takes the higher one; with 1
+    for all there is no difference.
     """
     if rules.confidence != "ones":
         return None
@@ -289,7 +290,7 @@ def some_names(names: Sequence[str]) -> str:
 
 
 def _key(name: str) -> str:
-    """What the file calls a metric; one of the k likeliest classes has their number before its name.
+    """The name of a metric in the file; for the k most likely classes it begins with k.
 
     >>> _key("mIoU"), _key("top-3 mIoU"), _key("mF1-other")
     ('miou', 'top_3_miou', 'mf1_other')
@@ -299,6 +300,6 @@ def _key(name: str) -> str:
 
 
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values under the names that the file has for them, without counts of classes."""
+    """Values under their names in the file, without counts of classes."""
     plain = {_key(name): plain_json(value) for name, value in values.items()}
     return {name: value for name, value in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}

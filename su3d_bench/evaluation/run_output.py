@@ -1,6 +1,6 @@
-"""Predictions made elsewhere as a run folder: what ``run`` writes of a method, but for what a method alone can tell.
+"""External predictions as a run folder: what ``run`` writes, except what only a method itself can report.
 
-The counts are those of the evaluation, so that every number of the run is the one that it answers, to the last bit.
+The counts are those of the evaluation, so every number of the run equals the evaluation's to the last bit.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from su3d_bench.runs.summary import COMPUTED_BY_METHOD, confidences_of
 from su3d_bench.store import records
 from su3d_bench.store.run_folder import RunFolder
 
-FILE_CONFIDENCES = "those of the files"
-OVERRIDDEN_CONFIDENCES = "those of the files, where the protocol has 1 for every mask"
+FILE_CONFIDENCES = "those in the files"
+OVERRIDDEN_CONFIDENCES = "those in the files, although the protocol sets 1 for every mask"
 _SCENE_AND_SENTENCE = re.compile(r"([^:]*): (.*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """Evaluations by method, and as a run.  ``existed``: the folder held them already and stayed as it was."""
+    """Evaluations by method, and as a run. ``existed``: the folder already had them and was not changed."""
 
     evaluations: Mapping[str, Evaluation]
     metrics: records.MetricsRecord
@@ -55,7 +55,7 @@ class EvaluatedRun:
 
 @dataclass
 class _Kept:
-    """What is known of one method's predictions; the maps go to ``folder``, where there is one."""
+    """The state of one method's predictions; the maps go to ``folder``, if there is one."""
 
     method: str
     request: Request
@@ -75,7 +75,7 @@ class _Kept:
         self._write(address, self._shown(scene, content, rules))
 
     def _shown(self, scene: str, content: Content, rules: Sequence[ProtocolRules]) -> Content:
-        """The map as it is scored: on the points of the truth, under the names of the first protocol with classes."""
+        """The map as scored: on the ground-truth points, with the names of the first protocol with classes."""
         for each in sorted(rules, key=lambda one: one.class_agnostic is not None):
             truth = self.truths.of_scene(each, scene)
             if isinstance(truth, GroundTruth):
@@ -83,7 +83,7 @@ class _Kept:
         return content
 
     def record_no_score(self, address: str) -> None:
-        """That a scene of another method has no score of this one."""
+        """Record that this method has no score for a scene of another method."""
         self._write(address, Instances.of(np.zeros((0, 3), np.float32), [], labels=()))
         self.files[address] = {}
 
@@ -108,10 +108,9 @@ class _Kept:
 
 
 def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -> EvaluatedRun:
-    """The numbers of each method's predictions, written as one run to ``out`` where it is given.
+    """The numbers of each method's predictions, written as one run to ``out`` if given.
 
-    A folder that holds the same evaluation stays as it is, byte for byte; a ``StoreError`` where it holds another one,
-    or anything else.
+    A folder with the same evaluation is not changed; ``StoreError`` if it contains another evaluation or anything else.
     """
     for method in requests:
         check_method_name(method)
@@ -137,7 +136,7 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
 
 
 def check_method_name(name: str) -> None:
-    """A ``ConfigError`` where predictions cannot be called so."""
+    """``ConfigError`` if predictions cannot have this name."""
     check_folder_name("--name", name)
     if name == CEILING_METHOD:
         raise ConfigError(f"--name: '{name}' is reserved for the ground-truth ceiling; choose another name")
@@ -149,7 +148,7 @@ def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
 
 
 def _check_same_runs(out: Path) -> None:
-    """A ``StoreError`` where ``out`` holds something that no evaluation wrote, before anything is scored."""
+    """``StoreError``, before anything is scored, if ``out`` contains something that no evaluation wrote."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         raise StoreError(f"{shown(out)}: is not a folder; choose another with --out")
     RunFolder(out).check_is_run_folder()
@@ -158,12 +157,12 @@ def _check_same_runs(out: Path) -> None:
         and not records.read_record(records.RunRecord, out / "run.json", shown(out)).predictions
     ):
         raise StoreError(
-            f"{shown(out)}: holds a run that is not an evaluation of external predictions; choose another with --out"
+            f"{shown(out)}: contains a run that is not an evaluation of external predictions; choose another with --out"
         )
 
 
 def _check_same_evaluation(out: Path, record: records.RunRecord, metrics: records.MetricsRecord) -> None:
-    """A ``StoreError`` where ``out`` holds another evaluation than the one of ``record``, which says in what."""
+    """``StoreError`` if the evaluation in ``out`` is not the one of ``record``; the message states the difference."""
     there = records.read_record(records.RunRecord, out / "run.json", shown(out))
     pairs = {what: (of(there), of(record)) for what, of in _IDENTITY.items()}
     other = next((what for what, (before, now) in pairs.items() if before != now), None)
@@ -171,12 +170,12 @@ def _check_same_evaluation(out: Path, record: records.RunRecord, metrics: record
         other = "numbers, though of the same files" if there.code == record.code else "numbers of another version"
     if other is not None:
         raise StoreError(
-            f"{shown(out)}: holds a different evaluation (other {other}); choose another --out, or remove the folder"
+            f"{shown(out)}: contains a different evaluation (other {other}); choose another --out, or remove the folder"
         )
 
 
 def _without_paths(record: records.RunRecord) -> list[object]:
-    """The predictions of a run by what they hold, wherever they lay."""
+    """The predictions of a run by content, regardless of their paths."""
     return [
         [one.formats, one.confidences, one.texts and one.texts[1]]
         + [(scene, sorted(digests.values())) for scene, digests in one.files.items()]
@@ -207,7 +206,7 @@ def _metrics(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> re
 
 
 def _scenes(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> tuple[str, ...]:
-    """The scenes that any method has a score of, in the order of the truth."""
+    """The scenes for which any method has a score, in the order of the ground truth."""
     scored = {scene for one in evaluations.values() for protocol in one.protocols for scene in protocol.scores}
     truths = kept[0].truths
     return tuple(truths.address(scene) for scene in _names(kept) if scene in scored)
@@ -250,7 +249,7 @@ def _numbers(kept: _Kept, found: ProtocolEvaluation) -> records.NumbersRecord:
 
 
 def _warning(kept: _Kept, line: str) -> str:
-    """A warning with the address of its scene before it, or what stands there where it is of all."""
+    """A warning with the address of its scene as prefix, or that of every scene."""
     parts = _SCENE_AND_SENTENCE.fullmatch(line)
     if parts is None or (parts[1] not in kept.truths.scenes and parts[1] != EVERY_SCENE):
         return f"{EVERY_SCENE}: {line}"
@@ -268,7 +267,7 @@ def _confidences(kept: _Kept, found: ProtocolEvaluation) -> str | None:
 
 
 def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> records.RunRecord:
-    """Write everything but the maps, which are there; the record of the run."""
+    """Write everything except the maps, which already exist; return the record of the run."""
     record = _record(kept, run)
     for one in kept:
         for address in record.scenes:
@@ -309,7 +308,7 @@ def _mark_complete(
 
 
 def _write_ceilings(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation], folder: RunFolder) -> None:
-    """What the truth itself scores, where a run has it: as the counts of the method that is told the truth."""
+    """Write the scores of the ground truth as the counts of the ceiling method."""
     ceilings: dict[str, dict[str, SceneScore]] = {}
     for one in kept:
         for found in evaluations[one.method].protocols:
@@ -357,7 +356,7 @@ def _names(kept: Sequence[_Kept]) -> list[str]:
 
 
 def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]) -> Iterable[records.UnscoredRecord]:
-    """Why scenes of the run have no score of a method under a protocol."""
+    """Why scenes of the run have no score for a method and protocol."""
     for one in kept:
         evaluation = run.evaluations[one.method]
         found = {each.rules.name: each for each in evaluation.protocols}
@@ -374,11 +373,11 @@ def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]
 def _missing_reason(evaluation: Evaluation, found: ProtocolEvaluation | None, protocol: str, scene: str) -> str:
     if found is None:
         return printable(evaluation.not_scored.get(protocol, "is not scored"))
-    return printable(found.unscored.get(scene, "has no prediction, and is left out as the original evaluator does"))
+    return printable(found.unscored.get(scene, "has no prediction, and is skipped as in the original evaluator"))
 
 
 def _settings(kept: Sequence[_Kept], record: records.RunRecord) -> list[tuple[tuple[str, ...], object, str]]:
-    """What was asked for, as far as a run has it."""
+    """The settings of the request that a run records."""
     request, target = kept[0].request, kept[0].truths.target
     name = record.scenes[0].partition("/")[0]
     scenes = [f"{target}/{address.removeprefix(f'{name}/')}" for address in record.scenes]

@@ -1,4 +1,4 @@
-"""One scene under one protocol: its counts, those of the ceiling, and what must stand beside them."""
+"""One scene under one protocol: its counts, those of the ceiling, and the warnings."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
 
 
 def with_confidences_of_files(rules: ProtocolRules) -> ProtocolRules:
-    """The rules with the predictions' own confidences where a protocol has 1 for every mask."""
+    """The rules with the predictions' own confidences if a protocol sets 1 for every mask."""
     return rules.model_copy(update={"confidence": "prediction"}) if rules.confidence == "ones" else rules
 
 
 def skips_missing_scenes(rules: ProtocolRules) -> bool:
-    """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
+    """Whether the original skips scenes without a prediction, so that their objects never count as missed.
 
-    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files, but
-    for OpenSUN3D's and those whose files hold places in a list of classes, which stop at the first scene without a
-    prediction. A protocol of a user, or of rooms that are made here, has no original.
+    evaluate_semantic_instance.py, evaluate_semantic_label.py and their derivatives iterate over the prediction files,
+    except OpenSUN3D's and those whose files have indices into a list of classes, which stop at the first scene without
+    a prediction. Custom protocols and those of the generated rooms have no original.
     """
     stops = rules.class_agnostic == "numbered" or (rules.class_numbers == "lines" and rules.names_masks)
     if rules.metric != "scannet" or rules.name not in protocol_names() or stops:
@@ -56,7 +56,7 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
 
 
 def facts_of(content: Content) -> ContentFacts:
-    """What the question asks whether a protocol may score ``content``."""
+    """The facts that decide whether a protocol can score ``content``."""
     if isinstance(content, VertexLabels):
         n = len(content.class_ids)
         ids = content.class_ids if content.numbering == "id" else None
@@ -74,7 +74,7 @@ def facts_of(content: Content) -> ContentFacts:
 
 
 def empty_like(content: Content | None) -> Content:
-    """An empty prediction of the same kind, for a scene that was not predicted; masks where no kind is known."""
+    """An empty prediction of the same kind, for a scene without a prediction; masks if the kind is unknown."""
     none = np.zeros(0, np.int32)
     if isinstance(content, VertexLabels):
         return VertexLabels(none)
@@ -115,7 +115,7 @@ def score_on_vertices(
 
 
 def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
-    """What must be said where a rule makes one object of those that share a number, as its original does."""
+    """A warning if a protocol, like its original, merges objects that share a number."""
     if rules.class_agnostic != "everything":
         return []
     objects = np.unique(values[values >= instance_ap.INSTANCES_PER_CLASS])
@@ -123,15 +123,15 @@ def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
     if not n:
         return []
     return [
-        f"{scene}: the instance numbers begin anew with each class, and {n} of {len(objects)} objects melt with another"
-        " of their number, as in the original, which takes values modulo 1000; number the objects of a scene through"
+        f"{scene}: instance numbers restart with each class, so {n} of {len(objects)} objects merge with another of the"
+        " same number, as in the original (values modulo 1000); number the objects of a scene consecutively"
     ]
 
 
 def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndarray) -> SceneScore:
     true_class = class_index_of_ids(rules, labels)
     called = class_index_of_ids(rules, class_ids)
-    if class_ids.any():  # else nothing was predicted
+    if class_ids.any():  # otherwise nothing was predicted
         called = with_unnamed(rules, called)
     counts = semantic.per_scene(true_class, called, scored_classes(rules))
     return _score(rules, counts, len(np.unique(class_ids)), int((true_class >= 0).sum()))
@@ -149,7 +149,7 @@ def _instance_score(
 def _segment_counts(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
 ) -> PanopticCounts:
-    """The counts of masks with class ids (K,) where every point is in one segment."""
+    """The counts of masks with class ids (K,) if every point is in one segment."""
     semantic, instance = np.divmod(values, instance_ap.INSTANCES_PER_CLASS)
     return count_segments(rules, semantic, instance, masks, scores, ids)
 
@@ -157,7 +157,7 @@ def _segment_counts(
 def _instance_counts(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array | None
 ) -> instance_ap.InstanceCounts:
-    """The counts of masks with class ids (K,), or without any of each mask under every class."""
+    """The counts of masks with class ids (K,), or of each mask with every class if ``ids`` is None."""
     assert rules.min_region_size is not None
     used = np.ones(len(masks)) if rules.confidence == "ones" else scores
     return scene_counts.per_scene(
@@ -179,7 +179,7 @@ def _score(
     n_predictions: int,
     n_scored: int,
 ) -> SceneScore:
-    nowhere = np.zeros(len(transfer.COVERAGE_RADII_M), np.int64)  # without coordinates nothing is known of distances
+    nowhere = np.zeros(len(transfer.COVERAGE_RADII_M), np.int64)  # distances are unknown without coordinates
     return SceneScore(rules.name, rules.version, counts, n_predictions, n_scored, nowhere, ())
 
 
@@ -190,7 +190,7 @@ def _class_ids(rules: ProtocolRules) -> list[int]:
 def _ids_of_masks(
     rules: ProtocolRules, masks: VertexMasks, labels: Int64Array, encoder: Encoder | None
 ) -> tuple[Int64Array, list[str]]:
-    """The class id of each mask, 0 where it has none of the protocol's; and what a reader must know of the names."""
+    """The class id of each mask, 0 if it has none of the protocol's; and warnings on the names."""
     if rules.class_agnostic is not None or not len(masks):
         return np.full(len(masks), OBJECT, np.int64), []
     if masks.class_numbers is not None:
@@ -202,7 +202,7 @@ def _ids_of_masks(
 
 
 def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Array) -> SceneScore:
-    """What the annotated objects themselves score."""
+    """The score of the annotated objects themselves."""
     row, distinct, _ = scene_counts.segments_of(truth.values)
     is_object = distinct >= instance_ap.INSTANCES_PER_CLASS
     n_void = int((~is_object).sum())
@@ -215,7 +215,7 @@ def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Arr
 def score_on_truth(
     rules: ProtocolRules, truth: GroundTruth, scene: str, content: Content, encoder: Encoder | None
 ) -> SceneOutcome:
-    """The outcome against the truth of a dataset; what has no points of its own stands on those of the truth."""
+    """The outcome against a dataset's ground truth; content without its own points uses those of the ground truth."""
     prediction = map_of(content, truth.points, rules)
     if isinstance(content, VertexMasks):
         warnings = checks.class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
@@ -237,12 +237,12 @@ def score_on_truth(
 
 
 def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Prediction:
-    """The map of ``content``; what has no points of its own stands on those of the truth."""
+    """The map of ``content``; content without its own points uses those of the ground truth."""
     return content.on(points, rules) if isinstance(content, VertexMasks | VertexLabels) else content
 
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
-    """What the truth itself scores through the same steps; None where it has no instances to hand over."""
+    """The score of the ground truth through the same steps; None if it has no instances."""
     told = visible_truth(rules, truth)
     if not told.instance.any():
         return None
@@ -259,9 +259,9 @@ def score_on_objects(
     content: Content,
     encoder: Encoder | None,
 ) -> SceneOutcome:
-    """The outcome against objects with labels, queries or questions; an empty map where ``content`` has no points.
+    """The outcome against objects with labels, queries or questions; an empty map if ``content`` has no points.
 
-    Labels n' are those of the vote, for a file beside a run's map is not part of a prediction.
+    Labels n' are those of the vote, because a file next to a run's map is not part of a prediction.
     """
     prediction: Prediction = NOTHING if isinstance(content, VertexMasks | VertexLabels) else content
     base = truth.scene if isinstance(truth, QuestionTruth) else truth

@@ -42,20 +42,19 @@ from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import TruthRecord
 
-LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv, the longest list of classes that is known here
+LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv, the longest known list of classes
 FORMS: dict[ValuesForm, str] = {
-    "classes": "class ids alone",
+    "classes": "class ids only",
     "instances": "class id * 1000 + instance",
-    "numbers": "numbers of objects alone",
+    "numbers": "object numbers only",
 }
-BEYOND = (OBJECT + 1) * INSTANCES_PER_CLASS  # values of the label 2: no object where values are numbers
+BEYOND = (OBJECT + 1) * INSTANCES_PER_CLASS  # values of the label 2: no object if values are object numbers
 FLAG = "--ground-truth-values"
 
 
 @dataclass(frozen=True)
 class TruthValues:
-    """The range of the values of all scenes without 0, both 0 where nothing is annotated, and what they are ``stated``
-    to be."""
+    """The range of the nonzero values of all scenes, 0 and 0 without any; ``stated``: their configured form."""
 
     lowest: int
     highest: int
@@ -68,10 +67,10 @@ class TruthValues:
         return cls(lowest, max((int(values.max()) for values in annotated), default=0), stated)
 
     def form(self, rules: ProtocolRules) -> ValuesForm | None:
-        """What they are under a protocol; None where they may be one or the other and nobody said which.
+        """The form of the values under a protocol; None if it is ambiguous and not configured.
 
-        From 1000 to the largest class id they may be instances of the class 1. Then values below 1000 speak for class
-        ids where a protocol needs no instances, for as instances they would be of no class.
+        From 1000 to the largest class id they may be instances of class 1. Then values below 1000 indicate class ids if
+        a protocol needs no instances, because as instances they would have no class.
         """
         if self.stated is not None:
             return self.stated
@@ -84,12 +83,12 @@ class TruthValues:
         return None if rules.needs_instances or self.lowest >= INSTANCES_PER_CLASS else "classes"
 
     def incompatibility(self, rules: ProtocolRules) -> str | None:
-        """Why a protocol cannot score against such values."""
+        """Why a protocol cannot score against these values; None if it can."""
         form, values = self.form(rules), f"the values of the ground truth, {self.lowest} to {self.highest},"
         if form is None:
             return (
-                f"{values} may be {FORMS['classes']}, or {FORMS['instances']} of class 1; say which with {FLAG} "
-                "classes or instances (numbers: of objects alone)"
+                f"{values} may be {FORMS['classes']}, or {FORMS['instances']} of class 1; choose with {FLAG} "
+                "classes or instances (numbers: object numbers only)"
             )
         if form == "numbers" and (rules.class_agnostic in {None, "scored"}):
             return f"needs classes, and {values} are {FORMS['numbers']}"
@@ -97,21 +96,21 @@ class TruthValues:
             return None
         if not self.highest:
             return "needs instances, and every value of the ground truth is 0: nothing is annotated"
-        are = f"are said to be {FORMS['classes']}" if self.stated else f"are {FORMS['classes']}"
+        are = f"are configured as {FORMS['classes']}" if self.stated else f"are {FORMS['classes']}"
         return (
-            f"needs instances, and {values} {are}: {FORMS['instances']} is never below 1000; where they are "
-            f"{FORMS['numbers']}, say {FLAG} numbers"
+            f"needs instances, and {values} {are}: {FORMS['instances']} is never below 1000; if they are "
+            f"{FORMS['numbers']}, use {FLAG} numbers"
         )
 
     def doubts(self, rules: ProtocolRules) -> tuple[str, ...]:
-        """What makes it doubtful that the labels are those of a protocol."""
+        """Reasons to doubt that the labels are those of a protocol."""
         if self.form(rules) == "numbers":
             line = f"values of the ground truth from {BEYOND} up are background, as in OpenSUN3D's script"
             return (line,) if self.highest >= BEYOND else ()
         largest = self.largest_label(rules)
         if rules.ground_truth == "nyu40-vertices" and largest > LARGEST_NYU40_ID:
             return (
-                f"the ground truth holds the label {largest}, NYU40 ends at {LARGEST_NYU40_ID}: are these raw ids "
+                f"the ground truth has the label {largest}, NYU40 ends at {LARGEST_NYU40_ID}: are these raw ids "
                 "of ScanNet200? points of other classes are void",
             )
         if rules.ground_truth == "scannet200-vertices" and largest <= LARGEST_NYU40_ID:
@@ -119,14 +118,14 @@ class TruthValues:
         return ()
 
     def largest_label(self, rules: ProtocolRules) -> int:
-        """The largest class id among them."""
+        """The largest class id among the values."""
         return self.highest // INSTANCES_PER_CLASS if self.form(rules) == "instances" else self.highest
 
     def read(self, values: Int64Array, rules: ProtocolRules) -> tuple[Int64Array, Int64Array]:
         """The values (N,) of a scene as a protocol scores them, and the label (N,) of each point, 0 for none.
 
-        Numbers become 1001, 1002, ... in ascending order, as do all instances under a protocol that goes by numbers
-        alone.
+        Object numbers become 1001, 1002, ... in ascending order, as do all instances under a protocol that uses only
+        object numbers.
         """
         form = self.form(rules)
         if form == "classes":
@@ -142,7 +141,7 @@ class TruthValues:
 
 
 class TextTruths(SceneTruths):
-    """Labels of points without coordinates; what values mean is said, or told from all scenes together."""
+    """Labels of points without coordinates; the meaning of the values is configured, or inferred from all scenes."""
 
     has_points = False
 
@@ -168,7 +167,7 @@ class TextTruths(SceneTruths):
         self._range = self._all = TruthValues.of(self._values.values(), self._said)
         if self.matches and self.dataset_name is None and not request.protocols:
             raise ConfigError(
-                f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
+                f"{self.where}: unknown label set; name the protocol with --protocol or the dataset with --dataset"
             )
 
     @property
@@ -194,17 +193,17 @@ class TextTruths(SceneTruths):
         variant = list_of_ids(largest := self._range.largest_label(rules))
         if variant == rules.ground_truth:
             return None
-        other = "; name the protocol where they are of its own list" if largest <= LARGEST_NYU40_ID else ""
+        other = "; name the protocol if they are of its own list" if largest <= LARGEST_NYU40_ID else ""
         return f"the labels of the ground truth go up to {largest}, as {ID_LISTS[variant]}{other}"
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
-        if scene not in self._values:  # missed: the doubts speak of all that are scored
+        if scene not in self._values:  # a missed scene: the doubts cover all scored scenes
             self._values |= {name: read_values(file) for name, file in self._files.items() if name not in self._values}
             self._all = TruthValues.of(self._values.values(), self._said)
         if self._all.form(rules) != self._range.form(rules):
             raise DataError(
                 f"{self.where}: the values of scenes without a prediction go up to {self._all.highest}, those of the "
-                f"others to {self._range.highest}; say what they are with {FLAG} classes, instances or numbers"
+                f"others to {self._range.highest}; choose their form with {FLAG} classes, instances or numbers"
             )
         values, labels = self._range.read(self._values[scene], rules)
         return VertexTruth(values, labels, self._all.doubts(rules))
@@ -217,14 +216,14 @@ def text_scenes(folder: Path) -> dict[str, Path]:
     with converted(PredictionError, DataError):
         files = scene_files(folder, (".txt",))
     if odd := next((name for name in files if not name.isprintable()), None):
-        raise DataError(f"{shown(folder)}: holds a file '{printable(odd, 80)}'; name files after scenes")
+        raise DataError(f"{shown(folder)}: contains a file '{printable(odd, 80)}'; name files after scenes")
     if not files:
         raise DataError(f"{shown(folder)}: has no .txt file; expected <scene>.txt, one value per point")
     return files
 
 
 def read_values(path: Path) -> Int64Array:
-    """One value a point of a scene: a class id, or class id * 1000 + instance."""
+    """One value per point of a scene: a class id, or class id * 1000 + instance."""
     where = shown(path)
     with converted(PredictionError, DataError), reading(where, DataError):
         values = integer_lines(file_bytes(path), where).astype(np.int64)
@@ -233,31 +232,31 @@ def read_values(path: Path) -> Int64Array:
     is_wrong = (values < 0) | (values > LARGEST_VALUE)
     if is_wrong.any():
         line = int(np.argmax(is_wrong))
-        raise DataError(f"{where}:{line + 1}: {int(values[line])} is negative; expected class id * 1000 + instance")
+        raise DataError(f"{where}:{line + 1}: {int(values[line])} is out of range; expected class id * 1000 + instance")
     return values
 
 
-# ---- the truth and maps of a run, with places for whoever explains its errors
-# Files of ground truth number points and say nothing of where they are. Which mask lies on which object is known from
-# the numbers, so each point gets a place of its own, a metre from any other: the nearest point of a map is the same.
+# ---- the ground truth and maps of a run, with point positions for error attribution
+# Ground-truth files index points and have no coordinates. The indices state which mask lies on which object, so each
+# point gets its own position, at least a metre from any other: the nearest point of a map is then the same point.
 
-ROW = 256  # places along an axis before the next row begins
+ROW = 256  # positions along an axis before the next row begins
 
 
 class GroundTruthFiles:
-    """The truth of a run that was scored against files, which must still be those that they were."""
+    """The ground truth of a run that was scored against files, which must not have changed."""
 
     def __init__(self, run: FinishedRun) -> None:
         self._run = run
 
     def truth(self, scene: str, rules: ProtocolRules) -> GroundTruth:
-        """The truth of a scene under a protocol, each point at a place of its own."""
+        """The ground truth of a scene under a protocol, each point at its own position."""
         found = self._texts.of_scene(rules, scene.partition("/")[2])
         assert isinstance(found, VertexTruth)
         return _at_places(rules, found, scene)
 
     def prediction(self, scene: str, method: str, rules: ProtocolRules, n_points: int) -> Prediction:
-        """The map of a method on the same places."""
+        """The map of a method at the same positions."""
         return map_of(read_stored(self._run.folder.job(scene, method).prediction), places(n_points), rules)
 
     @cached_property
@@ -265,8 +264,8 @@ class GroundTruthFiles:
         record, run = self._run.record.ground_truth, self._run
         if record is None or record.path is None or not Path(record.path).is_dir():
             raise DataError(
-                f"{run.name}: its ground truth, {printable(str(record and record.path), 200)}, is not here; run this "
-                "where the folder lies, or evaluate again with --out"
+                f"{run.name}: its ground truth, {printable(str(record and record.path), 200)}, is missing; restore the "
+                "folder, or evaluate again with --out"
             )
         folder = Path(record.path)
         files = text_scenes(folder)
@@ -284,7 +283,7 @@ class GroundTruthFiles:
 
 
 def places(n: int) -> Float32Array:
-    """Places (n, 3) a metre apart, the same for the same number.
+    """Positions (n, 3) at least a metre apart, always the same for the same n.
 
     >>> places(2).tolist()
     [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
@@ -294,13 +293,13 @@ def places(n: int) -> Float32Array:
 
 
 def _at_places(rules: ProtocolRules, truth: VertexTruth, scene: str) -> GroundTruth:
-    """Instances keep their numbers where a protocol goes by them; elsewhere they are numbered through."""
+    """Instances keep their numbers if a protocol uses them; otherwise they are numbered consecutively."""
     instance = truth.values % INSTANCES_PER_CLASS
     if rules.class_agnostic is None:
         is_object = truth.values >= INSTANCES_PER_CLASS
         distinct, number = np.unique(truth.values[is_object], return_inverse=True)
         if len(distinct) >= INSTANCES_PER_CLASS:
-            raise ConfigError(f"{printable(scene, 100)}: has {len(distinct)} objects; errors of up to 999 are told")
+            raise ConfigError(f"{printable(scene, 100)}: has {len(distinct)} objects; at most 999 are supported")
         instance = np.zeros(len(truth.values), np.int64)
         instance[is_object] = number + 1
     ids = dict.fromkeys(entry.id for entry in rules.classes)

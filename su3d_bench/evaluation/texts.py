@@ -1,4 +1,4 @@
-"""Features of class names: out of a file of the user, or of the encoder that is here; and such a file, made here."""
+"""Text features of class names: from a user's file or an available encoder; and writing such a file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ MAX_NAMES = 1 << 20
 
 @dataclass(frozen=True)
 class TextFeatures:
-    """A feature (C, D) for each of ``names``, which are class names or whole prompts, out of ``path``.
+    """Features (C, D) from ``path``, one for each of ``names``, which are class names or whole prompts.
 
-    ``encoder``: what made them, as far as the file says it.
+    ``encoder``: the encoder that made them, if the file names it.
     """
 
     path: Path
@@ -39,13 +39,13 @@ class TextFeatures:
         return int(self.features.shape[1])
 
     def missing(self, rules: ProtocolRules) -> list[str]:
-        """The classes of the protocol among which a classifier may choose and that have no feature here."""
+        """The candidate classes of the protocol that have no feature here."""
         known, names = set(self.names), candidate_names(rules)
         return [name for name in names if name not in known and not known.issuperset(rules.texts_of(name))]
 
 
 class GivenTextEncoder:
-    """``TextFeatures`` in the place of the protocol's encoder: a prompt has its own feature, or its class's."""
+    """``TextFeatures`` instead of the protocol's encoder: a prompt has its own feature, or that of its class."""
 
     def __init__(self, given: TextFeatures, rules: ProtocolRules) -> None:
         self.name = given.encoder
@@ -69,7 +69,7 @@ class GivenTextEncoder:
 
 
 def read_text_features(path: Path | None) -> TextFeatures | None:
-    """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file, and ``encoder``, a text, where it is there."""
+    """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file, and ``encoder``, a text, if present."""
     if path is None:
         return None
     where = shown(path)
@@ -96,10 +96,10 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
 
 
 def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | None, *, is_own: bool) -> Encoder | str:
-    """What names features of ``n_dimensions`` under a protocol, or the reason why nothing here can.
+    """The encoder that classifies features of ``n_dimensions`` under a protocol, or why there is none.
 
-    ``is_own``: the features come from a run of ours; those of the embedded encoder are told by their dimensions. The
-    protocol's encoder serves where its files are here.
+    ``is_own``: the features come from a run of this program; the embedded encoder is recognized by the number of
+    dimensions. The protocol's encoder is used if its files are available.
     """
     if given is not None:
         missing = given.missing(rules)
@@ -126,7 +126,7 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
 
 
 def _real_encoder(name: str) -> Encoder | None:
-    """The foundation model that protocols call ``name``; None where it is none or its files are not here."""
+    """The foundation model that protocols call ``name``; None if unknown or its files are not available."""
     from su3d_bench.perception.models.catalogue import encoder_known_as
     from su3d_bench.perception.models.loading import model_state
 
@@ -138,25 +138,25 @@ def _real_encoder(name: str) -> Encoder | None:
 
 @lru_cache(maxsize=2)
 def _loaded(name: str, folder: Path) -> Encoder:
-    """The encoder in ``folder``, kept with the features of the texts that it was asked for."""
+    """The encoder in ``folder``, cached with the features of the texts that it has encoded."""
     from su3d_bench.perception.models.config import ModelsConfig
     from su3d_bench.perception.models.loading import load_encoder
 
     return load_encoder(ModelsConfig(encoder=name, paths={name: folder}))
 
 
-# ---- the file, made here
+# ---- writing the file
 
 
 def candidate_names(rules: ProtocolRules) -> list[str]:
-    """The classes among which a protocol may choose the one whose text a feature is nearest to."""
+    """The candidate classes of a protocol, whose texts features are compared with."""
     return [entry.name for entry in (rules.classes if rules.vocabulary == "all" else rules.scored)]
 
 
 def named_texts(rules: ProtocolRules, queries: Path | None) -> dict[str, tuple[str, ...]]:
-    """The texts that stand for each name that a protocol compares features with: its classes, or those of a file.
+    """The texts for each name that a protocol compares features with: its classes, or those of a file.
 
-    ``ConfigError`` where it compares none, where it has classes and a file is given, or has none and there is no file.
+    ``ConfigError`` if it compares none, if it has classes and a file is given, or if it has neither.
     """
     if rules.prompt is None and not rules.prompts:
         raise ConfigError(f"protocol '{rules.name}' does not compare features with texts; there is nothing to encode")
@@ -164,15 +164,15 @@ def named_texts(rules: ProtocolRules, queries: Path | None) -> dict[str, tuple[s
         raise ConfigError(f"protocol '{rules.name}' uses its classes as texts; remove --queries")
     if not rules.classes and queries is None:
         raise ConfigError(
-            f"protocol '{rules.name}' has no texts of its own; give them with --queries FILE: .toml or .csv as "
-            "evaluate takes them, .json of OpenLex3D, or .txt with one a line"
+            f"protocol '{rules.name}' has no own texts; give them with --queries FILE: .toml or .csv as "
+            "for evaluate, .json of OpenLex3D, or .txt with one per line"
         )
     names = candidate_names(rules) if queries is None else dict.fromkeys(_texts_of_file(queries))
     return {name: rules.texts_of(name) for name in names}
 
 
 def _texts_of_file(path: Path) -> list[str]:
-    """Every text of a file of queries, whatever it says of their objects, or of a list with one text a line."""
+    """Every text of a query file, without its objects, or of a list with one text per line."""
     from su3d_bench.datasets.openlex3d.release import read_prompts, read_queries
     from su3d_bench.questions.query_files import read_query_rows
 
@@ -184,11 +184,11 @@ def _texts_of_file(path: Path) -> list[str]:
 
 
 def distinct_texts(named: Mapping[str, Sequence[str]]) -> list[str]:
-    """What is to be encoded, each text once, in the order of the names."""
+    """The texts to encode, without repeats, in the order of the names."""
     return list(dict.fromkeys(text for texts in named.values() for text in texts))
 
 
 def text_arrays(texts: Sequence[str], encoder: Encoder) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that ``read_text_features`` takes: a feature a text, from which the protocol forms means."""
+    """The arrays of a file for ``read_text_features``: one feature per text; the protocol averages them."""
     features = encoder.encode_texts(texts)
     return {"names": np.array(texts, np.str_), "features": features, "encoder": np.array(encoder.name, np.str_)}

@@ -1,6 +1,6 @@
-"""May a prediction be scored under a protocol, against a truth? Answered from plain facts, before any work.
+"""Whether a protocol can score a prediction against a ground truth, decided from plain facts before any work.
 
-Each ``why_not_...`` gives the reason as a clause without the protocol's name, None where nothing stands against it.
+Each ``why_not_...`` returns the reason as a clause without the protocol's name, None if there is none.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from su3d_bench.core.types import BoolArray, IntArray
 
 ONE, SEVERAL = "one label", "the top labels of a mask"
-MIN_MULTI_LABEL_SHARE = 0.5  # of the masks; single masks can be there twice by chance
+MIN_MULTI_LABEL_SHARE = 0.5  # of the masks; single masks can occur twice by chance
 
 
 def labels_counted(rules: ProtocolRules, *, by_features: bool, are_several: bool = False) -> str | None:
-    """What a number under a protocol is of; None where no label counts.
+    """Which labels a number under a protocol is based on; None if labels are not scored.
 
-    ``by_features``: the protocol named what the prediction left to features, which rank every label. ``are_several``:
-    masks stand there under several labels each.
+    ``by_features``: the protocol classified the prediction's features, which rank every label. ``are_several``: masks
+    occur with several labels each.
 
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> labels_counted(load_protocol("openlex3d-topn"), by_features=True)
@@ -47,7 +47,7 @@ def labels_counted(rules: ProtocolRules, *, by_features: bool, are_several: bool
 
 
 def labels_taken(rules: ProtocolRules) -> str:
-    """Which of the two a protocol takes, as a clause.
+    """Which of the two a protocol accepts, as a clause.
 
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> labels_taken(load_protocol("scannet-instance"))
@@ -66,7 +66,7 @@ def labels_taken(rules: ProtocolRules) -> str:
 
 
 def under_several_labels(masks: Masks, labels: Sequence[str | int]) -> BoolArray:
-    """Whether the same points stand there under another label too, of each mask; empty masks do not.
+    """Whether each mask also occurs, with the same points, under another label; never for empty masks.
 
     >>> import numpy as np
     >>> from su3d_bench.core.maps import Masks
@@ -83,7 +83,7 @@ def under_several_labels(masks: Masks, labels: Sequence[str | int]) -> BoolArray
 
 
 LARGEST_NYU40_ID = 40
-# Ground truths of ScanNet and whose class ids they hold.
+# Ground truths of ScanNet and the class ids that they have.
 ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
 
 Form = Literal["instances", "partition", "dense", "vertex-masks", "vertex-labels"]
@@ -91,11 +91,10 @@ Form = Literal["instances", "partition", "dense", "vertex-masks", "vertex-labels
 
 @dataclass(frozen=True)
 class TruthFacts:
-    """What a truth offers.
+    """What a ground truth provides.
 
-    ``label_space`` None: it does not say whose labels it has. ``has_points``: its points have coordinates;
-    ``knows_questions``: it has questions with all right answers; ``further``: of label spaces beside its own, the truth
-    that has their labels.
+    ``label_space`` is None if unknown. ``has_points``: its points have coordinates; ``knows_questions``: it has
+    questions with all right answers; ``further``: for each additional label space, the ground truth with its labels.
     """
 
     name: str
@@ -108,7 +107,7 @@ class TruthFacts:
 
     @classmethod
     def of_dataset(cls, dataset: Any) -> TruthFacts:
-        """Those of a dataset, class or object."""
+        """The facts of a dataset, class or object."""
         return cls(
             dataset.name,
             dataset.label_space,
@@ -120,13 +119,13 @@ class TruthFacts:
 
 @dataclass(frozen=True)
 class ContentFacts:
-    """What a prediction of a scene holds.
+    """What a prediction of a scene contains.
 
-    ``form``: ``vertex-masks`` and ``vertex-labels`` (one class a point) lie over the points of the truth, the others
-    bring their own. ``n``: how many masks or rows of features. ``n_dimensions`` of the features, None without any.
-    ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
-    ``n_points``: over how many points of the truth it lies, None where it has its own or says no number. ``n_several``:
-    how many of its masks stand there under another label too. ``has_places``: it has floors and rooms above them.
+    ``form``: ``vertex-masks`` and ``vertex-labels`` (one class per point) are over the points of the ground truth, the
+    others have their own. ``n``: number of masks or rows of features. ``n_dimensions``: of the features, None without
+    any. ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
+    ``n_points``: number of ground-truth points that it covers, None if it has its own or states no number.
+    ``n_several``: number of masks that also occur with another label. ``has_places``: it has floors and rooms.
     """
 
     form: Form
@@ -142,12 +141,12 @@ class ContentFacts:
 
     @property
     def are_several(self) -> bool:
-        """Whether its masks stand there under several labels each."""
+        """Whether its masks occur with several labels each."""
         return self.n > 0 and self.n_several >= MIN_MULTI_LABEL_SHARE * self.n
 
     @classmethod
     def of(cls, prediction: Prediction) -> ContentFacts:
-        """Those of a prediction with points of its own."""
+        """The facts of a prediction with its own points."""
         features = prediction.features
         n_dimensions = None if features is None else int(features.shape[-1])
         if isinstance(prediction, Instances):
@@ -170,11 +169,11 @@ class ContentFacts:
 
 
 def truth_incompatibility(rules: ProtocolRules, truth: TruthFacts) -> str | None:
-    """Why no prediction at all can be scored under a protocol against a truth."""
+    """Why no prediction can be scored under a protocol against a ground truth."""
     if (rules.asks or rules.needs_boxes) and not truth.has_points:
         return "needs the objects of a dataset; name one with --dataset"
     if rules.needs_instances and not truth.has_instances:
-        return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
+        return "needs instances, the ground truth has class ids only (expected class id * 1000 + instance)"
     if truth.label_space is None or truth.further.get(rules.label_space) == rules.ground_truth:
         return None
     if rules.label_space != truth.label_space:
@@ -182,38 +181,38 @@ def truth_incompatibility(rules: ProtocolRules, truth: TruthFacts) -> str | None
     if rules.ground_truth not in truth.variants:
         return f"it needs ground truth '{rules.ground_truth}', {truth.name} has {', '.join(truth.variants)}"
     if rules.questions == "dataset" and not truth.knows_questions:
-        return f"it needs a dataset that knows questions and answers itself, which {truth.name} does not"
+        return f"it needs a dataset with questions and answers, which {truth.name} does not have"
     return None
 
 
 def content_incompatibility(rules: ProtocolRules, content: ContentFacts, *, has_points: bool = True) -> str | None:
-    """Why such a prediction cannot be scored under a protocol; ``has_points``: those of the truth have coordinates."""
+    """Why such a prediction cannot be scored under a protocol; ``has_points``: ground truth has coordinates."""
     if rules.needs_own_points and not has_points:
-        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
+        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor text files provide"
     has_ids = content.class_ids is not None and len(content.class_ids) > 0
     if rules.class_numbers != "ids" and rules.class_agnostic is None and has_ids:
         return (
-            "its files number the classes by their place in the list from 0, these are read as class ids; name the "
-            "format that counts so with --format"
+            "its files number the classes by their index in the list, these are read as class ids; name the "
+            "format with such numbers with --format"
         )
     if rules.needs_own_points and not content.has_own_points:
-        return "needs a map with points of its own, the prediction is over the points of another truth"
+        return "needs a map with its own points, the prediction is over the points of another ground truth"
     if content.has_own_points:
         if not has_points:
-            return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
+            return "the prediction has its own points, the ground truth has no coordinates; name a --dataset"
         return map_incompatibility(rules, content) or _naming_incompatibility(rules, content)
     if content.form == "vertex-labels":
         if rules.needs_instances:
-            return "needs instances, the prediction has one class a point"
+            return "needs instances, the prediction has one class per point"
         can_count = has_points or rules.metric in {"scannet", "ovo"}
         return None if can_count else "needs the coordinates of the points; name a --dataset"
     if rules.names_points and not has_points:
-        return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
+        return "needs a class for every point, the prediction has masks; name a --dataset to convert them to a map"
     return _naming_incompatibility(rules, content)
 
 
 def kind_incompatibility(rules: ProtocolRules, prediction: Prediction) -> str | None:
-    """A sentence where this kind of prediction cannot be scored under the protocol at all."""
+    """Why the protocol cannot score this kind of prediction at all; None if it can."""
     facts = ContentFacts.of(prediction)
     if rules.labels is not None and isinstance(prediction, Instances) and prediction.labels is not None:
         facts = replace(facts, n_several=int(under_several_labels(prediction, prediction.labels).sum()))
@@ -222,9 +221,9 @@ def kind_incompatibility(rules: ProtocolRules, prediction: Prediction) -> str | 
 
 
 def map_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | None:
-    """Why a map with points of its own cannot be scored under a protocol at all."""
+    """Why a protocol cannot score a map with its own points at all."""
     if not rules.takes_dense and content.form == "dense":
-        return "needs instances, and the method gives one feature a point"
+        return "needs instances, and the method gives one feature per point"
     if (reason := _label_incompatibility(rules, content)) is not None:
         return reason
     if rules.needs_places and content.n and not content.has_places:
@@ -232,20 +231,20 @@ def map_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | No
     if rules.uses_names:
         if content.form != "instances":
             return "needs instances with names, and the method gives a partition"
-        return "needs names, and the method gives its instances none" if content.n and not content.has_names else None
+        return "needs names, and the instances of the method have none" if content.n and not content.has_names else None
     return NEEDS_FEATURES if rules.compares_texts and content.n_dimensions is None and content.n else None
 
 
 def _label_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | None:
-    """Why masks with one label or several cannot be scored where a protocol takes the other alone."""
+    """Why masks with one label or several cannot be scored if a protocol accepts only the other."""
     if rules.labels is None or not content.n or content.are_several == (rules.labels == "top-k"):
         return None
-    given = "the same masks stand there under several" if content.are_several else "each mask has one"
+    given = "the same masks have several" if content.are_several else "each mask has one"
     return f"takes {'one label' if rules.labels == 'one' else 'the top labels'} of a mask, and {given}"
 
 
 def _naming_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | None:
-    """Why masks cannot get the classes that a protocol of classes asks for."""
+    """Why masks cannot get the classes that a protocol needs."""
     if rules.class_agnostic is not None or (rules.needs_own_points and not rules.vocabulary) or not content.n:
         return None
     if content.form == "vertex-masks" and (reason := _label_incompatibility(rules, content)) is not None:
@@ -260,7 +259,7 @@ def _naming_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str 
 
 
 def class_id_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | None:
-    """Why class ids cannot be those of a protocol, where its label space has two lists of ids."""
+    """Why class ids cannot be those of a protocol, if its label space has two lists of ids."""
     ids = content.class_ids
     if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS or ids is None or not len(ids):
         return None
@@ -272,12 +271,12 @@ def class_id_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str
 
 
 def list_of_ids(largest: int) -> str:
-    """The ground truth whose class ids go up to such a one."""
+    """The ground truth whose list of class ids goes up to the given one."""
     return "nyu40-vertices" if largest <= LARGEST_NYU40_ID else "scannet200-vertices"
 
 
 def length_mismatch(content: ContentFacts, n_points: int) -> str | None:
-    """Why a prediction cannot be one over the ``n_points`` points of a truth."""
+    """Why a prediction cannot be over the ``n_points`` points of a ground truth."""
     if content.n_points in {None, n_points}:
         return None
     what = "labels" if content.form == "vertex-labels" else "masks"
@@ -288,7 +287,7 @@ def length_mismatch(content: ContentFacts, n_points: int) -> str | None:
 
 
 def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | None:
-    """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
+    """The dimensions of the features to classify; None if there are labels or the protocol needs none."""
     if rules.class_agnostic is not None or rules.uses_names or rules.needs_places or not content.n:
         return None
     has_names = content.has_labels if content.form == "vertex-masks" else content.has_every_label

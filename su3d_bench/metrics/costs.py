@@ -1,4 +1,4 @@
-"""What the updates of one scene under one method cost."""
+"""The cost of the updates of one scene and method."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import Growth, growth_exponent
 from su3d_bench.store.records import MapCost
 
-# Stages that are no part of keeping the map: reading the frame, and perception. They tell the map's part of runs whose
-# updates have no ``method_ms``, as earlier versions wrote them.
+# Stages that are not mapping: reading the frame, and perception. They give the mapping time of runs by earlier
+# versions, whose updates have no ``method_ms``.
 NOT_MAP = ("decode", "cache", "segment", "encode", "caption")
-MEASURED_AROUND = ("total_ms", "method_ms")  # by who runs the method; all other times are of stages
+MEASURED_AROUND = ("total_ms", "method_ms")  # measured by the runner; all other times are of stages
 MAP = "map"
 TOTAL = "total"
 WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
@@ -22,12 +22,12 @@ WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
 
 @dataclass(frozen=True)
 class UpdateTimes:
-    """The updates of one scene under one method, in their order.
+    """The updates of one scene and method, in order.
 
-    ``columns`` holds (N,) float64 of every column of ``updates.csv``: ``total_ms``, ``method_ms``, a ``<stage>_ms`` a
-    stage, sizes. ``maps`` are those midway and the last one; what was not measured is None. ``calibration_ms``: the
-    time of a fixed piece of work, measured between the updates; ``start_ms`` and ``close_ms``: of the method before
-    the first frame and after the last map.
+    ``columns`` has (N,) float64 for every column of ``updates.csv``: ``total_ms``, ``method_ms``, one ``<stage>_ms``
+    per stage, sizes. ``maps`` are the intermediate ones and the last; what was not measured is None.
+    ``calibration_ms``: the time of a fixed workload, measured between the updates; ``start_ms`` and ``close_ms``: of
+    the method before the first frame and after the last map.
     """
 
     run: str
@@ -46,13 +46,13 @@ class UpdateTimes:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Names of the stages, in the order in which they first took time."""
+        """Names of the stages, in the order of their first nonzero time."""
         return tuple(
             name.removesuffix("_ms") for name in self.columns if name.endswith("_ms") and name not in MEASURED_AROUND
         )
 
     def ms(self, stage: str) -> Float64Array:
-        """Milliseconds (N,) of a stage, of ``total`` or of ``map``; zeros for a stage that it does not have."""
+        """Milliseconds (N,) of a stage, of ``total`` or of ``map``; zeros for an unknown stage."""
         if stage == MAP:
             if "method_ms" in self.columns:
                 return self.columns["method_ms"]
@@ -71,7 +71,7 @@ class StageSummary:
     """One stage of a method over its updates, in ms; ``first`` is the mean of the updates before the steady ones.
 
     ``share`` of the total time; ``against_points`` and ``against_frames``: growth with the size of the map and with the
-    number of updates so far, None where the run cannot tell.
+    number of updates so far, None if unknown.
     """
 
     name: str
@@ -87,10 +87,10 @@ class StageSummary:
 
 @dataclass(frozen=True)
 class MethodSummary:
-    """What a method cost over the scenes of a run; rows of ``stages`` end with ``map`` and ``total``.
+    """The cost of a method over the scenes of a run; the last rows of ``stages`` are ``map`` and ``total``.
 
     ``map`` is the whole time of the method without perception. ``frames_per_s`` counts frames at full rate, of which
-    every stride-th is an update. Bytes are the largest over the scenes, None where none was measured.
+    every stride-th is an update. Bytes are the largest over the scenes, None if not measured.
     """
 
     run: str
@@ -108,7 +108,7 @@ class MethodSummary:
 
 
 def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSummary:
-    """The costs of one method over ``times``, at least one scene; ``warm_up`` updates of each scene stand apart."""
+    """The costs of one method over ``times``, at least one scene; ``warm_up`` updates per scene are kept separate."""
     pool = _Pool(times, warm_up)
     stages = tuple(dict.fromkeys(stage for updates in times for stage in updates.stages))
     seconds = float(pool.total_ms.sum()) / 1e3
@@ -164,7 +164,7 @@ def _largest(values: Sequence[float]) -> int | None:
 
 
 def _frames_covered(times: UpdateTimes) -> float:
-    """Frames at full rate that the updates stand for: the spacing of their indices, the last one's included."""
+    """Frames at full rate that the updates represent: the spacing of their indices, including the last one's."""
     frames = times.columns.get("frame", np.arange(len(times), dtype=np.float64))
     spacing = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
     return float(frames[-1] - frames[0]) + spacing

@@ -1,5 +1,5 @@
-"""Protocols of kind ``objects``: predicted objects matched one to one with the true ones, and where the true category
-of a match stands among all categories.
+"""Protocols of kind ``objects``: predicted objects matched one to one with the true ones, and the rank of the true
+category of each match among all categories.
 
 Source: ``evaluate_objects`` of hovsg/eval/hm3dsem_evaluator.py, hovsg/HOV-SG at commit 71a8069.
 """
@@ -26,13 +26,13 @@ from su3d_bench.metrics.metric import Counts, Metric, SceneScore, axes
 from su3d_bench.metrics.protocols.kinds import OBJECT_RANKS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
-THRESHOLDS = np.linspace(0.0, 1.0, 11)  # a pair is found where its overlap is above
+THRESHOLDS = np.linspace(0.0, 1.0, 11)  # a pair is found if its overlap is above
 Pairs = tuple[Int64Array, Int64Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points (N, D) in m, searched by their neighbours."""
+    """Points (N, D) in m with a neighbour search."""
 
     points: Float64Array
 
@@ -44,11 +44,11 @@ class Cloud:
 
     @cached_property
     def corners(self) -> Float64Array:
-        """The lowest and the highest corner (2, D); there must be points."""
+        """The lowest and the highest corner (2, D); needs at least one point."""
         return box_around(self.points)
 
     def n_near(self, other: Cloud, radius_m: float) -> int:
-        """How many of its points have one of ``other`` nearer than ``radius_m``."""
+        """The number of its points with one of ``other`` nearer than ``radius_m``."""
         if not len(self.points) or not len(other.points):
             return 0
         low, high = other.corners
@@ -60,7 +60,7 @@ class Cloud:
 
 
 def larger_share(first: Cloud, second: Cloud, radius_m: float) -> float:
-    """The share of either cloud's points that lie nearer than ``radius_m`` to the other, whichever is larger.
+    """The share of a cloud's points nearer than ``radius_m`` to the other cloud; the larger of the two directions.
 
     >>> line = Cloud(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]))
     >>> larger_share(line, Cloud(line.points[:1] + 0.01), 0.02), larger_share(line, Cloud(np.zeros((0, 3))), 0.02)
@@ -73,9 +73,9 @@ def larger_share(first: Cloud, second: Cloud, radius_m: float) -> float:
 
 
 def covered_share(of: Cloud, by: Cloud, radius_m: float) -> float:
-    """How many points of ``by`` lie nearer than ``radius_m`` to ``of``, over the number of points of ``of``, at most 1.
+    """The number of points of ``by`` nearer than ``radius_m`` to ``of``, divided by the size of ``of``, at most 1.
 
-    The original counts the points of the one cloud and divides by those of the other.
+    The original counts the points of one cloud and divides by those of the other.
 
     >>> covered_share(Cloud(np.zeros((4, 2))), Cloud(np.zeros((1, 2))), 0.05)
     0.25
@@ -84,7 +84,7 @@ def covered_share(of: Cloud, by: Cloud, radius_m: float) -> float:
 
 
 def voxel_ids(points: Float64Array, voxel_m: float) -> Int64Array:
-    """A number from 0 for each voxel that holds points (N, D), of a grid around their lowest corner, as Open3D's."""
+    """The voxel number, from 0, of each point (N, D), in a grid that starts at their lowest corner, as in Open3D."""
     corner = points.min(axis=0, initial=np.inf) - voxel_m * 0.5
     return row_ids(np.floor((points - corner) / voxel_m).astype(np.int64))
 
@@ -103,7 +103,7 @@ def voxel_means(values: Float64Array, voxel: Int64Array) -> Float64Array:
 def best_pairs(overlap: Float64Array) -> Pairs:
     """Rows and columns of the one-to-one assignment of greatest total ``overlap`` (P, T); min(P, T) pairs.
 
-    Pairs without any overlap are among them: as many as there can be.
+    Pairs without any overlap are included: as many pairs as possible.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -112,7 +112,7 @@ def best_pairs(overlap: Float64Array) -> Pairs:
 
 
 def found_at(overlap: Float64Array) -> Int64Array:
-    """How many of the best pairs' overlaps (T,) are above each of ``THRESHOLDS``."""
+    """The number (T,) of the best pairs' overlaps above each of ``THRESHOLDS``."""
     return np.array([(overlap > threshold).sum() for threshold in THRESHOLDS], np.int64)
 
 
@@ -126,16 +126,16 @@ class Rates:
 
     @property
     def area(self) -> Float64Array:
-        """The area (R,) under precision over recall, as the original forms it: recalls are sorted, precisions are not.
+        """The area (R,) under precision over recall, as in the original: recalls are sorted, precisions are not.
 
-        Precisions stand from the lowest threshold on, recalls from the smallest one on, so that the highest precision
-        meets the lowest recall.
+        Precisions are ordered by threshold and recalls by value, so that the highest precision is paired with the
+        lowest recall.
         """
         return trapezoid(self.precision, np.sort(self.recall, axis=1))
 
 
 def rates(n_found: Float64Array, n_predicted: Float64Array, n_true: Float64Array) -> Rates:
-    """The rates of numbers (R, T), (R,) and (R,); 0 where nothing is predicted, NaN where nothing is true.
+    """The rates of numbers (R, T), (R,) and (R,); 0 without predictions, NaN without ground truth.
 
     >>> table = rates(np.array([[2.0, 1.0]]), np.array([4.0]), np.array([2.0]))
     >>> table.precision.tolist(), table.recall.tolist(), table.accuracy.tolist()
@@ -151,18 +151,18 @@ def trapezoid(values: Float64Array, places: Float64Array) -> Float64Array:
     return np.asarray(np.trapezoid(values, places, axis=1))
 
 
-RADIUS_M = 0.02  # evaluate_objects: points of two objects nearer than this lie together
+RADIUS_M = 0.02  # evaluate_objects: points of two objects nearer than this overlap
 RANK_STEP = 10  # evaluate_objects: the curve has a point at every tenth k from 0
 HALF = int(np.flatnonzero(THRESHOLDS == 0.5)[0])
-FEW_LABELS = "labels name the first categories of an object alone: the true one counts as none where it is not there"
+FEW_LABELS = "labels name only the first categories of an object: the true one counts as unranked if it is missing"
 
 
 @dataclass(frozen=True)
 class MatchedObjects(Counts):
-    """What one scene, or several, adds.
+    """The counts of one scene or several.
 
     ``n_objects`` (2,): predicted and true ones. ``n_found`` (T,): pairs whose overlap is above each threshold.
-    ``n_ranked`` (C + 1,): pairs by the rank of the true category, from 1 on; the last, those where it has none.
+    ``n_ranked`` (C + 1,): pairs by the rank of the true category, from 1; the last entry counts pairs without a rank.
     """
 
     stored_as = "matched-objects"
@@ -172,12 +172,12 @@ class MatchedObjects(Counts):
     n_ranked: Int64Array = field(metadata=axes("ranks"))
 
     def contradiction(self) -> str | None:
-        """More pairs than objects, or pairs found at a threshold and not at a lower one."""
+        """More pairs than objects, or pairs found at a threshold but not at a lower one."""
         if len(self.n_objects) != 2:
             return f"'n_objects' has {len(self.n_objects)} numbers"
         n_pairs, most = int(self.n_ranked.sum()), int(self.n_objects.min())
         if n_pairs > most or (np.diff([most, *self.n_found]) > 0).any():
-            return f"'n_found' or 'n_ranked' has more pairs than the {most} that there can be, or more at a threshold"
+            return f"'n_found' or 'n_ranked' has more than the {most} possible pairs, or more at a higher threshold"
         return None
 
 
@@ -214,7 +214,7 @@ class ObjectMetric(Metric[MatchedObjects]):
         rows: Int64Array,
         columns: Int64Array,
     ) -> Int64Array:
-        """The rank (n,) of the true category of each pair, 0 where it has none."""
+        """The rank (n,) of the true category of each pair, 0 for none."""
         first_point = np.unique(truth.instance, return_index=True)[1][-len(ids) :] if len(ids) else ids
         category = class_index_of_ids(self.rules, truth.semantic[first_point])[columns]
         if not len(rows):
@@ -247,7 +247,7 @@ class ObjectMetric(Metric[MatchedObjects]):
 
 
 def objects_of(truth: GroundTruth) -> tuple[Int64Array, list[Cloud]]:
-    """The ids (T,) of a truth's objects, ascending, and the cloud of each."""
+    """The ids (T,) of the true objects, ascending, and the cloud of each."""
     order = np.argsort(truth.instance, kind="stable")
     ids, starts = np.unique(truth.instance[order], return_index=True)
     parts = np.split(order, starts[1:])
@@ -257,9 +257,9 @@ def objects_of(truth: GroundTruth) -> tuple[Int64Array, list[Cloud]]:
 
 
 def boxes_of(truth: GroundTruth, ids: Int64Array, objects: Sequence[Cloud]) -> Float64Array:
-    """The lowest and highest corners (T, 2, 3) of the boxes by which the objects are first met.
+    """The lowest and highest corners (T, 2, 3) of the boxes used to preselect pairs of objects.
 
-    Their given centre and sides along the axes of the world, however the box was turned, as the original takes them.
+    Their given centre and sides along the axes of the world, whatever the rotation of the box, as in the original.
     """
     given = {} if truth.places is None else truth.places.object_boxes
     corners = np.zeros((len(ids), 2, 3))
@@ -273,7 +273,7 @@ def boxes_of(truth: GroundTruth, ids: Int64Array, objects: Sequence[Cloud]) -> F
 
 
 def object_overlaps(predicted: Sequence[Cloud], objects: Sequence[Cloud], boxes: Float64Array) -> Float64Array:
-    """The overlap (P, T) of the clouds of each pair whose boxes share a volume; 0 where they do not."""
+    """The overlap (P, T) of the clouds of each pair whose boxes share a volume; 0 for other pairs."""
     overlap = np.zeros((len(predicted), len(objects)))
     for row, cloud in enumerate(predicted):
         if not len(cloud.points):
@@ -285,10 +285,10 @@ def object_overlaps(predicted: Sequence[Cloud], objects: Sequence[Cloud], boxes:
 
 
 def ranks_among(similarity: Float64Array, category: Int64Array) -> Int64Array:
-    """The rank (n,), from 1, of each row's ``category`` among all classes (n, C), 0 where that is -1.
+    """The rank (n,), from 1, of each row's ``category`` among all classes (n, C), 0 if that is -1.
 
-    Of equals the last in the list comes first, as in an ascending order that is turned round; the original's sort
-    leaves open which does.
+    On ties the last in the list comes first, as in a reversed ascending order; the original's sort does not define the
+    order of ties.
 
     >>> ranks_among(np.array([[0.1, 0.9, 0.3]] * 3), np.array([1, 0, -1])).tolist()
     [1, 3, 0]
@@ -301,7 +301,7 @@ def ranks_among(similarity: Float64Array, category: Int64Array) -> Int64Array:
 
 
 def _ranks_of_labels(rules: ProtocolRules, prediction: Instances, rows: Int64Array, category: Int64Array) -> Int64Array:
-    """The place of the true category among the labels of each instance, 0 where it is none of them."""
+    """The rank of the true category among the labels of each instance, 0 if it is not among them."""
     assert prediction.labels is not None
     further = prediction.further_labels or ((),) * len(prediction)
     rank = np.zeros(len(rows), np.int64)
@@ -313,21 +313,21 @@ def _ranks_of_labels(rules: ProtocolRules, prediction: Instances, rows: Int64Arr
 
 
 ROOM_RADIUS_M = VOXEL_M = 0.05  # evaluate_rooms
-BOUND_M = 0.5  # evaluate_floors: how far the height of a bound may be off
-# evaluate_rooms prints what it calls IoU=0.5 from this place of the list, which is 0.6; recalls were sorted, so that
-# theirs is the place as far from the end, 0.4
+BOUND_M = 0.5  # evaluate_floors: tolerance of the height of a bound
+# evaluate_rooms prints what it calls IoU=0.5 from this index of the list, which is 0.6; recalls were sorted, so
+# theirs is the index as far from the end, 0.4
 ROOM_THRESHOLD, RECALL_THRESHOLD = 6, len(THRESHOLDS) - 1 - 6
-NEEDS_PLACES = "needs floors and rooms, the map has none; HOV-SG's folder graph/ holds them"
-OTHER_FLOORS = "{} floors are predicted, {} are true: no bound counts as found (the original ends in an error)"
+NEEDS_PLACES = "needs floors and rooms, the map has none; HOV-SG's folder graph/ has them"
+OTHER_FLOORS = "{} floors are predicted, {} are true: no bound counts as found (the original raises an error)"
 
 
 @dataclass(frozen=True)
 class PlaceCounts(Counts):
-    """What one scene, or several, adds; of two ``sides`` the first is the prediction's, the second the truth's.
+    """The counts of one scene or several; of two ``sides`` the first is the prediction, the second the ground truth.
 
     ``n_scenes`` (2,): those with the right number of floors, and all. ``n_bounds``, ``n_rooms`` (2,);
     ``n_bounds_found`` (1,); ``n_rooms_found`` (T,) at each threshold; ``room_shares`` (2,) float64: the sum over rooms
-    of how much of each is covered by the room of the other side that covers it most.
+    of the largest share of each that one room of the other side covers.
     """
 
     stored_as = "places"
@@ -340,13 +340,13 @@ class PlaceCounts(Counts):
     room_shares: Float64Array = field(metadata=axes("sides"))
 
     def contradiction(self) -> str | None:
-        """More found than there is."""
+        """More found than exist."""
         if len(self.n_scenes) != 2 or len(self.n_bounds_found) != 1:
             return "'n_scenes' or 'n_bounds_found' has another number of values"
         if self.n_scenes[0] > self.n_scenes[1] or (self.n_bounds_found > self.n_bounds.min()).any():
-            return "more floors are right than there are"
+            return "more right numbers of floors than scenes, or more bounds found than exist"
         if (np.diff([self.n_rooms.min(), *self.n_rooms_found]) > 0).any():
-            return "'n_rooms_found' has more rooms than there are, or more at a higher threshold"
+            return "'n_rooms_found' has more rooms than exist, or more at a higher threshold"
         inside = (self.room_shares >= 0) & (self.room_shares <= self.n_rooms * (1 + 1e-9))
         return None if inside.all() else "'room_shares' is more than the number of rooms"
 
@@ -359,7 +359,7 @@ class PlaceMetric(Metric[PlaceCounts]):
 
     def per_scene(self, truth: GroundTruth, prediction: Instances, encoder: Encoder | None) -> SceneScore:
         if truth.places is None:
-            raise DataError(f"{self.rules.name}: the truth '{truth.variant}' knows no floors and no rooms")
+            raise DataError(f"{self.rules.name}: ground truth '{truth.variant}' has no floors and rooms")
         if prediction.places is None and len(prediction):
             raise PredictionError(f"{self.rules.name}: {NEEDS_PLACES}")
         predicted = prediction.places or Places((), ())
@@ -402,9 +402,9 @@ class PlaceMetric(Metric[PlaceCounts]):
 
 
 def floor_bounds(predicted: Sequence[Floor], true: Sequence[Floor]) -> tuple[Int64Array, int]:
-    """How many bounds between storeys there are on each side (2,), and how many of them lie within ``BOUND_M``.
+    """The number of bounds between storeys on each side (2,), and how many of them match within ``BOUND_M``.
 
-    Bounds meet in their order; where there are more on one side, none is found.
+    Bounds are compared in order; if one side has more, none is found.
 
     >>> floor_bounds([Floor(0.0, 2.4), Floor(2.8, 5.0)], [Floor(0.1, 2.5), Floor(2.9, 5.6)])
     (array([3, 3]), 2)
@@ -415,7 +415,7 @@ def floor_bounds(predicted: Sequence[Floor], true: Sequence[Floor]) -> tuple[Int
 
 
 def _bounds(floors: Sequence[Floor]) -> Float64Array:
-    """The lowest and the highest height, and between them the middles of two that follow one another."""
+    """The lowest and the highest height, and between them the midpoints of consecutive ones."""
     heights = np.sort([height for floor in floors for height in (floor.lowest_m, floor.highest_m)])
     if not len(heights):
         return np.zeros(0)
@@ -423,11 +423,11 @@ def _bounds(floors: Sequence[Floor]) -> Float64Array:
 
 
 def room_overlaps(predicted: Sequence[Room], truth: Places) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Of each pair of rooms (P, T): the overlap, how much of the predicted one is covered and how much of the true one.
+    """For each pair of rooms (P, T): the overlap, and the covered shares of the predicted and of the true room.
 
-    A pair counts where the true room lies on a floor and the middle of the predicted one is within its heights. The
-    true room's points are reduced anew for each such pair, as the original does it, so that its cloud depends on how
-    many pairs came before.
+    A pair counts if the true room is on a floor and the middle of the predicted one is within that floor's heights.
+    The true room's points are downsampled again for each such pair, as in the original, so that its cloud depends on
+    the number of previous pairs.
     """
     n_pairs = len(predicted), len(truth.rooms)
     overlap, of_predicted, of_true = np.zeros(n_pairs), np.zeros(n_pairs), np.zeros(n_pairs)
@@ -444,7 +444,7 @@ def room_overlaps(predicted: Sequence[Room], truth: Places) -> tuple[Float64Arra
 
 
 def _met(predicted: Sequence[Room], truth: Places) -> Iterator[tuple[int, int]]:
-    """The pairs of rooms that count, once for each floor of the true one."""
+    """The pairs of rooms that count, one per floor of the true one."""
     for floor in truth.floors:
         for column, true in enumerate(truth.rooms):
             if floor.lowest_m < true.middle_m < floor.highest_m:
@@ -458,7 +458,7 @@ def _from_above(room: Room) -> Float64Array:
 
 
 def _reduced(cloud: Cloud) -> Cloud:
-    """The cloud with one point a voxel; itself where each voxel has one."""
+    """The cloud with one point per voxel; unchanged if each voxel already has one."""
     voxel = voxel_ids(cloud.points, VOXEL_M)
     is_reduced = voxel.max(initial=-1) + 1 == len(cloud.points)
     return cloud if is_reduced else Cloud(voxel_means(cloud.points, voxel))

@@ -1,4 +1,4 @@
-"""What every kind of metric is: the additive counts of a scene, and the numbers that counts of scenes come to."""
+"""The base of all metrics: additive counts per scene, and the values computed from the counts of scenes."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ from su3d_bench.metrics.matching.nearest import n_farther
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean, ratio
 
-MAX_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed
+MAX_COUNTED = 1 << 53  # larger integers are not exact in the float64 of ratios
 Values = dict[str, float]
 C = TypeVar("C", bound="Counts")
-ROWS = "rows"  # the axis along which scenes are put one after another; along all others they are summed
+ROWS = "rows"  # the axis along which scenes are concatenated; along all others they are summed
 NUMBER_KINDS = {"Int64Array": "i", "Int32Array": "i", "Float64Array": "f", "BoolArray": "b"}
 
 
 def axes(*names: str) -> dict[str, tuple[str, ...]]:
-    """The metadata of an array of counts: its axes, of which those of one name are equally long."""
+    """The metadata of an array of counts: its axes; axes of the same name have the same length."""
     return {"axes": names}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What scenes add to a protocol's numbers, as arrays with ``axes``; ``stored_as`` names the kind in files."""
+    """The counts of scenes under a protocol, as arrays with ``axes``; ``stored_as`` names the kind in files."""
 
     stored_as: ClassVar[str]
 
     @classmethod
     @cache
     def arrays(cls) -> dict[str, tuple[str, tuple[str, ...]]]:
-        """Of each array the kind of its numbers and its axes."""
+        """The dtype kind and axes of each array."""
         return {array.name: (NUMBER_KINDS[str(array.type)], array.metadata["axes"]) for array in fields(cls)}
 
     @classmethod
     def joined(cls, counts: Sequence[Self]) -> Self:
-        """The counts of several scenes as one: rows one after another, numbers summed in order, flags of any scene."""
+        """The joined counts of several scenes: rows concatenated, numbers summed in order, flags combined with *or*."""
         whole: dict[str, NDArray[Any]] = {}
         for name, (number_kind, names) in cls.arrays().items():
             parts = [getattr(of_scene, name) for of_scene in counts]
@@ -66,8 +66,8 @@ class Counts:
 
     @classmethod
     def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The counts in ``arrays``; a ``DataError`` names one that no scene gives: of another kind or shape than it
-        must be, below 0, or that another one contradicts."""
+        """The counts in ``arrays``; ``DataError`` names an impossible one: of a wrong kind or shape, below 0, or
+        contradicted by another."""
         sizes: dict[str, int] = {}
         for name, (number_kind, names) in cls.arrays().items():
             array = arrays[name]
@@ -82,12 +82,12 @@ class Counts:
         return counts
 
     def contradiction(self) -> str | None:
-        """A clause on what cannot be true of these counts; None where all can."""
+        """A clause on what is impossible in these counts; None if nothing is."""
         return None
 
     @property
     def sizes(self) -> dict[str, int]:
-        """How long each axis is."""
+        """The length of each axis."""
         return {
             axis: n
             for name, (_, names) in self.arrays().items()
@@ -97,9 +97,9 @@ class Counts:
 
 @dataclass(frozen=True)
 class SceneScore:
-    """What one scene adds to a protocol's numbers, with what a reader must know about it.
+    """The counts of one scene under a protocol, with warnings.
 
-    ``n_scored`` points of the truth count; ``n_farther`` (3,) of them have no predicted point within 2.5, 5 and 10 cm.
+    ``n_scored`` ground-truth points count; ``n_farther`` (3,) of them have no predicted point within 2.5, 5 and 10 cm.
     """
 
     protocol: str
@@ -113,7 +113,7 @@ class SceneScore:
 
 @dataclass(frozen=True)
 class Pooled:
-    """The metrics of all scenes together, of each class and of each group of classes, and what a reader must know."""
+    """The metrics over all scenes, per class and per group of classes, with warnings."""
 
     values: Values
     classes: dict[str, Values] = field(default_factory=dict)
@@ -122,10 +122,10 @@ class Pooled:
 
 
 class Metric(ABC, Generic[C]):
-    """One kind of protocol under its rules: what a scene counts, and the ratios that counts of scenes come to.
+    """One kind of protocol with its rules: the counts of a scene, and the ratios computed from counts of scenes.
 
-    ``truth``: what ``per_scene`` takes; ``counts``: what it gives. Ratios are formed in ``pooled``, ``combine_each``
-    and ``resampled`` alone.
+    ``truth``: the type that ``per_scene`` takes; ``counts``: the type it returns. Ratios are computed only in
+    ``pooled``, ``combine_each`` and ``resampled``.
     """
 
     truth: ClassVar[type]
@@ -136,12 +136,12 @@ class Metric(ABC, Generic[C]):
 
     @abstractmethod
     def per_scene(self, truth: Any, prediction: Any, encoder: Encoder | None) -> SceneScore:
-        """The additive counts of one scene; ``encoder`` names features of predictions that bring no labels."""
+        """The additive counts of one scene; ``encoder`` classifies the features of predictions without labels."""
 
     def score(
         self, counts: C, prediction: Prediction, distance_m: Float64Array, warnings: Iterable[str | None]
     ) -> SceneScore:
-        """The score of a scene whose scored points are ``distance_m`` from the nearest point of the prediction."""
+        """The score of a scene whose scored points are ``distance_m`` away from the nearest predicted point."""
         return SceneScore(
             protocol=self.rules.name,
             version=self.rules.version,
@@ -154,16 +154,16 @@ class Metric(ABC, Generic[C]):
 
     @property
     def ceiling_remark(self) -> str | None:
-        """Why it is not known what perfect masks would score; None where it is, or where nobody would ask."""
+        """Why the score of perfect masks is unknown; None if it is known or irrelevant."""
         return None
 
     @property
     @abstractmethod
     def sizes(self) -> dict[str, int]:
-        """How long the axes of the counts are that the rules fix."""
+        """The lengths of the axes of the counts that the rules determine."""
 
     def pooled(self, counts: Sequence[C]) -> Pooled:
-        """The numbers of the scenes together."""
+        """The values over all scenes together."""
         return Pooled(self.values_once(counts))
 
     def values_once(self, counts: Sequence[C]) -> Values:
@@ -175,16 +175,16 @@ class Metric(ABC, Generic[C]):
         """The metrics (R,) of the scenes drawn ``weights`` (R, S) times, pooled."""
 
     def resampled_classes(self, counts: Sequence[C], weights: Int64Array) -> dict[str, dict[str, Float64Array]]:
-        """Class -> column -> value (R,) of the scenes drawn ``weights`` (R, S) times; NaN where it has no truth there.
+        """Class -> column -> value (R,) of the scenes drawn ``weights`` (R, S) times; NaN without ground truth there.
 
-        With weights of ones this is the value over all scenes, with a single one that of a scene alone.
+        Weights of ones give the value over all scenes, a single one that of one scene.
         """
         return {}
 
     def class_columns(
         self, tables: Mapping[str, Float64Array], is_kept: BoolArray
     ) -> dict[str, dict[str, Float64Array]]:
-        """Class -> column -> value (R,) from ``tables`` (R, C) of the scored classes, for those that are kept (C,)."""
+        """Class -> column -> value (R,) from ``tables`` (R, C) of the scored classes, for the kept ones (C,)."""
         return {
             entry.name: {name: table[:, c] for name, table in tables.items()}
             for c, entry in enumerate(self.rules.scored)
@@ -192,7 +192,7 @@ class Metric(ABC, Generic[C]):
         }
 
     def group_means(self, classes: Mapping[str, Values], columns: Mapping[str, str]) -> dict[str, Values]:
-        """Of each group the means over its classes that have a value; ``columns``: name of the mean -> of the value."""
+        """For each group the means over its classes with a value; ``columns``: name of the mean -> of the value."""
         rows: dict[str, list[Values]] = {}
         for entry in self.rules.scored:
             if entry.group:
@@ -206,11 +206,11 @@ class Metric(ABC, Generic[C]):
         }
 
     def combine(self, counts: Sequence[C]) -> Values:
-        """The metrics of the scenes together."""
+        """The metrics over all scenes together."""
         return self.pooled(counts).values
 
     def combine_each(self, counts: Sequence[C]) -> list[Values]:
-        """The metrics of each scene alone."""
+        """The metrics of each scene."""
         return [self.combine([of_scene]) for of_scene in counts]
 
     def reported(self, counts: Sequence[C]) -> Values:
@@ -222,8 +222,8 @@ class Metric(ABC, Generic[C]):
     ) -> dict[str, Float64Array]:
         """Each headline metric (R,) of the scenes drawn ``weights`` (R, S) times, pooled or as the mean over scenes.
 
-        ``rows`` hold the metrics of each scene alone, from which the mean over scenes is formed. With weights of ones
-        this is the value over all scenes, with a single one that of a scene alone.
+        ``rows`` are the metrics of each scene, from which the mean over scenes is computed. Weights of ones give the
+        value over all scenes, a single one that of one scene.
         """
         names = self.rules.headline
         if self.rules.aggregate == "scene-mean":
@@ -232,7 +232,7 @@ class Metric(ABC, Generic[C]):
         return {name: values[name] for name in names}
 
     def check(self, scene: str, counts: Counts) -> None:
-        """A ``DataError`` where counts have other classes, thresholds or values than the rules."""
+        """``DataError`` if counts have other classes, thresholds or values than the rules."""
         has = counts.sizes
         for axis, n in self.sizes.items():
             if has.get(axis, 0) != n:
@@ -243,7 +243,7 @@ class Metric(ABC, Generic[C]):
 
 
 def scene_mean(rows: Collection[Mapping[str, float]]) -> Values:
-    """The mean of each metric over scenes, without those where it is NaN."""
+    """The mean of each metric over scenes, ignoring NaN."""
     return {name: nan_mean(np.array([row[name] for row in rows])) for name in next(iter(rows))}
 
 
@@ -254,7 +254,7 @@ def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
 
 
 def first_row(values: Mapping[str, Float64Array]) -> Values:
-    """Of each value (R,) the first."""
+    """The first entry of each value (R,)."""
     return {name: float(value[0]) for name, value in values.items()}
 
 
@@ -264,5 +264,5 @@ def present(class_index: Int64Array, n_classes: int) -> BoolArray:
 
 
 def n_predictions(prediction: Prediction) -> int:
-    """How many instances, or rows of features, a prediction has."""
+    """The number of instances, or rows of features, of a prediction."""
     return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)

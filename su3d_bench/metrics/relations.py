@@ -26,8 +26,8 @@ NAMES = ("object R@1", "predicate R@1", "relationship R@1", "object mR@1", "pred
 
 @dataclass(frozen=True)
 class RelationCounts(Counts):
-    """What a scene adds: true objects of each class (C,) and true relations of each predicate (P,), and of these how
-    many objects got their class, relations their predicate, and relations subject, predicate and object right."""
+    """The counts of a scene: true objects per class (C,) and true relations per predicate (P,), and of these the
+    objects with the right class, relations with the right predicate, and relations with the right triplet."""
 
     stored_as = "relations"
 
@@ -38,7 +38,7 @@ class RelationCounts(Counts):
     n_triplets_found: Int64Array = field(metadata=axes("predicates"))
 
     def contradiction(self) -> str | None:
-        """More that is found than there is, or triplets without their predicate."""
+        """More found than exist, or triplets without their predicate."""
         pairs = (
             ("n_objects_found", "n_objects"),
             ("n_predicates_found", "n_relations"),
@@ -51,7 +51,7 @@ class RelationCounts(Counts):
 
 
 def recalls(sums: dict[str, Float64Array]) -> dict[str, Float64Array]:
-    """The recalls (R,) of sums of counts (R, C or P); NaN where nothing is true. ``mR`` is the mean over what is true.
+    """The recalls (R,) from sums of counts (R, C or P); NaN without ground truth, which ``mR`` averages over.
 
     >>> one = RelationCounts(*(np.array(n, np.int64) for n in ([2, 1], [2, 0], [4], [2], [1])))
     >>> {name: value.tolist() for name, value in recalls(RelationCounts.drawn([one], np.array([[1]]))).items()}
@@ -72,15 +72,15 @@ def recalls(sums: dict[str, Float64Array]) -> dict[str, Float64Array]:
     return dict(zip(NAMES, values, strict=True))
 
 
-MIN_OWN_SHARE = 0.5  # of a predicted object's points, to stand for an object: less, and it stands for none
-RIVAL_SHARE = 0.75  # of what the first object has of it, for the second: more, and it stands for none
-Edges = dict[tuple[int, int], int]  # rows of subject and object: the place of the predicate
+MIN_OWN_SHARE = 0.5  # minimum share of a predicted object's points in the object that it is assigned to
+RIVAL_SHARE = 0.75  # maximum ratio of the second object's share to the first's for an assignment
+Edges = dict[tuple[int, int], int]  # rows of subject and object: the index of the predicate
 
 
 def shared_points(
     points: Points, masks: Masks, true_points: Points, owner: Int64Array, n_objects: int, cap_m: float
 ) -> Int64Array:
-    """How many points (G, K) of each of K masks have one of each of G objects as the nearest, nearer than ``cap_m``.
+    """Points (G, K) of each of K masks whose nearest true point, nearer than ``cap_m``, belongs to each of G objects.
 
     ``owner`` (N,): the row of the object that each of ``true_points`` (N, 3) m belongs to.
     """
@@ -92,10 +92,10 @@ def shared_points(
 
 
 def assign_objects(shared: Int64Array, sizes: Int64Array) -> Int64Array:
-    """The mask (G,) that stands for each object, -1 for none, from shared points (G, K) and sizes (K,) of masks.
+    """The mask (G,) assigned to each object, -1 for none, from shared points (G, K) and sizes (K,) of masks.
 
-    A mask stands for the one object that has half of its points, unless a second has nearly as many; of several masks
-    that stand for an object the one with most points counts, the first of equals.
+    A mask is assigned to the object that has half of its points, unless a second one has nearly as many; of several
+    masks assigned to an object the one with most points counts, the first on ties.
 
     >>> stand_for(np.array([[6, 4, 5], [3, 4, 0]]), np.array([10, 8, 10])).tolist()
     [0, -1]
@@ -104,7 +104,7 @@ def assign_objects(shared: Int64Array, sizes: Int64Array) -> Int64Array:
     if not n_objects or not n_masks:
         return np.full(n_objects, -1, np.int64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = shared / sizes  # as in the original: 0.75 is held against a quotient of two such shares
+        share = shared / sizes  # as in the original: 0.75 is compared with a quotient of two such shares
         main = shared.argmax(axis=0)
         ordered = np.sort(share, axis=0)
         is_clear = ~(ordered[-1] < MIN_OWN_SHARE) & ~(
@@ -116,7 +116,7 @@ def assign_objects(shared: Int64Array, sizes: Int64Array) -> Int64Array:
 
 
 def last_best(scores: Float64Array) -> Int64Array:
-    """The place of the greatest score of each row (R, P), the last of equals, as the original's reversed order has it.
+    """The index of the greatest score of each row (R, P), the last on ties, as in the original's reversed order.
 
     >>> last_best(np.array([[0.5, 0.5, 0.0]])).tolist()
     [1]
@@ -126,7 +126,7 @@ def last_best(scores: Float64Array) -> Int64Array:
 
 
 def boxes_around(points: Points, masks: Masks) -> Float64Array:
-    """The lowest and highest corners (K, 2, 3) of the points of each mask; zeros of an empty one."""
+    """The lowest and highest corners (K, 2, 3) of the points of each mask; zeros for an empty one."""
     boxes = np.zeros((len(masks), 2, 3))
     for row in np.flatnonzero(masks.sizes).tolist():
         boxes[row] = box_around(points[masks.mask(row)])
@@ -136,9 +136,9 @@ def boxes_around(points: Points, masks: Masks) -> Float64Array:
 def geometric_edges(
     boxes: Float64Array, names: Sequence[str], predicates: Sequence[str], *, sure: bool = False
 ) -> Edges:
-    """The first of the relations that boxes (K, 2, 3) of things so called give each ordered pair, if a predicate.
+    """The first relation of each ordered pair of named boxes (K, 2, 3), if it is a predicate.
 
-    In the order of ``RELATIONS``. ``sure`` leaves out what ``Relations.doubtful`` names.
+    In the order of ``RELATIONS``. ``sure`` excludes those of ``Relations.doubtful``.
     """
     relations = Relations(boxes, [last_word(name) for name in names])
     asked: list[Relation] = [name for name in RELATIONS if name in predicates]
@@ -151,21 +151,21 @@ def geometric_edges(
     return {pair: place for pair, place in edges.items() if place >= 0}
 
 
-MAX_RELATED = 1000  # masks whose boxes are compared pair by pair; above it, only those that stand for an object
-BY_BOXES = "relations of the map by the boxes of its instances: it has no edges of its own"
+MAX_RELATED = 1000  # masks whose boxes are compared pair by pair; above it, only those assigned to an object
+BY_BOXES = "relations of the map from the boxes of its instances: it has no edges"
 
 
 @dataclass(frozen=True)
 class _Graph:
-    """What is true: instance ids and class places (G,) of objects, and the place of the predicate of pairs of rows."""
+    """Ground truth: instance ids and class indices (G,) of objects, and the predicate index of pairs of rows."""
 
     ids: Int64Array
     classes: Int64Array
-    relations: Sequence[tuple[int, int, int]]  # rows of subject and object, place of the predicate
+    relations: Sequence[tuple[int, int, int]]  # rows of subject and object, index of the predicate
 
 
 class RelationMetric(Metric[RelationCounts]):
-    """Of true objects, relations and triplets, how many has a scene graph at rank 1?"""
+    """The share of true objects, relations and triplets that a scene graph has at rank 1."""
 
     truth = GroundTruth
     counts = RelationCounts
@@ -187,11 +187,11 @@ class RelationMetric(Metric[RelationCounts]):
         return score_of_masks(self, counts, prediction, truth.points, is_object, warnings)
 
     def _graph(self, truth: GroundTruth) -> _Graph:
-        """The objects of scored classes and their relations, as people annotated them or by their boxes."""
+        """The objects of scored classes and their relations, as annotated or by their boxes."""
         rules = self.rules
         if rules.relations == "annotated":
             if truth.graph is None:
-                raise DataError(f"{rules.name}: the truth '{truth.variant}' has no annotated relations")
+                raise DataError(f"{rules.name}: ground truth '{truth.variant}' has no annotated relations")
             class_of = dict(truth.graph.class_of_object)
         else:
             ids, first = np.unique(truth.instance, return_index=True)
@@ -202,7 +202,7 @@ class RelationMetric(Metric[RelationCounts]):
         for key, place in kept.items():
             if truth.labels.name_of(class_of[key]) != rules.classes[place].name:
                 raise DataError(
-                    f"{rules.name}: class {class_of[key]} is '{rules.classes[place].name}', in the truth it is "
+                    f"{rules.name}: class {class_of[key]} is '{rules.classes[place].name}', in the ground truth it is "
                     f"'{truth.labels.name_of(class_of[key])}'"
                 )
         objects, classes = np.array([*kept], np.int64), np.array([*kept.values()], np.int64)
@@ -221,13 +221,13 @@ class RelationMetric(Metric[RelationCounts]):
 
     def _place(self, predicate: str) -> int:
         if predicate not in self.rules.predicates:
-            raise DataError(f"{self.rules.name}: the truth has the predicate '{predicate}', none of the protocol's")
+            raise DataError(f"{self.rules.name}: unknown predicate '{predicate}' in ground truth")
         return self.rules.predicates.index(predicate)
 
     def _edges(
         self, prediction: Instances | Partition, masks: Masks, called: Int64Array, stands: Int64Array
     ) -> tuple[Edges, str | None]:
-        """The predicate of each pair of rows that the map relates, its own or by boxes; and a remark."""
+        """The predicate of each pair of rows, from the map's edges or by boxes; and a remark."""
         rules = self.rules
         own = prediction if isinstance(prediction, Instances) and prediction.edges is not None else None
         if own is not None:
@@ -270,7 +270,7 @@ class RelationMetric(Metric[RelationCounts]):
         return {"classes": len(self.rules.classes), "predicates": len(self.rules.predicates)}
 
     def pooled(self, counts: Sequence[RelationCounts]) -> Pooled:
-        """The recalls, beside each what it is a share of, ``n_<name>``, and those of each class and predicate."""
+        """The recalls, the number that each is a share of, ``n_<name>``, and those of each class and predicate."""
         sums = RelationCounts.drawn(counts, np.ones((1, len(counts)), np.int64))
         values = first_row(recalls(sums))
         n_objects, n_relations = int(sums["n_objects"].sum()), int(sums["n_relations"].sum())
@@ -279,7 +279,7 @@ class RelationMetric(Metric[RelationCounts]):
         return Pooled(values, {name: {"R@1": value} for name, value in single.items() if not np.isnan(value)})
 
     def _single(self, sums: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
-        """The recall (R,) of each class and each predicate that some scene has."""
+        """The recall (R,) of each class and each predicate that occurs in a scene."""
         of_class = ratio(sums["n_objects_found"], sums["n_objects"])
         of_predicate = ratio(sums["n_predicates_found"], sums["n_relations"])
         names = [entry.name for entry in self.rules.classes]

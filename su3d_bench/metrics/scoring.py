@@ -1,6 +1,6 @@
-"""One scene under one protocol to additive counts, counts of scenes to what is reported, and counts in files.
+"""Additive counts of one scene under one protocol, reported values from counts of scenes, and counts in files.
 
-``METRICS`` is the one table of the kinds of metrics; everything else asks the metric that ``metric_of`` gives.
+``METRICS`` is the only table of the kinds of metrics; all other code uses the metric from ``metric_of``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __all__ = [
     "unpack_scores",
 ]
 
-EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
+EVERY_SCENE = "every scene"  # prefix of a warning that all scenes share, in place of the name of one
 QuestionTruth = (
     questions.RetrievalTruth | questions.PresenceTruth | questions.AnnotationTruth | questions.ReasoningTruth
 )
@@ -76,15 +76,15 @@ _COUNTS: dict[str, type[Counts]] = {metric.counts.stored_as: metric.counts for m
 
 
 def metric_of(rules: ProtocolRules) -> Metric[Any]:
-    """The metric of a protocol's kind under its rules."""
+    """The metric of a protocol's kind, with its rules."""
     return METRICS[rules.kind](rules)
 
 
 def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
     """The additive counts of one scene under one protocol.
 
-    ``encoder`` names the features of predictions that bring no labels. Raises ``PredictionError`` for a prediction that
-    cannot be scored and ``DataError`` for a truth that does not fit the protocol.
+    ``encoder`` classifies the features of predictions without labels. Raises ``PredictionError`` for a prediction that
+    cannot be scored and ``DataError`` for a ground truth that does not fit the protocol.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> rules = su3d.load_protocol("rooms-instance")
@@ -101,9 +101,9 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
     base = truth.scene if isinstance(truth, QuestionTruth) else truth
     space = base.labels.space if isinstance(base, GroundTruth) else base.space
     if space != rules.label_space:
-        raise DataError(f"{rules.name}: scores the label space '{rules.label_space}', the truth has '{space}'")
+        raise DataError(f"{rules.name}: needs the label space '{rules.label_space}', ground truth has '{space}'")
     if base.variant != rules.ground_truth or not isinstance(truth, metric.truth):
-        raise DataError(f"{rules.name}: scores the truth '{rules.ground_truth}', this one is '{base.variant}'")
+        raise DataError(f"{rules.name}: needs ground truth '{rules.ground_truth}', this one is '{base.variant}'")
     reason = kind_incompatibility(rules, prediction)
     if reason:
         raise PredictionError(reason)
@@ -122,21 +122,21 @@ def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:
     if isinstance(prediction, Partition):
         n = len(prediction.features)
         if prediction.instance.shape != (len(prediction.points),) or prediction.instance.max(initial=-1) >= n:
-            raise PredictionError(f"{rules.name}: the partition needs one row of its {n} features a point, -1 for none")
+            raise PredictionError(f"{rules.name}: a partition needs one row of its {n} features per point, -1 for none")
     if isinstance(prediction, DenseFeatures) and len(prediction.features) != len(prediction.points):
         raise PredictionError(
-            f"{rules.name}: {len(prediction.points)} points and {len(prediction.features)} features; give one a point"
+            f"{rules.name}: {len(prediction.points)} points and {len(prediction.features)} features; give one per point"
         )
 
 
 @dataclass(frozen=True)
 class ProtocolResult:
-    """The numbers of one method under one protocol, as fractions, NaN where undefined.
+    """The values of one method under one protocol, as fractions, NaN if undefined.
 
-    ``metrics`` is ``pooled`` or ``scene_mean``, whichever the protocol reports; ``intervals`` belong to it, for the
-    headline metrics, and are ``None`` where ``jackknife_interval`` has none, as for a single scene. ``coverage``: by
-    radius in metres, the share of scored points without a predicted point that near. ``groups`` holds head, common and
-    tail where the protocol has them.
+    ``metrics`` is ``pooled`` or ``scene_mean``, whichever the protocol reports; ``intervals`` are its confidence
+    intervals for the headline metrics, ``None`` if ``jackknife_interval`` has none, as for a single scene.
+    ``coverage``: by radius in metres, the share of scored points without a predicted point within it. ``groups`` has
+    head, common and tail if the protocol has them.
     """
 
     protocol: str
@@ -168,7 +168,7 @@ class ProtocolResult:
 
 
 def plain_json(value: Any) -> Any:
-    """``value`` with None for what is no finite number, and tuples as lists."""
+    """``value`` with None for non-finite numbers, and tuples as lists."""
     if isinstance(value, Mapping):
         return {key: plain_json(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
@@ -177,11 +177,11 @@ def plain_json(value: Any) -> Any:
 
 
 def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_intervals: bool = True) -> ProtocolResult:
-    """The protocol's numbers over the scenes of ``scores``, whose order does not matter.
+    """The protocol's values over the scenes of ``scores``, whose order does not matter.
 
-    ``intervals`` are None where they are not wanted.
+    ``intervals`` are None if not wanted.
 
-    A ``DataError`` where no scene is given, or one was scored by other rules. The values are fractions.
+    ``DataError`` without scenes, or if one was scored with other rules. The values are fractions.
 
     >>> import su3d_bench as su3d
     >>> su3d.combine(su3d.load_protocol("rooms-instance"), {})
@@ -218,12 +218,12 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_inte
 
 
 def combined_metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
-    """The ``metrics`` of ``combine`` alone, without intervals, classes and scenes."""
+    """Only the ``metrics`` of ``combine``, without intervals, classes and scenes."""
     return metric_of(rules).reported([score.counts for score in _ordered(rules, scores).values()])
 
 
 def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> dict[str, SceneScore]:
-    """The scenes by name; a ``DataError`` where there is none, or one that was scored by other rules."""
+    """The scenes by name; ``DataError`` if there is none, or if one was scored with other rules."""
     if not scores:
         raise DataError(f"{rules.name}: no scene was scored; nothing to combine")
     metric = metric_of(rules)
@@ -238,7 +238,7 @@ def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> dict[str
 
 
 def _coverage(scores: Collection[SceneScore]) -> dict[str, float]:
-    """By radius, the share of scored points without a predicted point that near."""
+    """By radius, the share of scored points without a predicted point within it."""
     n_scored = sum(score.n_scored for score in scores)
     n_beyond = np.sum([score.n_farther for score in scores], axis=0)
     shares = n_beyond / n_scored if n_scored else np.full(len(n_beyond), np.nan)
@@ -246,7 +246,7 @@ def _coverage(scores: Collection[SceneScore]) -> dict[str, float]:
 
 
 def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:
-    """Each sentence with its scene, or once for all where every scene has it.
+    """Each warning with its scene, or once if every scene has it.
 
     >>> _gathered({"a": ("x", "y"), "b": ("x",)})
     ['every scene: x', 'a: y']
@@ -280,14 +280,14 @@ def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
         }
         arrays[f"{name}/about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
         arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays()}
-    # numpy dates every member 1980-01-01, so the bytes say nothing of when they were written
+    # numpy dates every member 1980-01-01, so the bytes do not depend on the time of writing
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
 def unpack_scores(data: bytes) -> dict[str, SceneScore]:
-    """What ``pack_scores`` packed; raises ``DataError`` for anything else."""
+    """The scores packed by ``pack_scores``; raises ``DataError`` for anything else."""
     try:
         arrays = read_arrays(io.BytesIO(data))
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
@@ -306,7 +306,7 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     if n_farther.shape != (len(transfer.COVERAGE_RADII_M),):
         raise DataError(f"counts: 'n_farther' has the shape {n_farther.shape}; score the scene again")
     if about["protocol"] != name:
-        raise DataError(f"counts: '{name}' holds those of '{about['protocol']}'; score the scene again")
+        raise DataError(f"counts: '{name}' contains those of '{about['protocol']}'; score the scene again")
     for key in ("version", "n_predictions", "n_scored"):
         if type(about[key]) is not int or not 0 <= about[key] < MAX_COUNTED:
             raise DataError(f"counts: '{key}' is {about[key]}; score the scene again")

@@ -1,1 +1,1 @@
-"""Predictions made elsewhere: readers of the formats in which other programs leave their results."""
+"""External predictions: readers of the result formats of other programs."""

@@ -1,4 +1,4 @@
-"""What a reader of predictions gives, whatever the format: masks, labels or a map of one scene, with remarks."""
+"""The output of prediction readers, whatever the format: masks, labels or a map of one scene, with remarks."""
 
 from __future__ import annotations
 
@@ -26,11 +26,10 @@ Numbering = Literal["id", "index", "line"]
 class VertexMasks(Masks):
     """Masks over the points of the ground truth, in its order; the file has no coordinates.
 
-    ``n_points`` is None where the file does not say it (a list without masks). ``scores`` (K,) are finite.
-    ``class_numbers`` (K,) are as the file has them, None where it has no classes: with ``numbering`` "id" class ids of
-    the label space, with "index" positions among the classes that a protocol scores, with "line" among all of its list.
-    ``features`` (K, D), all-zero rows have
-    none. ``keys`` name the masks in messages.
+    ``n_points`` is None if the file does not state it (a list without masks). ``scores`` (K,) are finite.
+    ``class_numbers`` (K,) are those of the file, None if it has no classes: with ``numbering`` "id" class ids of the
+    label space, with "index" indices of the classes that a protocol scores, with "line" indices of its whole list.
+    ``features`` (K, D): all-zero rows mean none. ``keys`` name the masks in messages.
     """
 
     n_points: int | None
@@ -44,9 +43,9 @@ class VertexMasks(Masks):
         k = len(self.keys)
         shapes = [array.shape for array in (self.scores, self.class_numbers) if array is not None]
         if self.indptr.shape != (k + 1,) or not self.is_whole or (self.n_points is None and k):
-            raise PredictionError(f"{k} masks: indptr of {self.indptr.shape} does not describe them")
+            raise PredictionError(f"{k} masks: indptr of {self.indptr.shape} does not fit them")
         if shapes.count((k,)) < len(shapes) or (self.features is not None and self.features.shape[:1] != (k,)):
-            raise PredictionError(f"{k} masks, but scores, classes or features of another number")
+            raise PredictionError(f"{k} masks, but a different number of scores, classes or features")
         if not np.isfinite(self.scores).all():
             worst = int(np.flatnonzero(~np.isfinite(self.scores))[0])
             raise PredictionError(f"mask '{self.keys[worst]}': the score is {self.scores[worst]}; it must be finite")
@@ -67,13 +66,13 @@ class VertexMasks(Masks):
             )
 
     def class_ids(self, rules: ProtocolRules) -> Int64Array:
-        """The class id (K,) of each mask, 0 where it has none."""
+        """The class id (K,) of each mask, 0 for none."""
         if self.class_numbers is None:
             return np.zeros(len(self), np.int64)
         return ids_of(self.class_numbers, self.numbering, rules)
 
     def on(self, points: Float32Array, rules: ProtocolRules) -> Instances:
-        """The map of the masks on the ``points`` of the truth, with the names of the protocol's classes as labels."""
+        """The map of the masks on the ground-truth ``points``, with the names of the protocol's classes as labels."""
         labels: tuple[str, ...] | None = None if len(self) else ()
         if self.class_numbers is not None:
             name_of = {entry.id: entry.name for entry in rules.classes}
@@ -82,7 +81,7 @@ class VertexMasks(Masks):
 
 
 def ids_of(numbers: Int32Array, numbering: Numbering, rules: ProtocolRules) -> Int64Array:
-    """The class ids that ``numbers`` of any shape stand for under a protocol, 0 for those of none of its classes."""
+    """The class ids of ``numbers`` of any shape under a protocol, 0 for those of none of its classes."""
     wide = numbers.astype(np.int64)
     if numbering == "id":
         return wide
@@ -93,18 +92,18 @@ def ids_of(numbers: Int32Array, numbering: Numbering, rules: ProtocolRules) -> I
 
 @dataclass(frozen=True)
 class VertexLabels:
-    """One class number a point of the ground truth, in its order, and ``further`` (N, k) ones, the likeliest first."""
+    """One class number per ground-truth point, in its order, and ``further`` (N, k) ones, the most likely first."""
 
     class_ids: Int32Array
     further: Int32Array | None = None
     numbering: Numbering = "id"
 
     def masks(self) -> VertexMasks:
-        """One mask a class, the first one that a point has."""
+        """One mask per class, using the first class of each point."""
         return self._masks(self.class_ids[:, None])[0]
 
     def on(self, points: Float32Array, rules: ProtocolRules) -> Instances:
-        """The map of one mask a class, or a row of classes, on the ``points`` of the truth, named as ``rules`` do."""
+        """The map of one mask per class, or row of classes, on the ground-truth ``points``, named by ``rules``."""
         if self.further is None:
             return self.masks().on(points, rules)
         masks, numbers = self._masks(np.column_stack([self.class_ids, self.further]))
@@ -114,7 +113,7 @@ class VertexLabels:
         return replace(named, further_labels=tuple(tuple(name_of.get(one, "") for one in row) for row in ids.tolist()))
 
     def _masks(self, rows: Int32Array) -> tuple[VertexMasks, Int32Array]:
-        """One mask a distinct row (R,) of ``rows`` (N, k), and these rows."""
+        """One mask per distinct row (R,) of ``rows`` (N, k), and these rows."""
         values, row = np.unique(rows if rows.shape[1] > 1 else rows[:, 0], axis=0, return_inverse=True)
         distinct = values.reshape(-1, rows.shape[1]).astype(np.int32)
         masks, first = masks_of_partition(row.ravel(), len(distinct)), distinct[:, 0]
@@ -142,7 +141,7 @@ def vertex_masks(
     keys: Sequence[str] | None = None,
     **more: Any,
 ) -> VertexMasks:
-    """The masks whose point indices are ``members``; score 1 and keys ``mask 0``, ... where none are given."""
+    """The masks whose point indices are ``members``; score 1 and keys ``mask 0``, ... by default."""
     parts: list[Int32Array] = []
     n = 0
     for part in members:
@@ -157,7 +156,7 @@ def vertex_masks(
 
 @contextmanager
 def named(where: str) -> Iterator[None]:
-    """Errors of the block begin with ``where``."""
+    """Prefix errors of the block with ``where``."""
     try:
         yield
     except PredictionError as error:
@@ -165,7 +164,7 @@ def named(where: str) -> Iterator[None]:
 
 
 def instances_of(clouds: Sequence[Float32Array], where: str, features: Float32Array | None, **texts: Any) -> Instances:
-    """One instance a cloud, each with points of its own, score 1 and no views; boxes of empty clouds are zeros."""
+    """One instance per cloud, each with its own points, score 1 and no views; boxes of empty clouds are zeros."""
     sizes = np.array([len(cloud) for cloud in clouds], np.int64)
     n = int(sizes.sum())
     if n > MAX_POINTS or len(clouds) > MAX_MASKS:
@@ -177,7 +176,7 @@ def instances_of(clouds: Sequence[Float32Array], where: str, features: Float32Ar
 
 @dataclass(frozen=True)
 class ScenePrediction:
-    """What one scene's files say; ``remarks`` are what a reader of the number must know."""
+    """The content of one scene's files; ``remarks`` are facts that affect the interpretation of the results."""
 
     scene: str
     format: str
@@ -186,26 +185,26 @@ class ScenePrediction:
     remarks: tuple[str, ...] = ()
 
 
-Parsed = tuple[Content, Sequence[str]]  # of one scene, with remarks
-Parse = Callable[[Path, str], Parsed]  # by its file or folder, and its name
+Parsed = tuple[Content, Sequence[str]]  # content of one scene, with remarks
+Parse = Callable[[Path, str], Parsed]  # from its file or folder, and its name
 
 
 @dataclass(frozen=True)
 class Reader:
     """One format of predictions.
 
-    ``recognise`` says why a path is of this format, from names and first bytes alone, None where it is not; ``scenes``
-    gives the file or folder of each scene by the name that the files give it; ``parse`` what is in one of these.
+    ``recognise`` returns why a path is of this format, from names and first bytes only, None if it is not; ``scenes``
+    the file or folder of each scene by its name in the files; ``parse`` the content of one of these.
     """
 
     name: str
     recognise: Callable[[Path], str | None]
     scenes: Callable[[Path], Mapping[str, Path]]
     parse: Parse
-    noun: str = "prediction"  # what messages call that of a scene
+    noun: str = "prediction"  # its name in messages
 
     def read(self, path: Path, scene: str) -> ScenePrediction:
-        """The prediction of one of ``scenes(path)``; ``PredictionError`` where it cannot be used."""
+        """The prediction of one of ``scenes(path)``; ``PredictionError`` if it cannot be used."""
         place = self.scenes(path).get(scene)
         if place is None:
             raise PredictionError(f"{shown(path)}: has no {self.noun} of scene '{printable(scene, 80)}'")
@@ -214,9 +213,9 @@ class Reader:
 
 
 def file_format(name: str, suffixes: Sequence[str], looks: Callable[[Path], str | None], parse: Parse) -> Reader:
-    """A file a scene, called after it and ending in the first of ``suffixes`` that fits.
+    """A format with one file per scene, named after it and ending in the first of ``suffixes`` that fits.
 
-    ``looks`` says of the first file with the last suffix, then of those with the others, why it is of this format.
+    ``looks`` returns, for the first file with the last suffix, then those with the others, why it is of this format.
     """
 
     def recognise(path: Path) -> str | None:
@@ -231,7 +230,7 @@ def file_format(name: str, suffixes: Sequence[str], looks: Callable[[Path], str 
 
 
 def scene_of_folder(folder: Path, path: Path) -> str:
-    """The name of the scene whose ``folder`` was found at ``path``."""
+    """The name of the scene whose ``folder`` was found in ``path``."""
     return folder.absolute().name
 
 
@@ -244,9 +243,9 @@ def folder_format(
     scene_of: Callable[[Path, Path], str] = scene_of_folder,
     n_above: int = 2,
 ) -> Reader:
-    """A folder a scene, at most ``n_above`` folders below the path.
+    """A format with one folder per scene, at most ``n_above`` folders below the path.
 
-    ``first`` and ``second`` lie in it; ``scene_of`` names the scene of a folder that was found at a path.
+    ``first`` and ``second`` are in it; ``scene_of`` names the scene of a folder that was found in a path.
     """
 
     def folders(path: Path) -> list[Path]:
@@ -255,7 +254,7 @@ def folder_format(
 
     def recognise(path: Path) -> str | None:
         names = " and ".join(dict.fromkeys((first, second)))
-        return f"it holds {names}" if path.is_dir() and folders(path) else None
+        return f"it contains {names}" if path.is_dir() and folders(path) else None
 
     def scenes(path: Path) -> Mapping[str, Path]:
         return named_once([(scene_of(folder, path), folder) for folder in folders(path)], path)
@@ -264,7 +263,7 @@ def folder_format(
 
 
 def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The files with one of ``suffixes`` in a folder by their names without it, in alphabetical order; or one file."""
+    """The files with one of ``suffixes`` in a folder, or one file, by their names without it, in alphabetical order."""
     with reading(shown(path)):
         files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
     of_scene = {}
@@ -276,13 +275,13 @@ def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
 
 
 def first_found(path: Path, patterns: Sequence[str]) -> list[Path]:
-    """What the first of ``patterns`` that matches anything below ``path`` matches, in alphabetical order."""
+    """The matches of the first of ``patterns`` that matches anything in ``path``, in alphabetical order."""
     with reading(shown(path)):
         return next((matches for pattern in patterns if (matches := sorted(path.glob(pattern)))), [])
 
 
 def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Path]:
-    """``pairs`` as a table; ``PredictionError`` where two paths claim one scene."""
+    """``pairs`` as a table; ``PredictionError`` if two paths are of the same scene."""
     table: dict[str, Path] = {}
     for name, place in pairs:
         if table.setdefault(name, place) != place:

@@ -1,17 +1,17 @@
-"""Maps over points of their own with a feature for each point, voxel or object of a partition.
+"""Maps over their own points with a feature for each point, voxel or object of a partition.
 
-- ConceptFusion as gradslam stores it, ``pc_points.h5`` and the features of its points. Source: gradslam branch
+- ConceptFusion as stored by gradslam, ``pc_points.h5`` and the features of its points. Source: gradslam branch
   conceptfusion at commit 59ca872. Its loader makes poses relative to the first frame, so that the points are in the
-  frame of the first camera; the first pose of the recording brings them to the world.
-- RayFronts, a feature a voxel or point. Source: RayFronts/RayFronts at commit cfa0e6a: ``save`` of
-  rayfronts/mapping/semantic_voxel_map.py and semantic_point_cloud.py, and the cache that scripts/semseg_eval.py keeps
-  of any of its maps, ``map.pt`` in the folder of a scene. Its rays, beyond the reach of the depth, are in no file.
-- OVO, the points of its SLAM, the object of each, and a feature an object, in one checkpoint a scene. Source:
+  frame of the first camera; the first pose of the recording transforms them to the world.
+  - RayFronts, one feature per voxel or point. Source: RayFronts/RayFronts at commit cfa0e6a: ``save`` of
+  rayfronts/mapping/semantic_voxel_map.py and semantic_point_cloud.py, and the cache that scripts/semseg_eval.py
+  writes for any of its maps, ``map.pt`` in the folder of a scene. Its rays, beyond the depth range, are in no file.
+  - OVO, the points of its SLAM, the object of each, and one feature per object, in one checkpoint per scene. Source:
   tberriel/OVO at commit cf3b68e, ``save_representation`` of ovo/entities/ovomapping.py, ``capture_dict`` of
-  ovo/entities/ovo.py and ``export`` of ovo/entities/instance3d.py. What its ``--segment`` writes beside them are texts
-  in ScanNet's forms, their classes positions in OVO's own list.
+  ovo/entities/ovo.py and ``export`` of ovo/entities/instance3d.py. Its ``--segment`` also writes text files in
+  ScanNet's formats, whose classes are indices into OVO's own list.
 - OpenLex3D, a cloud, the object of each point, the feature of each object. Source: openlex3d at commit 3dbad2b. The
-  format has no point without an object, no overlaps, scores or names.
+  format has no points without an object, no overlaps, scores or names.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"  # gradslam's
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")
 MAP_FOLDERS = ("pointclouds", "saved-map", "saved-maps", "Sequence_1")
 CLOUD = "point_cloud.pcd"  # OpenLex3D's
-CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the order in which the original looks for them
+CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the search order of the original
 LEX_INDEX, LEX_EMBEDDINGS = "index.npy", "embeddings.npy"
 OVO_MAP = "ovo_map.ckpt"
-OVO_POINTS = ("map_params", "gaussian_params")  # the second in maps of before; its own loader takes both
+OVO_POINTS = ("map_params", "gaussian_params")  # the second in older maps; its own loader accepts both
 OVO_OBJECTS = "ovo_map_params"
 RAY_MAP = "map.pt"
-N_COLOURS, N_COUNTS = 3, 1  # columns before and behind the features of a voxel of RayFronts
+N_COLOURS, N_COUNTS = 3, 1  # columns before and after the features of a voxel of RayFronts
 
 
 def scene_of_gradslam(folder: Path, path: Path) -> str:
-    """The first name upwards that is no folder of the map's own."""
+    """The first name upwards that is not one of the map's own folders."""
     absolute = folder.absolute()
     names = [above.name for above in (absolute, *absolute.parents) if above.name not in MAP_FOLDERS]
     return names[0] or "scene"
@@ -62,7 +62,7 @@ def gradslam(place: Path, scene: str) -> Parsed:
         points, pose_remark = _in_world(points, place)
         features, n_without = _features(place / EMBEDDINGS, len(points))
     if not np.isfinite(points).all():
-        raise PredictionError(f"{where}: the first pose moves points out of what float32 metres can hold")
+        raise PredictionError(f"{where}: the first pose moves points outside the range of float32 metres")
     remarks = [pose_remark]
     if n_without:
         remarks.append(f"{n_without} of {len(points)} points have no feature (a row of zeros or NaN)")
@@ -70,26 +70,26 @@ def gradslam(place: Path, scene: str) -> Parsed:
 
 
 def _in_world(points: Float32Array, folder: Path) -> tuple[Float32Array, str]:
-    """``points`` moved by the first pose beside them, or as they are; and the remark that says so."""
+    """``points``, transformed with the first pose next to them if there is one, and a remark on it."""
     file = next((candidate for name in POSE_FILES if (candidate := folder / name).is_file()), None)
     if file is None:
         return points, (
-            "points are taken as they are; gradslam leaves them in the frame of the first camera: to bring them to the "
-            f"world, put its camera-to-world pose, 16 numbers in a line, into {POSE_FILES[0]} beside {POINTS}"
+            "points are used unchanged; gradslam stores them in the frame of the first camera: to transform them to "
+            f"the world, put its camera-to-world pose, 16 numbers on one line, into {POSE_FILES[0]} next to {POINTS}"
         )
     pose = read_first_pose(file, shown(file))
     with np.errstate(over="ignore", invalid="ignore"):
-        return moved(points, pose), f"points were brought to the world with the first pose of {file.name}"
+        return moved(points, pose), f"points were transformed to the world with the first pose of {file.name}"
 
 
 def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
-    """The features (N, D), mapped from a file without a name, and how many rows have none.
+    """The features (N, D), memory-mapped from an unnamed file, and the number of rows without any.
 
-    Rows with what float16 cannot hold become zeros.
+    Rows with values outside the range of float16 become zeros.
     """
     where, n_rows, n_without, n_columns = shown(file), 0, 0, 0
     try:
-        # Sparse writes would crash the process on a full disk when the map is touched; plain ones fail here.
+        # Sparse writes would crash the process on a full disk at the first access of the map; plain ones fail here.
         with tempfile.TemporaryFile() as stored:
             for block in row_blocks(file, None, where):
                 rows = arrays.half_rows(block)
@@ -99,7 +99,7 @@ def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
                     stored.write(rows.tobytes())
             stored.flush()
             if n_rows != n_points:
-                raise PredictionError(f"{where}: has other rows than {POINTS}, which has {n_points}; copy both again")
+                raise PredictionError(f"{where}: has other rows than {POINTS} ({n_points}); copy both again")
             empty = np.zeros((0, n_columns), np.float16)
             return (np.memmap(stored, np.float16, "r", shape=(n_rows, n_columns)) if n_rows else empty), n_without
     except OSError as error:
@@ -112,7 +112,7 @@ def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
 
 
 def scene_of_openlex3d(folder: Path, path: Path) -> str:
-    """``scene``, or ``dataset/scene`` where ``path`` holds folders of datasets."""
+    """``scene``, or ``dataset/scene`` if ``path`` contains folders of datasets."""
     parts = folder.relative_to(path).parts
     return "/".join(parts) if parts else folder.absolute().name
 
@@ -126,21 +126,21 @@ def openlex3d(place: Path, scene: str) -> Parsed:
     features, remarks = arrays.without_nonfinite(arrays.feature_table(read_npy(embeddings), embeddings), "objects")
     if len(clouds) > 1:
         names = ", ".join(file.name for file in clouds[1:])
-        remarks = (f"{clouds[0].name} is read, as the original does, and not {names}", *remarks)
+        remarks = (f"{clouds[0].name} is read, as in the original, and not {names}", *remarks)
     index = _index(place / LEX_INDEX, len(points), clouds[0].name, len(features))
     return Partition(points, index, features), remarks
 
 
 def _index(file: Path, n_points: int, cloud: str, n_objects: int) -> Int32Array:
     """The object of each point; every point has one."""
-    expected = f"an integer for each of the {n_points} points of {cloud}"
+    expected = f"one integer for each of the {n_points} points of {cloud}"
     index = arrays.array_of(read_npy(file), f"{shown(file)}: holds", expected, "iu", n_points)
     is_wrong = (index < 0) | (index >= n_objects)
     if is_wrong.any():
         point = int(np.argmax(is_wrong))
         raise PredictionError(
             f"{shown(file)}: point {point} is of object {int(index[point])}, {LEX_EMBEDDINGS} has {n_objects} rows; "
-            "every point needs one of them, leave out points without an object"
+            "every point needs one of them, omit points without an object"
         )
     return index.astype(np.int32)
 
@@ -164,12 +164,12 @@ def ovo(place: Path, scene: str) -> Parsed:
     instance = _rows(cloud.get("obj_ids"), len(points), ids, where)
     n_lost = len(ids) - len(np.unique(instance[instance >= 0]))
     if n_lost:
-        remarks += (f"{n_lost} of {len(ids)} objects have no point left",)
+        remarks += (f"{n_lost} of {len(ids)} objects have no points",)
     return Partition(points, instance, features), remarks
 
 
 def _ids(value: object, where: str) -> Int64Array:
-    """The number of each object, in the order of the map's."""
+    """The number of each object, in the map's order."""
     is_empty = isinstance(value, np.ndarray) and not value.size
     value = arrays.array_of(
         value, f"{where}: 'ins_3d_ids' is", "the number of each object", "iuf" if is_empty else "iu", None
@@ -177,24 +177,24 @@ def _ids(value: object, where: str) -> Int64Array:
     arrays.check_sizes(0, len(value), where)
     ids = value.astype(np.int64)
     if len(np.unique(ids)) != len(ids) or (len(ids) and int(ids.min()) < 0):
-        raise PredictionError(f"{where}: 'ins_3d_ids' has a number twice or below 0; is it damaged?")
+        raise PredictionError(f"{where}: 'ins_3d_ids' has a repeated or negative number; is it damaged?")
     return ids
 
 
 def _rows_of(objects: Mapping[object, object], ids: Int64Array, file: Path) -> Float32Array:
-    """A row (K, D) for each object, of zeros for those that were never described."""
+    """One row (K, D) per object, zeros for those without a descriptor."""
     where, features = shown(file), np.zeros((len(ids), 0), np.float32)
     for row, number in enumerate(ids.tolist()):
         value = objects.get(f"ins3d_{number}_clip_feature")
         if value is None:
             continue
-        if isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 1:  # where several views were merged
+        if isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 1:  # if several views were merged
             value = value[0]
         n = features.shape[1]
         found = f"{where}: the feature of object {number} is"
         feature = arrays.array_of(value, found, f"a row of {n}" if n else "a row", "f", n or arrays.NOT_EMPTY)
         if not n:
-            arrays.check_memory(4 * len(ids) * len(feature), file)  # objects may share one row
+            arrays.check_memory(4 * len(ids) * len(feature), file)  # objects can share one row
             features = np.zeros((len(ids), len(feature)), np.float32)
         features[row] = arrays.as_float32(feature)
     return features if features.shape[1] else np.zeros((len(ids), 1), np.float32)
@@ -222,7 +222,7 @@ def _rows(value: object, n_points: int, ids: Int64Array, where: str) -> Int32Arr
 
 def looks_like_rayfronts(path: Path) -> str | None:
     if _kept(path):
-        return f"it holds {RAY_MAP}"
+        return f"it contains {RAY_MAP}"
     return SAVED_MAPS.recognise(path)
 
 
@@ -238,12 +238,12 @@ def rayfronts(place: Path, scene: str) -> Parsed:
         raise PredictionError(f"{where}: holds {arrays.kind_of(value)}; expected a dict of RayFronts")
     points, table = _columns(value, place)
     places = arrays.checked_points(points, where)
-    found = f"{where}: {len(places)} places, but the features are"
+    found = f"{where}: {len(places)} positions, but the features are"
     features = arrays.half_rows(
-        arrays.array_of(table, found, "a row a voxel or point", "f", len(places), arrays.NOT_EMPTY)
+        arrays.array_of(table, found, "one row per voxel or point", "f", len(places), arrays.NOT_EMPTY)
     )
     n_without = int((~features.any(axis=1)).sum())
-    remarks = ["what lay beyond the reach of the depth is in no file of RayFronts: its rays are not scored"]
+    remarks = ["RayFronts' files do not contain its rays, beyond the depth range: they are not scored"]
     if n_without:
         remarks.append(f"{n_without} of {len(places)} voxels or points have no feature (a row of zeros or NaN)")
     return DenseFeatures(places, features), remarks
@@ -253,14 +253,14 @@ SAVED_MAPS = file_format("rayfronts", (".pt",), holds(dict, "a dict"), rayfronts
 
 
 def _kept(path: Path) -> list[Path]:
-    """The caches of an evaluation at or below ``path``."""
+    """The caches of an evaluation at or in ``path``."""
     if not path.is_dir():
         return []
     return [file for file in first_found(path, [RAY_MAP, f"*/{RAY_MAP}", f"*/*/{RAY_MAP}"]) if file.is_file()]
 
 
 def _columns(value: Mapping[object, object], file: Path) -> tuple[object, object]:
-    """Places and features of a map in any of the three forms."""
+    """Positions and features of a map in any of the three forms."""
     where = shown(file)
     if "feats_feats" in value:
         return value.get("feats_xyz"), value["feats_feats"]
@@ -272,7 +272,7 @@ def _columns(value: Mapping[object, object], file: Path) -> tuple[object, object
         places, features = value.get("global_xyz_pc"), value["global_feat_pc"]
         return _joined(places, file), _joined(features, file)
     if "global_vox_occ" in value:
-        raise PredictionError(f"{where}: holds which voxels are occupied and no features; save a semantic map")
+        raise PredictionError(f"{where}: is an occupancy map without features; save a semantic map")
     names = sorted(name for name in value if isinstance(name, str))
     raise PredictionError(
         f"{where}: holds {', '.join(names[:4]) or 'nothing'}; expected a map of RayFronts, such as {RAY_MAP}"
@@ -280,12 +280,12 @@ def _columns(value: Mapping[object, object], file: Path) -> tuple[object, object
 
 
 def _joined(value: object, file: Path) -> NDArray[np.generic]:
-    """The clouds of a list as one."""
+    """The clouds of a list, concatenated."""
     clouds, where = value if isinstance(value, list | tuple) else [], shown(file)
     if not clouds:
         raise PredictionError(f"{where}: holds no cloud; expected a list of them")
     width = next(iter(np.shape(clouds[0])[1:]), None)
     found = f"{where}: a cloud of the list is"
     tables = [arrays.array_of(cloud, found, "tables of one width", "fiu", None, width) for cloud in clouds]
-    arrays.check_memory(sum(table.nbytes for table in tables), file)  # clouds may share what they hold
+    arrays.check_memory(sum(table.nbytes for table in tables), file)  # clouds may share their arrays
     return np.concatenate(tables)

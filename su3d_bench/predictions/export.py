@@ -1,6 +1,6 @@
-"""Predictions in the forms that other evaluators take: OpenLex3D's three files, the lists of masks of ScanNet and
-ScanNet++, the ranked classes of ScanNet++, and the OpenSUN3D challenge's submissions, for each scene the masks that
-answer its query."""
+"""Predictions in the formats of other evaluators: OpenLex3D's three files, the lists of masks of ScanNet and
+ScanNet++, the ranked classes of ScanNet++, and the OpenSUN3D challenge's submissions, with the masks for the query
+of each scene."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from su3d_bench.predictions.dense import CLOUD, LEX_EMBEDDINGS, LEX_INDEX
 from su3d_bench.predictions.scannet_text import MASK_OF_RUNS
 
 MASKS_FOLDER = "pred_mask"
-RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer and the OpenSUN3D challenge call it
+RUNS_FOLDER = "predicted_masks"  # its name in ScanNet++'s own writer and the OpenSUN3D challenge
 ROWS_AT_ONCE = 1 << 14
 # demo_eval.py of OpenSun3D/cvpr24-challenge at 59db30f reads a list with numpy.loadtxt and stops at one of fewer lines.
 MIN_MASKS = 2
@@ -42,13 +42,13 @@ FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
 
 @contextmanager
 def whole_folder(out: Path) -> Iterator[Path]:
-    """A folder to fill, which becomes ``out`` when the block ends well and vanishes when it does not.
+    """A folder to fill, which becomes ``out`` if the block succeeds and is removed otherwise.
 
-    ``out`` must not exist yet, or be an empty folder.
+    ``out`` must not exist yet, or must be an empty folder.
     """
     is_empty = not out.exists() or (out.is_dir() and not any(out.iterdir()))
     if not is_empty or out.is_symlink():
-        raise StoreError(f"{out}: is there already; choose another folder with --out, or remove it")
+        raise StoreError(f"{out}: already exists; choose another folder with --out, or remove it")
     out = out.absolute()
     make_folder(out.parent)
     try:
@@ -60,9 +60,9 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 
 def file_name(scene: str) -> str:
-    """``scene`` as a name of files; ``PredictionError`` where it would lead elsewhere."""
+    """``scene`` as a file name; ``PredictionError`` if it would be outside the folder."""
     if FILE_NAME.fullmatch(scene) is None:
-        raise PredictionError(f"scene '{printable(scene, 80)}': cannot be the name of a file; rename its files")
+        raise PredictionError(f"scene '{printable(scene, 80)}': is not a valid file name; rename its files")
     return scene
 
 
@@ -71,7 +71,7 @@ def file_name(scene: str) -> str:
 
 @dataclass(frozen=True)
 class OpenLexParts:
-    """Points (N, 3), the object (N,) of each, features (K, D) of the objects, and what became of the rest."""
+    """Points (N, 3), the object (N,) of each, features (K, D) of the objects, and remarks on the rest."""
 
     points: Float32Array
     index: Int64Array
@@ -80,9 +80,9 @@ class OpenLexParts:
 
 
 def openlex_parts(content: Content) -> OpenLexParts:
-    """A map as OpenLex3D can say it: every point in one object, the first that holds it; the others are left out."""
+    """A map in OpenLex3D's form: every point in one object, the first that contains it; other points are omitted."""
     if isinstance(content, VertexMasks | VertexLabels):
-        raise PredictionError("is over the points of the ground truth and brings no points, which OpenLex3D needs")
+        raise PredictionError("is over the points of the ground truth and has no points, which OpenLex3D needs")
     features, remarks = content.features, []
     if features is None:
         raise PredictionError("has no features, and OpenLex3D needs one for each object")
@@ -92,33 +92,33 @@ def openlex_parts(content: Content) -> OpenLexParts:
         owner = transfer.first_owner(content, len(content.points))
         n_shared = int((np.bincount(content.indices, minlength=1) > 1).sum())
         if n_shared:
-            remarks.append(f"{n_shared} points are in several objects and went to the first of them")
+            remarks.append(f"{n_shared} points are in several objects and were assigned to the first")
     else:
         _check_partition(content)
         owner = content.instance.astype(np.int64)
     kept = owner >= 0
     if n_without := int((~kept).sum()):
-        remarks.append(f"{n_without} of {len(kept)} points are in no object and were left out")
+        remarks.append(f"{n_without} of {len(kept)} points are in no object and were omitted")
     n_empty = len(features) - len(np.unique(owner[kept]))
     if n_empty:
-        remarks.append(f"{n_empty} of {len(features)} objects have no point left")
+        remarks.append(f"{n_empty} of {len(features)} objects have no points")
     return OpenLexParts(_finite(content.points[kept]), owner[kept], features, tuple(remarks))
 
 
 def _check_partition(content: Partition) -> None:
     n = len(content.features)
     if content.instance.shape != (len(content.points),) or content.instance.max(initial=-1) >= n:
-        raise PredictionError(f"needs one of its {n} rows of features for each point, -1 for none; make the map again")
+        raise PredictionError(f"needs one of its {n} rows of features per point, -1 for none; create the map again")
 
 
 def _dense_parts(content: DenseFeatures) -> OpenLexParts:
-    """Each point as its own object; points without a feature are left out."""
+    """Each point as its own object; points without a feature are omitted."""
     has_feature = np.zeros(len(content.points), np.bool_)
     for start in range(0, len(has_feature), ROWS_AT_ONCE):
         has_feature[start : start + ROWS_AT_ONCE] = content.features[start : start + ROWS_AT_ONCE].any(axis=1)
-    remarks = ["each point is an object of its own"]
+    remarks = ["each point is its own object"]
     if n_without := int((~has_feature).sum()):
-        remarks.append(f"{n_without} of {len(has_feature)} points have no feature and were left out")
+        remarks.append(f"{n_without} of {len(has_feature)} points have no feature and were omitted")
     rows = np.cumsum(has_feature)[has_feature] - 1
     features: Any = content.features if has_feature.all() else content.features[has_feature]
     return OpenLexParts(_finite(content.points[has_feature]), rows.astype(np.int64), features, tuple(remarks))
@@ -126,14 +126,14 @@ def _dense_parts(content: DenseFeatures) -> OpenLexParts:
 
 def _finite(points: Float32Array) -> Float32Array:
     if not len(points):
-        raise PredictionError("has no point in any object; there is nothing to export")
+        raise PredictionError("has no points in any object; there is nothing to export")
     if not np.isfinite(points).all():
-        raise PredictionError("has points that are NaN or infinite; make the map again")
+        raise PredictionError("has points that are NaN or infinite; create the map again")
     return points
 
 
 def write_openlex(content: Content, folder: Path) -> tuple[str, ...]:
-    """``point_cloud.pcd``, ``index.npy`` and ``embeddings.npy`` of one scene; remarks on what did not fit."""
+    """``point_cloud.pcd``, ``index.npy`` and ``embeddings.npy`` of one scene; returns remarks on what did not fit."""
     parts = openlex_parts(content)
     make_folder(folder)
     write_pcd_points(folder / CLOUD, parts.points)
@@ -151,7 +151,7 @@ def write_openlex(content: Content, folder: Path) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class LabelledMasks:
-    """K masks over ``n_points`` points of the truth, a class id (K,), 0 for none, and a score (K,) for each."""
+    """K masks over ``n_points`` ground-truth points, with a class id (K,), 0 for none, and a score (K,) each."""
 
     masks: Masks
     n_points: int
@@ -161,12 +161,12 @@ class LabelledMasks:
 
 
 def needs_truth(content: Content, numbering: Numbering = "id") -> bool:
-    """Whether masks and classes of that ``numbering`` are not all in the file: other points or numbers, or none."""
+    """Whether the file lacks masks and classes of this ``numbering``: other points or numbers, or none."""
     return not isinstance(content, VertexMasks) or content.class_numbers is None or content.numbering != numbering
 
 
 def masks_as_they_are(content: VertexMasks) -> LabelledMasks:
-    """Masks over the truth's points with class ids of their own; of places in a list, from 0, the ids are one more."""
+    """Masks over the ground-truth points with their own class ids; for indices into a list, the ids are one more."""
     assert content.class_numbers is not None and content.numbering != "index"
     ids = content.class_numbers.astype(np.int64) + (content.numbering == "line")
     return LabelledMasks(content, content.n_points or 0, ids, content.scores)
@@ -175,9 +175,9 @@ def masks_as_they_are(content: VertexMasks) -> LabelledMasks:
 def masks_on_truth(
     content: Content, rules: ProtocolRules, truth: GroundTruth, encoder: Encoder | None
 ) -> LabelledMasks:
-    """The masks on the points of the truth, as ``rules`` bring them there, with class ids of its label set.
+    """The masks transferred to the ground-truth points by ``rules``, with class ids of its label set.
 
-    Classes are those of the prediction, else what ``encoder`` calls its features among the classes of ``rules``.
+    Classes are those of the prediction, otherwise ``encoder`` classifies its features among the classes of ``rules``.
     """
     named, remarks = _as_map(content, truth.points, rules), list[str]()
     if isinstance(named, Partition):
@@ -196,7 +196,7 @@ def masks_on_truth(
 def _as_map(content: Content, vertices: Float32Array, rules: ProtocolRules) -> Instances | Partition:
     """The map of masks, those of the ``vertices`` with these as their points."""
     if isinstance(content, VertexLabels | DenseFeatures):
-        raise PredictionError("has no masks, and a list of masks needs them")
+        raise PredictionError("has no masks, which a list of masks needs")
     if not isinstance(content, VertexMasks):
         return content
     if content.n_points not in {None, len(vertices)}:
@@ -211,33 +211,33 @@ def _moved(
 ) -> Masks:
     """The ``masks`` of a map on ``vertices`` (V, 3) m."""
     if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
-        raise PredictionError("has points, features or scores that are NaN or infinite; make it again")
+        raise PredictionError("has points, features or scores that are NaN or infinite; create it again")
     return transfer.transfer_masks(
         named.points, masks, vertices, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
 
 
 def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
-    """``<scene>.txt`` and a file of digits for each mask; masks without points or class are left out and told.
+    """``<scene>.txt`` and one file of digits per mask; masks without points or class are omitted, with a remark.
 
-    Confidences are written with all their digits: ``%f`` would make equals of what differs in the seventh.
+    Confidences are written with all digits: with ``%f`` those that differ in the seventh would become equal.
     """
     form = MASKS_FOLDER, ".txt", lambda k: digits_of(labelled, k)
     return write_list(labelled, labelled.class_ids - 1, scene, folder, 1, form)
 
 
 def digits_of(labelled: LabelledMasks, k: int) -> bytes:
-    """Mask k as ScanNet's benchmark has it: a line for each point, 1 where it is in the mask."""
+    """Mask k in the format of ScanNet's benchmark: one line per point, 1 if it is in the mask."""
     digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
     digits[labelled.masks.mask(k), 0] = ord("1")
     return digits.tobytes()
 
 
 def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene: str, folder: Path) -> tuple[str, ...]:
-    """``<scene>.txt`` and a file of run lengths for each mask; what cannot be said is left out and told.
+    """``<scene>.txt`` and one file of run lengths per mask; unsupported masks are omitted, with a remark.
 
-    Classes are places in the list of all classes of ``rules``; without these, the ids of the masks are such places + 1.
-    The official script takes confidences from 0 to 1 alone, as AP knows only their order others become ranks.
+    Classes are indices into the list of all classes of ``rules``; without it, mask ids are such indices + 1. The
+    official script accepts confidences from 0 to 1 only; others become ranks, because AP depends only on the order.
     """
     places = labelled.class_ids - 1
     if rules is not None:
@@ -246,14 +246,16 @@ def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene:
     scores = labelled.scores
     if len(scores) and (scores.min() < 0 or scores.max() > 1):
         distinct, rank = np.unique(scores, return_inverse=True)
-        remark = "confidences beyond 0 to 1, which the benchmark refuses, were written as their ranks over their number"
+        remark = (
+            "confidences outside 0 to 1, which the benchmark rejects, were written as ranks divided by their number"
+        )
         labelled = replace(labelled, scores=(rank + 1) / len(distinct), remarks=(*labelled.remarks, remark))
     form = RUNS_FOLDER, MASK_OF_RUNS, lambda k: _runs_json(labelled.masks.mask(k), labelled.n_points)
     return write_list(labelled, places, scene, folder, 0, form)
 
 
 def _runs_json(members: Int32Array, n_points: int) -> bytes:
-    """A mask as ScanNet++ has it: its length, and start and length of each run, the first point being 1."""
+    """A mask in ScanNet++'s format: its length, and start and length of each run, counting points from 1."""
     starts = np.flatnonzero(np.diff(members, prepend=-2) > 1)
     sizes = np.diff(np.append(starts, len(members)))
     runs = np.column_stack([members[starts] + 1, sizes]).ravel()
@@ -268,10 +270,10 @@ def write_list(
     first: int | None,
     form: tuple[str, str, Callable[[int], bytes]],
 ) -> tuple[str, ...]:
-    """``<scene>.txt`` and a file for each mask with points and a place (K,) from 0 on, which is written from ``first``;
-    where that is None, lines have no class, and files are numbered without gaps.
+    """``<scene>.txt`` and one file per mask with points and a class index (K,), which is written from ``first`` on;
+    if that is None, lines have no class, and files are numbered without gaps.
 
-    ``form``: folder and suffix of the files of masks, and what is in that of mask k.
+    ``form``: folder and suffix of the mask files, and the content of that of mask k.
     """
     scene, (below, suffix, content_of) = file_name(scene), form
     make_folder(folder / below)
@@ -289,16 +291,16 @@ def write_list(
             lines.append(f"{name} {score!r}\n" if first is None else f"{name} {place + first} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))
     left_out = {"no point of the ground truth": n_empty, "none of the classes": n_unnamed}
-    remarks = [f"{n} of {len(sizes)} masks have {what} and were left out" for what, n in left_out.items() if n]
+    remarks = [f"{n} of {len(sizes)} masks have {what} and were omitted" for what, n in left_out.items() if n]
     return (*labelled.remarks, *remarks)
 
 
 def write_scannetpp_labels(
     content: Content, rules: ProtocolRules, truth: GroundTruth, encoder: Encoder | None, scene: str, folder: Path
 ) -> tuple[str, ...]:
-    """``<scene>.txt`` with the classes of every vertex: as many as ``rules`` take, or one where the prediction has one.
+    """``<scene>.txt`` with the classes of every vertex: as many as ``rules`` score, or one if the prediction has one.
 
-    Every vertex has the classes of the nearest object. ``PredictionError`` where there is none to take them from.
+    Every vertex has the classes of the nearest object. ``PredictionError`` if there is none.
     """
     prediction = content.on(truth.points, rules) if isinstance(content, VertexMasks | VertexLabels) else content
     found = ranked_at(rules, truth, prediction, encoder, np.ones(len(truth.points), np.bool_))
@@ -311,7 +313,7 @@ def write_scannetpp_labels(
         )
     if (ranked[:, 1:] < 0).all():
         ranked = ranked[:, :1]
-    # a class that is said again makes no other number
+    # a repeated class does not change the score
     ranked = np.where(ranked < 0, ranked[:, :1], ranked)
     make_folder(folder)
     lines = [",".join(map(str, row)) for row in ranked.tolist()]
@@ -323,12 +325,12 @@ def write_scannetpp_labels(
 
 
 def is_answer(content: Content) -> bool:
-    """Whether a prediction is masks on the vertices with confidences and nothing that a text could be compared with."""
+    """Whether a prediction is masks on the vertices with confidences, without features to compare with a text."""
     return isinstance(content, VertexMasks) and content.features is None
 
 
 def masks_as_predicted(content: VertexMasks) -> LabelledMasks:
-    """Masks on the vertices with their own confidences; their classes, if they have some, say nothing here."""
+    """Masks on the vertices with their own confidences; their classes, if any, do not matter here."""
     return LabelledMasks(content, content.n_points or 0, np.zeros(len(content), np.int64), content.scores)
 
 
@@ -337,8 +339,8 @@ def answer_to(
 ) -> LabelledMasks:
     """Every mask of a map on the ``vertices`` (V, 3) m, its cosine with ``text`` as its confidence.
 
-    ``rules``, of kind ``queries``, say how masks reach the vertices. ``PredictionError`` where the map has no masks or
-    no features.
+    ``rules``, of kind ``queries``, define the transfer of masks to the vertices. ``PredictionError`` if the map has no
+    masks or no features.
     """
     named = _as_map(content, vertices, rules)
     masks = transfer.masks_of(named)
@@ -353,11 +355,11 @@ def answer_to(
 
 
 def write_opensun3d(answer: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
-    """``<scene>.txt`` and a file of digits for each mask; masks without points are left out and told."""
+    """``<scene>.txt`` and one file of digits per mask; masks without points are omitted, with a remark."""
     form = RUNS_FOLDER, ".txt", lambda k: digits_of(answer, k)
     remarks = write_list(answer, np.zeros(len(answer.class_ids), np.int64), scene, folder, None, form)
     n_written = int((answer.masks.sizes > 0).sum())
     if n_written < MIN_MASKS:
         said = f"has {n_written or 'no'} mask{'s' * (n_written != 1)}"
-        remarks = (*remarks, f"{said}: the challenge's own script stops at a list of fewer than {MIN_MASKS}")
+        remarks = (*remarks, f"{said}: the challenge's own script fails on a list of fewer than {MIN_MASKS}")
     return tuple(remarks)

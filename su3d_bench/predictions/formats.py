@@ -1,4 +1,4 @@
-"""The formats of predictions that can be read, and which of them a path is in."""
+"""The readable formats of predictions, and detection of a path's format."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from su3d_bench.predictions.run_predictions import OWN_RUNS
 from su3d_bench.predictions.scannet_text import text_format
 from su3d_bench.store.records import RunRecord, read_record
 
-# How the files of each format are known and read, and whose they are.
+# How the files of each format are recognized and read, and their origin.
 _ALL = (
-    OWN_RUNS,  # our own prediction.npz, or a run folder with those of one method
-    # ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D)
+    OWN_RUNS,  # prediction.npz of this program, or a run folder with those of one method
+    # ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (also Mask3D, Segment3D)
     text_format("scannet-text", text.looks_like_list, text.scannet_masks),
-    # ScanNet's semantic submission: <scene>.txt with one class id a line, one line a point
+    # ScanNet's semantic submission: <scene>.txt with one class id per line, one line per point
     text_format("scannet-semantic-text", text.looks_like_labels, text.scannet_labels),
     # ScanNet++'s instance submission: <scene>.txt with lines 'mask.json, class, confidence', run-length masks
     text_format("scannetpp", text.looks_like_scannetpp, text.scannetpp_masks),
-    # ScanNet++'s semantic submission: <scene>.txt with one class a line, or three with commas between
+    # ScanNet++'s semantic submission: <scene>.txt with one class per line, or three separated by commas
     text_format("scannetpp-semantic", text.looks_like_ranked, text.ranked_labels),
     # The OpenSUN3D challenge's submission: <scene>.txt with lines 'mask file, confidence', without classes
     text_format("opensun3d-challenge", text.looks_like_opensun3d, text.opensun3d_masks),
@@ -40,9 +40,9 @@ _ALL = (
     file_format("openins3d", (".pt",), masks.holds(SparseTensor, "a sparse tensor"), masks.openins3d),
     # SAM3D's <scene>.pth or .npy: a group number for each point, -1 for none, without scores and classes
     file_format("sam3d", (".npy", ".pth"), masks.looks_like_groups, masks.sam3d),
-    # SAM3D's coloured clouds <scene>.ply: one colour a group, black for none, the points those of the scene
+    # SAM3D's coloured clouds <scene>.ply: one colour per group, black for none, over the points of the scene
     file_format("sam3d-colours", (".ply",), masks.looks_like_colours, masks.sam3d_colours),
-    # ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post before the other) or exps/*/pcd_*.pkl.gz of ali-dev
+    # ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post preferred) or exps/*/pcd_*.pkl.gz of ali-dev
     Reader(
         "conceptgraphs", objects.looks_like_conceptgraphs, objects.conceptgraphs_scenes, objects.conceptgraphs, "map"
     ),
@@ -52,16 +52,16 @@ _ALL = (
     ),
     # HOV-SG's objects/pcd_<i>.ply (or .pcd) with row i of mask_feats.pt
     folder_format("hovsg", hovsg.FEATURES, hovsg.OBJECTS, hovsg.hovsg),
-    # HOV-SG's graph/ with floors, rooms and objects, a .ply and a .json each; the one with floors and rooms
+    # HOV-SG's graph/ with floors, rooms and objects, a .ply and a .json each; the only one with floors and rooms
     folder_format("hovsg-graph", hovsg.FLOORS, hovsg.ROOMS, hovsg.hovsg_graph, "graph", hovsg.scene_of_graph),
     # OpenLex3D's point_cloud.pcd (or .ply, or input.ply) with two tables
     folder_format(
         "openlex3d", dense.LEX_INDEX, dense.LEX_EMBEDDINGS, dense.openlex3d, "prediction", dense.scene_of_openlex3d
     ),
     folder_format("ovo", dense.OVO_MAP, dense.OVO_MAP, dense.ovo),
-    # RayFronts' <scene>/map.pt of its evaluation, or <scene>.pt of a map's save
+    # RayFronts' <scene>/map.pt of its evaluation, or a saved map <scene>.pt
     Reader("rayfronts", dense.looks_like_rayfronts, dense.rayfronts_scenes, dense.rayfronts, "map"),
-    # ESAM's two tables of its stream demo: one colour a mask, grey for none
+    # ESAM's two tables of its stream demo: one colour per mask, grey for none
     folder_format("esam", masks.COLOURS, masks.POINTS, masks.esam, "prediction"),
     # OnlineAnySeg's masks (points, masks) and their features, with the points
     folder_format("onlineanyseg", masks.ONLINE_MASKS, masks.ONLINE_CLOUD, masks.onlineanyseg, "prediction"),
@@ -72,9 +72,9 @@ READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 
 
 def recognise(path: Path, format: str | None = None) -> Reader:
-    """The reader for ``path``: the one that ``format`` names, otherwise the only one that knows the path as its own.
+    """The reader for ``path``: the one that ``format`` names, otherwise the only one that recognizes the path.
 
-    Raises ``ConfigError`` for an unknown format, ``PredictionError`` where no format or more than one fits.
+    Raises ``ConfigError`` for an unknown format, ``PredictionError`` if no format or more than one fits.
     """
     if format is not None:
         if format not in READERS:
@@ -86,14 +86,14 @@ def recognise(path: Path, format: str | None = None) -> Reader:
     if len(fitting) == 1:
         return READERS[next(iter(fitting))]
     if not fitting:
-        raise PredictionError(f"{path}: in none of the known formats ({', '.join(READERS)}); name it with --format")
+        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}); name it with --format")
     reasons = "; ".join(f"{name}: {why}" for name, why in fitting.items())
     raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --format")
 
 
 @dataclass(frozen=True)
 class Source:
-    """One path of predictions, its reader, and the names that its files give to scenes."""
+    """One path of predictions, its reader, and the scene names in its files."""
 
     path: Path
     reader: Reader
@@ -102,7 +102,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Match:
-    """The prediction of one scene: ``name`` as ``source`` calls it, ``scene`` as the ground truth does."""
+    """The prediction of one scene: ``name`` is its name in ``source``, ``scene`` that in the ground truth."""
 
     scene: str
     name: str
@@ -110,9 +110,9 @@ class Match:
 
 
 def open_sources(paths: Sequence[Path], format: str | None) -> list[Source]:
-    """Every path with the reader that knows it."""
+    """Every path with the reader that recognizes it."""
     if not paths:
-        raise ConfigError("evaluate: no predictions were named; give a folder or files")
+        raise ConfigError("evaluate: no predictions given; name a folder or files")
     sources = []
     for path in paths:
         reader = recognise(path, format)
@@ -128,20 +128,20 @@ def match_scenes(
 ) -> tuple[list[Match], list[str]]:
     """The prediction of each scene of ``known`` that has one, in that order, and remarks.
 
-    Names agree when they are equal without case, ``_`` and ``-``; otherwise the only name that goes on after the
-    scene's is taken, and said. A single prediction is that of the single scene that was ``requested``, whatever its
-    name. Raises ``PredictionError`` where several fit or one fits no scene.
+    Names match if they are equal ignoring case, ``_`` and ``-``; otherwise the only name that starts with the scene's
+    is used, with a remark. A single prediction is that of the single ``requested`` scene, whatever its name. Raises
+    ``PredictionError`` if several fit or one fits no scene.
     """
     names = {name: source for source in sources for name in source.scenes}
     if len(names) < sum(len(source.scenes) for source in sources):
         twice = next(n for k, s in enumerate(sources) for n in s.scenes if any(n in t.scenes for t in sources[:k]))
-        raise PredictionError(f"scene '{printable(twice, 80)}' is predicted in several of the paths; give each once")
+        raise PredictionError(f"scene '{printable(twice, 80)}' is predicted in several paths; give each scene once")
     foreign = [name for name in names if dataset is not None and "/" in name and name.partition("/")[0] != dataset]
-    remarks = [f"left out, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
+    remarks = [f"skipped, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
     own = {name: _plain(name.rpartition("/")[2]) for name in names if name not in foreign}
     if len(requested) == 1 and len(own) == 1 and not is_known(next(iter(own)), known):
         name = next(iter(own))
-        remark = f"{requested[0]}: the prediction '{printable(name, 80)}' is taken for it, as the only one"
+        remark = f"{requested[0]}: the prediction '{printable(name, 80)}' is used for it, as the only one"
         return [Match(requested[0], name, names[name])], [*remarks, remark]
     taken: dict[str, list[str]] = {}
     for name, plain in own.items():
@@ -156,11 +156,11 @@ def match_scenes(
 
 
 def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
-    """The scene that ``name`` means: of the same name, else the longest that it begins with."""
+    """The scene that ``name`` refers to: of the same name, otherwise the longest that it begins with."""
     same = [scene for scene in known if _plain(scene) == plain]
     if same:
         return same[0]
-    if "/" in name:  # a scene that is made on demand stands in no list
+    if "/" in name:  # a scene that is generated on demand is not listed
         return name.rpartition("/")[2]
     longer = [scene for scene in known if _is_continued(name, scene)]
     if longer:
@@ -170,12 +170,12 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
 
 
 def is_known(name: str, known: Sequence[str]) -> bool:
-    """Whether a prediction's name fits one of the scenes; one with a dataset before it fits whatever there is."""
+    """Whether a prediction's name fits one of the scenes; one with a dataset before it always fits."""
     return "/" in name or any(_plain(scene) == _plain(name) or _is_continued(name, scene) for scene in known)
 
 
 def _is_continued(name: str, scene: str) -> bool:
-    """Whether ``name`` is ``scene`` with more behind it: ``room0_mesh``, not ``room01``."""
+    """Whether ``name`` is ``scene`` with a suffix: ``room0_mesh``, not ``room01``."""
     forms = (scene, scene.replace("_", ""), scene.replace("-", "_"))
     return any(name.startswith(form) and not name[len(form) : len(form) + 1].isalnum() for form in forms)
 
@@ -185,11 +185,11 @@ def _only_name(scene: str, names: Sequence[str], plain: Mapping[str, str]) -> tu
     fitting = same or names
     if len(fitting) > 1:
         listed = printable(", ".join(fitting), 200)
-        raise PredictionError(f"{scene}: {len(fitting)} predictions match it ({listed}); give the one that is meant")
+        raise PredictionError(f"{scene}: {len(fitting)} predictions match it ({listed}); give only one")
     chosen, others = fitting[0], printable(", ".join(name for name in names if name not in same), 200)
     if same:
-        return chosen, [f"{scene}: '{chosen}' is taken; its name also begins {others}"] if others else []
-    return chosen, [f"{scene}: the prediction '{printable(chosen, 80)}' is taken for it"]
+        return chosen, [f"{scene}: '{chosen}' is used; other matches: {others}"] if others else []
+    return chosen, [f"{scene}: the prediction '{printable(chosen, 80)}' is used for it"]
 
 
 def _plain(name: str) -> str:
@@ -197,7 +197,7 @@ def _plain(name: str) -> str:
 
 
 def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
-    """The scenes of ``dataset`` that our own run folders were to predict; None for predictions from elsewhere."""
+    """The scenes of ``dataset`` that the run folders of this program cover; None for external predictions."""
     planned: list[str] = []
     for source in sources:
         record_file = source.path / "run.json"

@@ -1,10 +1,10 @@
-"""Maps of HOV-SG: a cloud a file in ``objects/`` with a row of features for each; and its scene graphs, ``floors/``,
-``rooms/`` and ``objects/`` with a cloud and a JSON file each.
+"""Maps of HOV-SG: one cloud per file in ``objects/`` with one row of features each; and its scene graphs,
+``floors/``, ``rooms/`` and ``objects/`` with a cloud and a JSON file each.
 
-Source: HOV-SG at commit 71a8069. Object i is row i of the features. Its loader counts the files and reads those from 0
-on, which loses the last ones where a number is missing; here the number is read from the name. Objects of a graph
-(``save`` of hovsg/graph/floor.py, room.py and object.py) come in the order of their files' names, as its loader has
-them: where overlaps are equal, who is matched depends on it.
+Source: HOV-SG at commit 71a8069. Object i is row i of the features. Its loader counts the files and reads those from
+0 on, which loses the last ones if a number is missing; here the number is read from the name. Objects of a graph
+(``save`` of hovsg/graph/floor.py, room.py and object.py) are in the order of their file names, as in its loader:
+the matching of equal overlaps depends on it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FLOORS, ROOMS, OBJECTS, GRAPH = "floors", "rooms", "objects", "graph"
 NUMBERS = {FLOORS: r"\d{1,9}", ROOMS: r"\d{1,9}_\d{1,9}", OBJECTS: r"\d{1,9}_\d{1,9}_\d{1,9}"}
 MAX_M, MAX_DIMENSIONS = 1e6, 1 << 14
 AGAIN = "copy the graph again"
-OTHER = {".ply": ".json", ".json": ".ply"}  # what lies beside each file
+OTHER = {".ply": ".json", ".json": ".ply"}  # suffix of the other file of each pair
 Fields = TypeVar("Fields", bound=BaseModel)
 Metres = Annotated[float, Field(ge=-MAX_M, le=MAX_M)]
 Feature = Annotated[list[float], Field(min_length=1, max_length=MAX_DIMENSIONS)]
@@ -55,7 +55,7 @@ def hovsg(place: Path, scene: str) -> Parsed:
 
 
 def read_points(file: Path) -> Float32Array:
-    """The points (N, 3) of a .ply or .pcd file in metres; ``PredictionError`` where it is damaged."""
+    """The points (N, 3) of a .ply or .pcd file in metres; ``PredictionError`` if it is damaged."""
     where = shown(file)
     with converted(DataError, PredictionError):
         if file.suffix == ".pcd":
@@ -76,9 +76,9 @@ def _object_files(folder: Path) -> dict[int, Path]:
     for match in filter(None, map(OBJECT_FILE.fullmatch, sorted(names))):
         name = match[0]
         if files.setdefault(int(match[1]), folder / name) != folder / name:
-            raise PredictionError(f"{shown(folder)}: object {match[1]} is there as .ply and .pcd; keep one of them")
+            raise PredictionError(f"{shown(folder)}: object {match[1]} exists as .ply and .pcd; keep one of them")
     if len(files) > MAX_MASKS:
-        raise PredictionError(f"{shown(folder)}: holds {len(files)} objects; is it damaged?")
+        raise PredictionError(f"{shown(folder)}: contains {len(files)} objects; is it damaged?")
     return files
 
 
@@ -132,21 +132,21 @@ def hovsg_graph(place: Path, scene: str) -> Parsed:
 
 
 def _members(place: Path, kind: str) -> dict[str, Path]:
-    """Name -> its cloud, in the order of the clouds' names; each has a JSON file beside it, and that a cloud."""
+    """Name -> cloud, in the order of the names; each cloud needs a JSON file next to it, and vice versa."""
     folder = place / kind
     with reading(shown(folder)):
         entries = sorted(entry for entry in folder.iterdir() if entry.suffix in OTHER and entry.is_file())
     files = {entry: None for entry in entries if re.fullmatch(NUMBERS[kind], entry.stem, re.ASCII)}
     for file in files:
         if file.with_suffix(OTHER[file.suffix]) not in files:
-            raise PredictionError(f"{shown(file)}: has no {OTHER[file.suffix]} beside it; {AGAIN}")
+            raise PredictionError(f"{shown(file)}: has no {OTHER[file.suffix]} next to it; {AGAIN}")
     if len(files) > 2 * MAX_MASKS:
-        raise PredictionError(f"{shown(folder)}: holds {len(files)} files of {kind}; is it damaged?")
+        raise PredictionError(f"{shown(folder)}: contains {len(files)} files of {kind}; is it damaged?")
     return {file.stem: file for file in files if file.suffix == ".ply"}
 
 
 def _fields(cloud: Path, model: type[Fields]) -> Fields:
-    """What the JSON file beside a cloud says."""
+    """The content of the JSON file next to a cloud."""
     path = cloud.with_suffix(".json")
     with reading(shown(path)):
         content = file_bytes(path)
@@ -174,13 +174,13 @@ def _room(cloud: Path) -> Room:
 
 
 def _embedding(table: _ObjectFields) -> Float32Array | None:
-    """The feature (D,) of an object; None where it has none."""
+    """The feature (D,) of an object; None if it has none."""
     values = np.array(table.embedding or None)
     return as_float32(values.reshape(-1)) if values.ndim else None
 
 
 def _features(embeddings: list[Float32Array | None], place: Path) -> tuple[Float32Array | None, tuple[str, ...]]:
-    """A row an object, zeros for those without a feature; None where no object has one."""
+    """One row per object, zeros for those without a feature; None if no object has one."""
     sizes = {len(feature) for feature in embeddings if feature is not None}
     if len(sizes) > 1:
         raise PredictionError(

@@ -1,12 +1,12 @@
-"""Masks over the points of the scene, or over points of their own, in one archive or folder a scene.
+"""Masks over the points of the scene, or over their own points, in one archive or folder per scene.
 
 Sources: PKU-EPIC/MaskClustering at commit eb2d41c, utils/post_process.py and semantics/open-voc_query.py;
 VinAIResearch/Open3DIS at 4b05043, generate_3d_inst.py and maskwise_vocab.py of tools; aminebdj/OpenYOLO3D at 24f344d,
 ``predict`` of utils/__init__.py and the files of ``--path_to_3d_masks``; Pointcept/SegmentAnything3D at 2aaa8c9,
-util.py, whose ``visualize_partition`` draws a random colour a group, black for none, and writes the cloud with Open3D
-in the order of the scene's points; xuxw98/ESAM at 188fc6d, ``run`` and ``mask_to_color`` of vis_demo/stream_demo.py,
-the only program of it that writes masks: one of 256 random colours a mask, grey for none; yjtang249/OnlineAnySeg at
-152466e, ``export_instance_mask`` of tool/post_process.py and ``save_pc`` of Scene_rep.py.
+util.py, whose ``visualize_partition`` draws a random colour per group, black for none, and writes the cloud with
+Open3D in the order of the scene's points; xuxw98/ESAM at 188fc6d, ``run`` and ``mask_to_color`` of
+vis_demo/stream_demo.py, its only program that writes masks: one of 256 random colours per mask, grey for none;
+yjtang249/OnlineAnySeg at 152466e, ``export_instance_mask`` of tool/post_process.py and ``save_pc`` of Scene_rep.py.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from su3d_bench.formats.torch_files import SparseTensor, read_torch
 from su3d_bench.predictions.base import NO_SCORES, Parsed, VertexMasks, vertex_masks
 from su3d_bench.predictions.hovsg import read_points
 
-ALL_ONES = "Open-YOLO 3D's own evaluator puts 1 for every score"
+ALL_ONES = "Open-YOLO 3D's own evaluator uses 1 for every score"
 WITHOUT_CLASSES = "groups without classes"
 FEATURES_SUFFIXES = ("_openmask3d_features.npy", "_features.npy", ".npy")
 ONLINE_MASKS, ONLINE_CLOUD = "ckpt_final.npz", "final.ply"  # OnlineAnySeg's
@@ -37,54 +37,52 @@ POINTS, COLOURS = "points.npy", "points_color.npy"  # ESAM's
 GREY = 200  # of every channel: a point in no mask of ESAM's
 MAX_COLOURS = 256  # in its palette
 CHANNELS = ("red", "green", "blue")
-MIN_POINTS_PER_COLOUR = (
-    20  # at least, on average over the first points, where colours are groups; photographs have 1 or 2
-)
+MIN_POINTS_PER_COLOUR = 20  # at least, on average over the first points, if colours are groups; photographs have 1 or 2
 
 
 # ---- which format a file is of
 
 
 def holds(kind: type | tuple[type, ...], content: str) -> Callable[[Path], str | None]:
-    """A look at a file of ``torch.save``: whether its value is of ``kind``, which messages call ``content``."""
+    """A check whether the value in a ``torch.save`` file is of ``kind``, named ``content`` in messages."""
 
     def looks(first: Path) -> str | None:
         is_kind = isinstance(read_torch(first, is_outline=True), kind)
-        return f"its {first.suffix} files hold {content}" if is_kind else None
+        return f"its {first.suffix} files contain {content}" if is_kind else None
 
     return looks
 
 
 def looks_like_matrix(first: Path) -> str | None:
-    is_hovsg = (first.parent / "mask_feats.pt").is_file()  # a matrix, too: of features
+    is_hovsg = (first.parent / "mask_feats.pt").is_file()  # also a matrix, but of features
     return None if is_hovsg else holds(np.ndarray, "one matrix")(first)
 
 
 def looks_like_masks(first: Path) -> str | None:
-    is_online = first.name == ONLINE_MASKS  # over points of its own
-    return "its .npz files hold 'pred_masks'" if not is_online and "pred_masks" in npz_names(first) else None
+    is_online = first.name == ONLINE_MASKS  # over its own points
+    return "its .npz files contain 'pred_masks'" if not is_online and "pred_masks" in npz_names(first) else None
 
 
 def looks_like_groups(first: Path) -> str | None:
     if first.suffix != ".npy":
         return holds(np.ndarray, "one array")(first)
     array = map_npy(first)
-    return "its .npy files hold a list of integers" if array.ndim == 1 and array.dtype.kind in "iu" else None
+    return "its .npy files contain a list of integers" if array.ndim == 1 and array.dtype.kind in "iu" else None
 
 
 def looks_like_colours(first: Path) -> str | None:
-    if (first.parent / ONLINE_MASKS).is_file():  # the cloud that those masks are over
+    if (first.parent / ONLINE_MASKS).is_file():  # the cloud of those masks
         return None
     colours = _colours(first_rows(first, "vertex"))
     is_group = colours is not None and len(np.unique(colours)) * MIN_POINTS_PER_COLOUR <= len(colours) > 0
-    return "its .ply files hold clouds in which many points share a colour" if is_group else None
+    return "its .ply files contain clouds in which many points share a colour" if is_group else None
 
 
 # ---- matrices, run lengths and sparse tensors
 
 
 def matrix_masks(where: str, value: object, scores: object = None, classes: object = None, **more: Any) -> VertexMasks:
-    """The masks in the columns of a matrix (points, masks), with scores and classes where they are not None."""
+    """The masks in the columns of a matrix (points, masks), with scores and classes unless None."""
     matrix = arrays.matrix_of(value, where)
     return _scored(where, arrays.column_members(matrix, where), len(matrix), scores, classes, **more)
 
@@ -122,18 +120,18 @@ def openyolo3d(place: Path, scene: str) -> Parsed:
 
 
 def openmask3d(place: Path, scene: str) -> Parsed:
-    """The masks, and the features (masks, D) that lie beside them, as they are; a row with NaN is one without one."""
+    """The masks with the unchanged features (masks, D) of the file next to them; a row with NaN counts as none."""
     where = shown(place)
     matrix = arrays.matrix_of(read_torch(place), where)
     n_masks = matrix.shape[1]
     names = [f"{scene}{end}" for end in FEATURES_SUFFIXES]
     file = next((candidate for name in names if (candidate := place.parent / name).is_file()), None)
     if file is None:
-        remark = f"no '{names[0]}' lies beside the masks: they have no features"
+        remark = f"no '{names[0]}' next to the masks: they have no features"
         return matrix_masks(where, matrix), (NO_SCORES, remark)
     found = f"{shown(file)}: {n_masks} masks, but the features are"
-    values = arrays.array_of(read_npy(file), found, "a row a mask", "fiu", n_masks, None)
-    # OpenMask3D normalises and puts 0 for what is NaN then, which makes a row with a NaN or infinity one of zeros.
+    values = arrays.array_of(read_npy(file), found, "one row per mask", "fiu", n_masks, None)
+    # OpenMask3D normalises and then replaces NaN with 0, so a row with NaN or infinity becomes zeros.
     features, remarks = arrays.without_nonfinite(arrays.as_float32(values), "masks")
     return matrix_masks(where, matrix, features=features), (NO_SCORES, *remarks)
 
@@ -147,14 +145,14 @@ def open3dis(place: Path, scene: str) -> Parsed:
         (len(column) for column in (classes, scores) if isinstance(column, np.ndarray) and column.ndim == 1), None
     )
     members, n_points = _instances(value["ins"], n_known, where)
-    remarks = [NO_SCORES if scores is None else "Open3DIS's own evaluator puts 1 for every confidence"]
+    remarks = [NO_SCORES if scores is None else "Open3DIS's own evaluator uses 1 for every confidence"]
     if classes is None:
         remarks.append("the file has no classes: the masks are class-agnostic")
     return _scored(where, members, n_points, scores, classes, numbering="index"), remarks
 
 
 def _scores_of_classes(scores: object, classes: object) -> object:
-    """The score of the class of each mask, where maskwise_vocab.py has those of all classes, mask after mask."""
+    """The score of the class of each mask, from maskwise_vocab.py's scores of all classes per mask."""
     if not all(isinstance(column, np.ndarray) and column.ndim == 1 and column.size for column in (scores, classes)):
         return scores
     table: Any = scores
@@ -179,7 +177,7 @@ def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int
         if not isinstance(mask, dict) or "length" not in mask or "counts" not in mask:
             raise PredictionError(f"{where}: mask {k} is {arrays.kind_of(mask)}; expected a dict of length and counts")
         members.append(arrays.run_members(mask["length"], mask["counts"], f"{where}: mask {k}"))
-        arrays.check_members(n := n + len(members[-1]) + len(mask["counts"]), where)  # empty runs take time, too
+        arrays.check_members(n := n + len(members[-1]) + len(mask["counts"]), where)  # empty runs take time too
         if length not in {None, int(mask["length"])}:
             raise PredictionError(f"{where}: mask {k} is of {mask['length']} points, mask 0 of {length}")
         length = int(mask["length"])
@@ -187,7 +185,7 @@ def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int
 
 
 def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> NDArray[Any]:
-    """(points, masks): Open3DIS has masks in rows; the number of scores or classes tells, or else the longer side."""
+    """(points, masks): Open3DIS has masks in rows; decided by the number of scores or classes, or the longer side."""
     n_rows, n_columns = matrix.shape
     if n_known is not None and n_known not in {n_rows, n_columns}:
         raise PredictionError(
@@ -201,9 +199,9 @@ def openins3d(place: Path, scene: str) -> Parsed:
     where, value = shown(place), read_torch(place)
     if not isinstance(value, SparseTensor) or len(value.shape) != 2:
         raise PredictionError(
-            f"{where}: holds {arrays.kind_of(value)}; expected a sparse tensor (points, masks), as OpenIns3D saves it"
+            f"{where}: holds {arrays.kind_of(value)}; expected a sparse tensor (points, masks) of OpenIns3D"
         )
-    remark = "masks without classes; OpenIns3D evaluates with classes and scores that it does not save"
+    remark = "masks without classes; OpenIns3D's own evaluation uses classes and scores that it does not save"
     return _sparse_masks(value, where), (NO_SCORES, remark)
 
 
@@ -213,7 +211,7 @@ def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:
     arrays.check_sizes(n_points, n_masks, where)
     limits = np.array(sparse.shape, np.int64)[:, np.newaxis]
     if ((sparse.indices < 0) | (sparse.indices >= limits)).any():
-        raise PredictionError(f"{where}: a sparse tensor of shape {sparse.shape} has a value outside of it")
+        raise PredictionError(f"{where}: a sparse tensor of shape {sparse.shape} has an index outside of it")
     order = np.lexsort((sparse.indices[0], sparse.indices[1]))
     rows, columns = sparse.indices[0][order], sparse.indices[1][order]
     is_first = np.ones(len(order), np.bool_)
@@ -229,10 +227,10 @@ def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:
 
 
 def sam3d(place: Path, scene: str) -> Parsed:
-    """One integer a point of the scene, -1 where it is in no group."""
+    """One integer per point of the scene, -1 if it is in no group."""
     where = shown(place)
     value = read_npy(place) if place.suffix == ".npy" else read_torch(place)
-    groups = arrays.array_of(value, f"{where}: holds", "one group number a point", "iu", None)
+    groups = arrays.array_of(value, f"{where}: holds", "one group number per point", "iu", None)
     arrays.check_sizes(len(groups), 0, where)
     return masks_of_groups(groups, "group", where), (NO_SCORES, WITHOUT_CLASSES)
 
@@ -247,14 +245,14 @@ def sam3d_colours(place: Path, scene: str) -> Parsed:
     groups = np.where(colours == 0, -1, colours)
     if len(np.unique(groups)) > arrays.MAX_MASKS:
         raise PredictionError(
-            f"{where}: {len(np.unique(groups))} colours; expected one a group: is it the cloud of a photograph?"
+            f"{where}: {len(np.unique(groups))} colours; expected one per group: is it a cloud with image colours?"
         )
-    remark = "a colour is a group: two groups of one colour are one here"
+    remark = "one colour is one group: groups of the same colour are merged"
     return masks_of_groups(groups, "colour", where), (NO_SCORES, WITHOUT_CLASSES, remark)
 
 
 def esam(place: Path, scene: str) -> Parsed:
-    """The points of all frames, and the colour of the mask of each."""
+    """The points of all frames, and the mask colour of each."""
     points, colours, where = read_npy(place / POINTS), read_npy(place / COLOURS), shown(place / COLOURS)
     cloud = points.reshape(-1, points.shape[-1]) if points.ndim == 3 else points
     places = arrays.checked_points(cloud, shown(place / POINTS))
@@ -265,14 +263,14 @@ def esam(place: Path, scene: str) -> Parsed:
     masks = masks_of_groups(np.where(groups == _of_channels(GREY, GREY, GREY), -1, groups), "colour", where)
     if len(masks) > MAX_COLOURS:
         raise PredictionError(
-            f"{where}: has {len(masks)} colours, ESAM's palette {MAX_COLOURS}; are they those of photographs?"
+            f"{where}: has {len(masks)} colours, ESAM's palette {MAX_COLOURS}; are they image colours?"
         )
-    remark = "a colour is a mask: of masks that share points one has them"
+    remark = "one colour is one mask: points shared by masks belong to one of them"
     return Instances.of(places, masks, names=masks.keys), (NO_SCORES, WITHOUT_CLASSES, remark)
 
 
 def masks_of_groups(groups: NDArray[np.integer[Any]], noun: str, where: str) -> VertexMasks:
-    """A mask for each value from 0 up, in ascending order."""
+    """One mask per value from 0 up, in ascending order."""
     order = np.argsort(groups, kind="stable").astype(np.int32)
     order = order[np.count_nonzero(groups < 0) :]
     sorted_groups = groups[order]
@@ -284,7 +282,7 @@ def masks_of_groups(groups: NDArray[np.integer[Any]], noun: str, where: str) -> 
 
 
 def _colours(columns: Mapping[str, object]) -> Int64Array | None:
-    """The colour of each point as one number; None where the file has no such bytes."""
+    """The colour of each point as one number; None if the file has no colour bytes."""
     channels = [columns.get(name) for name in CHANNELS]
     if not all(isinstance(channel, np.ndarray) and channel.dtype == np.uint8 for channel in channels):
         return None
@@ -297,7 +295,7 @@ def _of_channels(red: Any, green: Any, blue: Any) -> Int64Array:
 
 
 def onlineanyseg(place: Path, scene: str) -> Parsed:
-    """Masks over the points that it rebuilt itself, with a feature (of the file's (D, masks)) each."""
+    """Masks over the reconstructed points, with one feature each (from the file's (D, masks))."""
     where = shown(place / ONLINE_MASKS)
     points = read_points(place / ONLINE_CLOUD)
     archive = read_npz(place / ONLINE_MASKS, ("pred_masks", "pred_score", "pred_sem_features"))
@@ -311,7 +309,7 @@ def onlineanyseg(place: Path, scene: str) -> Parsed:
     remarks: tuple[str, ...] = ("the file has no features: the masks are class-agnostic",)
     if "pred_sem_features" in archive:
         found = f"{where}: {len(masks)} masks, but the features are"
-        table = arrays.array_of(archive["pred_sem_features"], found, "a column a mask", "f", None, len(masks))
+        table = arrays.array_of(archive["pred_sem_features"], found, "one column per mask", "f", None, len(masks))
         features, remarks = arrays.without_nonfinite(arrays.as_float32(np.ascontiguousarray(table.T)), "masks")
     instances = Instances.of(points, masks, masks.scores, features, names=masks.keys)
     return instances, (*remarks, *(() if "pred_score" in archive else (NO_SCORES,)))

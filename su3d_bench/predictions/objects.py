@@ -1,12 +1,12 @@
-"""Maps of ConceptGraphs: gzipped pickles of objects, each with its own points and a CLIP feature.
+"""Maps of ConceptGraphs: gzipped pickles of objects, each with its own points and one CLIP feature.
 
 Source: concept-graphs at commit 5c4da70 (``pcd_saves/full_pcd_*.pkl.gz``, with ``_post`` after its last merging) and
 branch ali-dev at dc00a8a (``exps/<suffix>/pcd_<suffix>.pkl.gz``, with ``edges``, without ``bg_objects``).
 
-And scene graphs of FROSS: one pickle of all scenes, objects with points and classes, edges with shares of predicates.
-Source: Merging/main.py of Howardkhh/FROSS at 645153b. Classes and predicates are numbers without names; what they are
-called is told by how many there are: ReplicaSSG's list of Visual Genome, 150 and 50. Of equal scores the last counts,
-as in its Merging/evaluate.py.
+Scene graphs of FROSS: one pickle of all scenes, objects with points and classes, edges with shares of predicates.
+Source: Merging/main.py of Howardkhh/FROSS at 645153b. Classes and predicates are numbers without names; the names
+follow from their number: ReplicaSSG's list of Visual Genome, 150 and 50. On equal scores the last one counts, as in
+its Merging/evaluate.py.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from su3d_bench.predictions.base import ONES, Parsed, first_found, instances_of,
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"
 FULL, STREAMLINED = f"full_pcd_*{SUFFIX}", f"pcd_*{SUFFIX}"
-SKIPPED_FIELDS = ("mask", "pcd_color_np")  # the masks of every view make most of the file
-NAME_OF_NONE = "item"  # what the class-agnostic variant calls every object
+SKIPPED_FIELDS = ("mask", "pcd_color_np")  # the masks of every view are most of the file
+NAME_OF_NONE = "item"  # the name of every object in the class-agnostic variant
 MAX_TEXT = 1000
 GRAPHS = "predictions_*.pkl"  # FROSS's
-LISTS = "replica-relations"  # the protocol with the lists by which its numbers are named
+LISTS = "replica-relations"  # the protocol with the lists that name its numbers
 SKIPPED_GRAPH_FIELDS = ("mean", "cov")
 MAX_SCENES, MAX_EDGES = 10_000, 10_000_000
 
@@ -45,7 +45,7 @@ def looks_like_conceptgraphs(path: Path) -> str | None:
     if path.is_file():
         is_map = path.name.endswith(SUFFIX) and path.name.startswith(("full_pcd_", "pcd_"))
         return "its name is that of a map of ConceptGraphs" if is_map else None
-    return f"it holds {FULL} or {STREAMLINED}" if _maps(path) else None
+    return f"it contains {FULL} or {STREAMLINED}" if _maps(path) else None
 
 
 def conceptgraphs_scenes(path: Path) -> Mapping[str, Path]:
@@ -60,7 +60,7 @@ def conceptgraphs_scenes(path: Path) -> Mapping[str, Path]:
 def conceptgraphs(place: Path, scene: str) -> Parsed:
     where, remarks = shown(place), [ONES]
     if place.name.endswith(POST) and place.with_name(place.name.removesuffix(POST) + SUFFIX).exists():
-        remarks.append(f"'{printable(place.name, 120)}' is read, not the map before the last merging beside it")
+        remarks.append(f"'{printable(place.name, 120)}' is read, not the map before the last merging next to it")
     value = read_pickle_file(place, forget=SKIPPED_FIELDS)
     if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
         raise PredictionError(f"{where}: holds {arrays.kind_of(value)} without a list of 'objects'; expected a map")
@@ -72,7 +72,7 @@ def conceptgraphs(place: Path, scene: str) -> Parsed:
 
 
 def _check_sum(values: Sequence[Any], file: Path) -> None:
-    """Refuses objects that share what they hold, which costs the file a few bytes and memory or time for each."""
+    """Rejects objects that share arrays: a few bytes in the file could cost memory and time for each object."""
     sizes = [np.size(value) if isinstance(value, np.ndarray) else len(value) for value in values if _is_many(value)]
     arrays.check_memory(4 * sum(sizes), file)
 
@@ -82,14 +82,14 @@ def _is_many(value: object) -> bool:
 
 
 def _maps(path: Path) -> list[Path]:
-    """The map files of one scene or several, at whatever level of the layout ``path`` is."""
+    """The map files of one scene or several, for ``path`` at any level of the layout."""
     full = [f"{above}{FULL}" for above in ("", "pcd_saves/", "*/pcd_saves/")]
     streamlined = [f"{above}{STREAMLINED}" for above in ("", "*/", "exps/*/", "*/exps/*/")]
     return [file for file in first_found(path, [*full, *streamlined]) if file.is_file()]
 
 
 def _scene_of(file: Path) -> str:
-    """The folder above ``pcd_saves`` or ``exps``, else the name of the file."""
+    """The folder above ``pcd_saves`` or ``exps``, otherwise the name of the file."""
     above = file.absolute().parents
     if above[0].name == "pcd_saves" and above[1].name:
         return above[1].name
@@ -99,15 +99,15 @@ def _scene_of(file: Path) -> str:
 
 
 def _chosen(files: Sequence[Path]) -> Path:
-    """The only map of a folder, or of a pair the one after the last merging."""
+    """The only map of a folder, or of two the one after the last merging."""
     if len(files) == 1 or [file.name for file in files[1:]] == [files[0].name.removesuffix(SUFFIX) + POST]:
         return files[-1]
     names = printable(", ".join(file.name for file in files), 200)
-    raise PredictionError(f"{shown(files[0].parent)}: holds {len(files)} maps ({names}); give one of these files")
+    raise PredictionError(f"{shown(files[0].parent)}: contains {len(files)} maps ({names}); give one of these files")
 
 
 def _class_names(value: object) -> tuple[str, ...]:
-    """The list of class names; empty where there is none."""
+    """The list of class names; empty if there is none."""
     texts = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "U" else value
     if not isinstance(texts, list | tuple):
         return ()
@@ -117,14 +117,14 @@ def _class_names(value: object) -> tuple[str, ...]:
 def _instances(
     objects: list[Any], background: list[Any], class_names: Sequence[str], where: str
 ) -> tuple[Instances, list[str]]:
-    """The objects, then those of the background, which have their own names as labels.
+    """The objects, then the background objects, which have their own names as labels.
 
-    So the original's evaluation has them where it excludes nothing but 'other' (``n_exclude`` 1). With 4 or 6 excluded
-    classes it does not load them; here they are then left out because their names are among the excluded ones.
+    This is the original's evaluation if it excludes only 'other' (``n_exclude`` 1). With 4 or 6 excluded classes it
+    does not load them; here they are then excluded because their names are among the excluded ones.
     """
     everything = [*objects, *background]
     if len(everything) > arrays.MAX_MASKS:
-        raise PredictionError(f"{where}: holds {len(everything)} objects; is it damaged?")
+        raise PredictionError(f"{where}: contains {len(everything)} objects; is it damaged?")
     clouds, names, captions = [], [], []
     for k, entry in enumerate(everything):
         at = f"{where}: object {k}"
@@ -138,7 +138,9 @@ def _instances(
         captions.append(printable(caption[:MAX_TEXT], MAX_TEXT) if isinstance(caption, str) else "")
     features, remarks = _features(objects, where)
     if features is not None and any(name != NAME_OF_NONE for name in names[: len(objects)]):
-        remarks.append("names are those of most detections; the feature of an object decides its class, as originally")
+        remarks.append(
+            "names are those of most detections; the feature of an object decides its class, as in the original"
+        )
     walls = tuple(name.lower() for name in names[len(objects) :])
     own = tuple(names[: len(objects)]) if features is None else ("",) * len(objects)
     if background:
@@ -163,7 +165,7 @@ def _instances(
 
 
 def _rows_like(background: Sequence[Mapping[str, Any]], n: int) -> Float32Array:
-    """The features (K, n) of background objects, zeros where one has none of that length; labels come before them."""
+    """The features (K, n) of background objects, zeros if one has none of that length; labels have priority."""
     rows = np.zeros((len(background), n), np.float32)
     for k, entry in enumerate(background):
         row = entry.get("clip_ft")
@@ -174,7 +176,7 @@ def _rows_like(background: Sequence[Mapping[str, Any]], n: int) -> Float32Array:
 
 
 def _majority(value: object) -> int | None:
-    """The most frequent class number of the detections, the lowest of equals as the original has it."""
+    """The most frequent class number of the detections, the lowest on ties, as in the original."""
     numbers = value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else value
     if not isinstance(numbers, list | tuple):
         return None
@@ -186,7 +188,7 @@ def _majority(value: object) -> int | None:
 
 
 def _name(entry: Mapping[str, Any], number: int | None, class_names: Sequence[str]) -> str:
-    """The name of class ``number``, else what the object says itself."""
+    """The name of class ``number``, otherwise the object's own."""
     if number is not None and 0 <= number < len(class_names) and class_names[number]:
         return class_names[number]
     name = entry.get("class_name")
@@ -195,14 +197,14 @@ def _name(entry: Mapping[str, Any], number: int | None, class_names: Sequence[st
 
 
 def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32Array | None, list[str]]:
-    """The features (K, D) of the objects; None where no object has one."""
+    """The features (K, D) of the objects; None if no object has one."""
     rows_of_file = [entry.get("clip_ft") for entry in objects]
     if not any(entry is not None for entry in rows_of_file):
         remark = "the objects have no 'clip_ft': the names of their detections decide their classes"
         return None, [remark] * bool(rows_of_file)
     rows: list[Float32Array] = []
     for k, row in enumerate(rows_of_file):
-        beside = f" of {len(rows[0])} numbers, as object 0 has" if rows else ""
+        beside = f" of {len(rows[0])} numbers, as in object 0" if rows else ""
         found = f"{where}: object {k}: 'clip_ft' is"
         rows.append(
             arrays.as_float32(
@@ -214,7 +216,7 @@ def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32
 
 
 def _background(value: object, where: str) -> list[Any]:
-    """Walls, floor and ceiling, which the Detect variant keeps apart; a class that was never seen is None there."""
+    """Walls, floor and ceiling, which the Detect variant stores separately; a class never seen is None there."""
     if value is not None and not isinstance(value, list):
         raise PredictionError(f"{where}: 'bg_objects' is {arrays.kind_of(value)}; expected a list")
     return [entry for entry in value or () if entry is not None]
@@ -224,7 +226,7 @@ def _background(value: object, where: str) -> list[Any]:
 
 
 def looks_like_fross(path: Path) -> str | None:
-    return f"it is or holds {GRAPHS}" if len(_graph_files(path)) == 1 else None
+    return f"it is or contains {GRAPHS}" if len(_graph_files(path)) == 1 else None
 
 
 def fross_scenes(path: Path) -> Mapping[str, Path]:
@@ -242,12 +244,12 @@ def fross(place: Path, scene: str) -> Parsed:
 
 
 def scene_graph(graph: object, rules: ProtocolRules, where: str) -> Instances:
-    """The map of one scene of the file, its numbers named by the classes and predicates of ``rules``."""
+    """The map of one scene of the file, with the class and predicate names of ``rules``."""
     if not isinstance(graph, dict):
         raise PredictionError(f"{where}: is {arrays.kind_of(graph)}; expected a scene graph with pcd, cls and edges")
     clouds = graph.get("pcd")
     if not isinstance(clouds, list) or len(clouds) > arrays.MAX_MASKS:
-        raise PredictionError(f"{where}: 'pcd' is {arrays.kind_of(clouds)}; expected a list of points an object")
+        raise PredictionError(f"{where}: 'pcd' is {arrays.kind_of(clouds)}; expected one list of points per object")
     k = len(clouds)
     classes = _table(graph.get("cls"), (k, len(rules.classes)), f"{where}: 'cls'")
     edges = _edges(graph.get("edge_index"), k, f"{where}: 'edge_index'")
@@ -269,15 +271,17 @@ def _graphs(file: Path) -> dict[str, Any]:
     if not isinstance(value, dict) or not value or len(value) > MAX_SCENES:
         raise PredictionError(f"{shown(file)}: holds {arrays.kind_of(value)}; expected the scene graph of each scene")
     if not all(isinstance(scene, str) for scene in value):
-        raise PredictionError(f"{shown(file)}: has a scene that is no name; expected the scene graph of each scene")
+        raise PredictionError(
+            f"{shown(file)}: has a scene key that is not a name; expected the scene graph of each scene"
+        )
     return value
 
 
 def _table(value: object, shape: tuple[int, int], where: str) -> Float64Array:
-    """A table of scores; without rows whatever is empty will do."""
+    """A table of scores; without rows any empty value is accepted."""
     if not shape[0] and _is_empty(value):
         return np.zeros(shape)
-    expected = f"{shape[0]} rows of {shape[1]}, as ReplicaSSG has"
+    expected = f"{shape[0]} rows of {shape[1]}, as in ReplicaSSG"
     scores: Float64Array = arrays.array_of(value, f"{where} is", expected, "fiu", *shape).astype(np.float64)
     if not np.isfinite(scores).all():
         raise PredictionError(f"{where} has values that are NaN or infinite")

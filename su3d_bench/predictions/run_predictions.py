@@ -1,4 +1,4 @@
-"""Predictions of our own runs: ``prediction.npz`` files, alone or in a run folder."""
+"""Predictions of this program's runs: ``prediction.npz`` files, single or in a run folder."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def looks_like_ours(path: Path) -> str | None:
     try:
         files = _files(path)
     except PredictionError:
-        files = {"": path}  # a run folder of several methods: reading it says so
+        files = {"": path}  # a run folder of several methods: reading it raises an error
     if not files:
         return None
-    return f"it holds {FILE}" if path.is_dir() or "kind" in npz_names(path) else None
+    return f"it contains {FILE}" if path.is_dir() or "kind" in npz_names(path) else None
 
 
 def stored_prediction(place: Path, scene: str) -> Parsed:
@@ -46,8 +46,8 @@ def stored_prediction(place: Path, scene: str) -> Parsed:
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         file = features_beside(place)
         table = array_of(map_npy(file), f"{shown(file)}: holds", "a table of features", "f", None, None)
-        if not table.flags.c_contiguous:  # a row of it would be all over the file
-            raise PredictionError(f"{shown(file)}: holds its table column by column; copy it again")
+        if not table.flags.c_contiguous:  # otherwise a row would be scattered over the file
+            raise PredictionError(f"{shown(file)}: stores its table column by column; copy it again")
         arrays["features"] = table
     with named(where):
         content = prediction_from_arrays(arrays, where)
@@ -57,7 +57,7 @@ def stored_prediction(place: Path, scene: str) -> Parsed:
 
 
 def write_content(path: Path, content: Content) -> None:
-    """Store what a reader gave at ``path``, so that ``OWN_RUNS`` reads the same."""
+    """Store the output of a reader at ``path``, so that ``OWN_RUNS`` reads the same."""
     if isinstance(content, VertexLabels):
         labels = {"kind": np.array("VertexLabels"), "class_ids": content.class_ids, "further": content.further}
         numbering = np.array(content.numbering) if content.numbering != "id" else None
@@ -84,13 +84,13 @@ def _write_present(path: Path, arrays: Mapping[str, NDArray[Any] | None]) -> Non
 
 
 def read_stored(path: Path) -> Content:
-    """What ``write_content`` stored at ``path``, or the map of a run."""
+    """The content stored by ``write_content`` at ``path``, or the map of a run."""
     if str(read_npz(path, ("kind",)).get("kind")) in OVER_VERTICES:
         return _over_vertices(read_npz(path), shown(path))
     return read_prediction(path)
 
 
-# Dimensions and kind of numbers of each array of masks and labels over points without coordinates.
+# Number of axes and dtype kind of each array of masks and labels over points without coordinates.
 _MASK_ARRAYS = {
     "indptr": (1, "i"),
     "indices": (1, "i"),
@@ -106,17 +106,17 @@ _OPTIONAL = ("class_numbers", "features", "further", "numbering")
 
 
 def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMasks | VertexLabels:
-    """The masks or labels in ``arrays``; a ``PredictionError`` where they are none."""
+    """The masks or labels in ``arrays``; ``PredictionError`` if there are none."""
     are_labels = str(arrays["kind"]) == "VertexLabels"
     values: dict[str, Any] = {}
     for name, (n_axes, kind) in (_LABEL_ARRAYS if are_labels else _MASK_ARRAYS).items():
         if name in arrays or name not in _OPTIONAL:
-            expected = "what it was written with; evaluate again with --out"
+            expected = "its original form; evaluate again with --out"
             values[name] = array_of(arrays.get(name), f"{where}: '{name}' is", expected, kind, *[None] * n_axes)
     numbering = NUMBERINGS.get(str(values.pop("numbering", "id")))
     further = values.get("further")
     if numbering is None or (further is not None and len(further) != len(values["class_ids"])):
-        raise PredictionError(f"{where}: holds no masks or labels; evaluate again with --out")
+        raise PredictionError(f"{where}: contains no masks or labels; evaluate again with --out")
     if are_labels:
         return VertexLabels(**values, numbering=numbering)
     n_points, keys = int(values.pop("n_points")), tuple(map(str, values.pop("keys")))
@@ -125,9 +125,9 @@ def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMask
 
 
 def _files(path: Path) -> dict[str, Path]:
-    """The predictions below a run folder, its ``scenes`` or a scene's folder, by address; or the one file.
+    """The predictions in a run folder, its ``scenes`` or a scene's folder, by address; or the one file.
 
-    Raises ``PredictionError`` where a scene has those of several methods.
+    Raises ``PredictionError`` if a scene has those of several methods.
     """
     if path.is_file():
         return {_scene_of(path): path} if path.suffix == ".npz" else {}
@@ -138,14 +138,14 @@ def _files(path: Path) -> dict[str, Path]:
     methods = sorted({file.parent.name for file in files})
     if len(methods) > 1:
         raise PredictionError(
-            f"{shown(path)}: holds predictions of {len(methods)} methods ({printable(', '.join(methods), 120)}); "
+            f"{shown(path)}: contains predictions of {len(methods)} methods ({printable(', '.join(methods), 120)}); "
             f"give the folders of one: {shown(path)}/{above}{printable(methods[0], 60)}"
         )
     return {_scene_of(file): file for file in files}
 
 
 def _scene_of(file: Path) -> str:
-    """``dataset/scene`` where the file lies in a run folder, else the name of the file."""
+    """``dataset/scene`` if the file is in a run folder, otherwise the name of the file."""
     folder = file.absolute().parent.parent
     if folder.parent.name == JOBS:
         return scene_of_folder(folder.name)

@@ -1,8 +1,8 @@
-"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels; the
-lists of the OpenSUN3D challenge, which have no class; and those of the ScanNet++ benchmark, lists of run-length masks
-and the likeliest classes of every vertex.
+"""Text predictions of ScanNet's benchmark: lists of masks, also exported by Mask3D and Segment3D, and labels; the
+lists of the OpenSUN3D challenge, without classes; and those of the ScanNet++ benchmark, lists of run-length masks
+and the most likely classes of every vertex.
 
-Class numbers of ScanNet++ are places in the benchmark's list of classes, from 0. Source: semantic/eval of
+Class numbers of ScanNet++ are indices into the benchmark's list of classes. Source: semantic/eval of
 scannetpp/scannetpp at commit f3b4712.
 """
 
@@ -26,17 +26,17 @@ from su3d_bench.formats.arrays import MAX_POINTS, check_members, integer_lines, 
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import Numbering, Parse, Parsed, Reader, VertexLabels, scene_files, vertex_masks
 
-EVALUATOR_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
+EVALUATOR_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own output, which it ignores
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
 MASK_OF_RUNS = ".json"  # ScanNet++'s
-TOP = 3  # classes a vertex, where a line of ScanNet++ has several: eval_semantic.py takes 1 or the largest of its k
+TOP = 3  # classes per vertex if a line of ScanNet++ has several: eval_semantic.py accepts 1 or the largest of its k
 SEPARATOR = ","  # between them
 MAX_FIRST_LINE = 4096
 MAX_INSPECTED = 50
 
 
 class Line(NamedTuple):
-    """One line of a list: the mask file as the line says it and as a path without detours, its class and score."""
+    """One line of a list: the mask file as written and as a normalized path, its class and score."""
 
     number: int
     file: str
@@ -45,7 +45,7 @@ class Line(NamedTuple):
 
 
 def text_format(name: str, looks: Callable[[str], str | None], parse: Parse) -> Reader:
-    """A text a scene; ``looks`` says of the first line that is not empty why it is of this format."""
+    """A format with one text file per scene; ``looks`` states why the first non-empty line is of this format."""
 
     def recognise(path: Path) -> str | None:
         lines = _first_lines(path)
@@ -76,22 +76,22 @@ def looks_like_list(line: str) -> str | None:
     if not line:
         return "its .txt files are empty lists"
     is_list = _is_list(line) and not line.split(" ")[0].endswith(MASK_OF_RUNS)
-    return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
+    return "its .txt files list a mask file, a class and a confidence per line" if is_list else None
 
 
 def looks_like_scannetpp(line: str) -> str | None:
     is_list = _is_list(line) and line.split(" ")[0].endswith(MASK_OF_RUNS)
-    return "its .txt files list a .json mask, a class and a confidence a line" if is_list else None
+    return "its .txt files list a .json mask, a class and a confidence per line" if is_list else None
 
 
 def looks_like_opensun3d(line: str) -> str | None:
     words = line.split()
     is_list = len(words) == 2 and _number(words[0]) is None and _number(words[1]) is not None
-    return "its .txt files list a mask file and a confidence a line" if is_list else None
+    return "its .txt files list a mask file and a confidence per line" if is_list else None
 
 
 def _is_list(line: str) -> bool:
-    """Whether a line is mask file, class and confidence."""
+    """Whether a line has a mask file, a class and a confidence."""
     words = line.split(" ")
     return len(words) == 3 and None not in map(_number, words[1:])
 
@@ -103,7 +103,7 @@ def scannet_masks(place: Path, scene: str, numbering: Numbering = "id") -> Parse
     numbers = np.array([line.label for line in said], np.int32)
     n_more = len(lines) - len(pairs)
     remark = (
-        f"{n_more} lines name a mask file again: class and confidence of its last line count, at the place of its "
+        f"{n_more} lines repeat a mask file: class and confidence of its last line are used, at the position of its "
         "first, as in the official evaluator"
     )
     return _masks(place, said, [remark] * bool(n_more), class_numbers=numbers, numbering=numbering)
@@ -114,7 +114,7 @@ def scannetpp_masks(place: Path, scene: str) -> Parsed:
 
 
 def opensun3d_masks(place: Path, scene: str) -> Parsed:
-    """Every line is a mask, one that names a file again too: the original numbers them anew."""
+    """Every line is a mask, even if it repeats a file: the original numbers the lines."""
     return _masks(place, read_list(place, has_classes=False), ["masks without classes"])
 
 
@@ -131,24 +131,24 @@ def _masks(place: Path, lines: Sequence[Line], remarks: Sequence[str], **more: A
 def looks_like_labels(line: str) -> str | None:
     words = line.split()
     is_label = len(words) == 1 and words[0].removeprefix("-").isdigit()
-    return "its .txt files hold one integer a line" if is_label else None
+    return "its .txt files contain one integer per line" if is_label else None
 
 
 def looks_like_ranked(line: str) -> str | None:
     words = line.split(SEPARATOR)
     is_ranked = len(words) > 1 and all(word.strip().isdigit() for word in words)
-    return "its .txt files hold integers with commas between" if is_ranked else None
+    return "its .txt files contain integers separated by commas" if is_ranked else None
 
 
 def scannet_labels(place: Path, scene: str) -> Parsed:
     where = shown(place)
     values = integer_lines(_content(place, where), where)
     if not len(values):
-        raise PredictionError(f"{where}: is empty; expected one class id a line, one line a point")
+        raise PredictionError(f"{where}: is empty; expected one class id per line, one line per point")
     is_wrong = np.abs(values.astype(np.int64)) > np.iinfo(np.int32).max
     if is_wrong.any():
         line = int(np.argmax(is_wrong))
-        raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
+        raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is not a class id")
     return VertexLabels(values.astype(np.int32)), ()
 
 
@@ -159,12 +159,12 @@ def ranked_labels(place: Path, scene: str) -> Parsed:
 
 
 def _ranked_numbers(content: bytes, where: str) -> Int32Array:
-    """The class numbers (N, 1) or (N, 3) of the vertices, the likeliest first."""
+    """The class numbers (N, 1) or (N, 3) of the vertices, the most likely first."""
     if (n_lines := content.count(b"\n")) > MAX_POINTS:
         raise PredictionError(f"{where}: has {n_lines} lines; is it damaged?")
     rows = [line.split(SEPARATOR.encode()) for line in content.splitlines()]
     if not rows:
-        raise PredictionError(f"{where}: is empty; expected one or three classes a line, one line a vertex")
+        raise PredictionError(f"{where}: is empty; expected one or three classes per line, one line per vertex")
     width = len(rows[0])
     for number, row in enumerate(rows, 1):
         if len(row) != width or width not in (1, TOP):
@@ -177,18 +177,18 @@ def _ranked_numbers(content: bytes, where: str) -> Int32Array:
     if is_wrong.any():
         line = int(np.argmax(is_wrong))
         shown_row = SEPARATOR.join(map(str, numbers[line].tolist()))
-        raise PredictionError(f"{where}:{line + 1}: {shown_row} is no place in a list of classes; they count from 0")
+        raise PredictionError(f"{where}:{line + 1}: {shown_row} is not a class index (0-based)")
     return numbers.astype(np.int32)
 
 
 def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
-    """The lines of a list of masks, each as the official script takes it: three fields with single spaces between.
+    """The lines of a list of masks, each as required by the official script: three fields separated by single spaces.
 
-    Without classes, as OpenSUN3D's script takes them through numpy: two fields, blanks between, no empty lines and
-    nothing behind a #; the class is then 0.
+    Without classes, as OpenSUN3D's script reads them with numpy: two fields separated by blanks, no empty lines and
+    no text after a #; the class is then 0.
     """
     where, lines = shown(file), []
-    form = "mask file, class id, confidence' with single spaces between" if has_classes else "mask file, confidence'"
+    form = "mask file, class id, confidence' separated by single spaces" if has_classes else "mask file, confidence'"
     for number, raw in enumerate(_content(file, where).splitlines(), 1):
         text = raw.decode("utf-8", "replace")
         words = text.split(" ") if has_classes else text.partition("#")[0].split()
@@ -200,25 +200,25 @@ def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
             )
         label, score = _number(words[1]) if has_classes else 0, _number(words[-1])
         if label is None or not -(1 << 31) < label < 1 << 31:
-            raise PredictionError(f"{where}:{number}: '{printable(words[1], 60)}' is no class id")
+            raise PredictionError(f"{where}:{number}: '{printable(words[1], 60)}' is not a class id")
         if score is None:
-            raise PredictionError(f"{where}:{number}: confidence '{printable(words[-1], 60)}' is no finite number")
+            raise PredictionError(f"{where}:{number}: confidence '{printable(words[-1], 60)}' is not a finite number")
         lines.append(Line(number, _plain_path(words[0], f"{where}:{number}"), int(label), score))
     return lines
 
 
 def _plain_path(text: str, where: str) -> str:
-    """A path inside the folder, without detours, from what a line says."""
+    """The normalized path inside the folder from a line."""
     plain = os.path.normpath(text) if text and "\0" not in text and "\ufffd" not in text else ""
     if not plain or plain == "." or os.path.isabs(plain) or plain.split(os.sep)[0] == "..":
         raise PredictionError(
-            f"{where}: '{printable(text, 120)}' is no path inside the folder of the list; mask files must be in it"
+            f"{where}: '{printable(text, 120)}' is not a path inside the folder of the list; mask files must be in it"
         )
     return plain
 
 
 def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[Int32Array], int | None]:
-    """The points in the mask of each line, and of how many points all are; None without any."""
+    """The points in the mask of each line, and the number of points of all; None without any."""
     members: list[Int32Array] = []
     n_members, n_points = 0, None
     folders: dict[Path, Path] = {folder: folder.resolve()}
@@ -230,7 +230,7 @@ def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[I
             reason = "does not exist" if isinstance(error, FileNotFoundError) else "cannot be read"
             raise PredictionError(f"{place} {reason}") from error
         if not is_inside:
-            raise PredictionError(f"{place} is no file inside the folder of the list; copy it there")
+            raise PredictionError(f"{place} is not a file inside the folder of the list; copy it there")
         n, indices = _parsed_mask(_content(folder / line.file, place), line.file, place)
         if n_points not in {None, n}:
             raise PredictionError(
@@ -244,9 +244,9 @@ def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[I
 
 
 def _is_inside(folder: Path, file: Path, folders: dict[Path, Path]) -> bool:
-    """Whether a regular file inside ``folder`` stands behind ``file``; ``OSError`` where there is none at all.
+    """Whether ``file`` resolves to a regular file inside ``folder``; ``OSError`` if there is none.
 
-    ``folders`` keeps the true place of each folder: one of many masks is followed once.
+    ``folders`` caches the real path of each folder: one of many masks is resolved once.
     """
     if file.parent not in folders:
         folders[file.parent] = file.parent.resolve(strict=True)
@@ -261,7 +261,7 @@ def _parsed_mask(content: bytes, file: str, where: str) -> tuple[int, Int32Array
     if file.endswith(MASK_OF_RUNS):
         return _run_length_mask(content, where)
     values = integer_lines(content, where)
-    return len(values), np.flatnonzero(values != 0).astype(np.int32)  # of booleans they are found at once
+    return len(values), np.flatnonzero(values != 0).astype(np.int32)  # fast for booleans
 
 
 def _run_length_mask(content: bytes, where: str) -> tuple[int, Int32Array]:
@@ -269,7 +269,7 @@ def _run_length_mask(content: bytes, where: str) -> tuple[int, Int32Array]:
     try:
         value = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise PredictionError(f"{where} is not readable as JSON") from error
+        raise PredictionError(f"{where} is not valid JSON") from error
     if not isinstance(value, dict) or "length" not in value or "counts" not in value:
         raise PredictionError(f"{where} has no 'length' and 'counts'")
     members = run_members(value["length"], value["counts"], where)

@@ -157,7 +157,7 @@ def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> N
         ),
         ("import os; os.kill(os.getpid(), 9)", {}, "was ended by signal 9; it wrote nothing to stderr"),
         ("", {}, "it ended without an error and left nothing in {output}"),
-        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: in none of the known formats"),
+        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: is in no known format"),
         ("import sys; open(sys.argv[1] + '/p.npz', 'wb').write(b'?')", {"format": "openmask3d"}, "{output}"),
     ],
     ids=["exit-code", "signal", "nothing", "unknown-format", "wrong-format"],

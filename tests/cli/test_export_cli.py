@@ -111,7 +111,7 @@ def test_predictions_of_other_programs_are_exported(
     theirs, ours = (read_text(Path(name), "scene0011_00") for name in ("theirs", "ours"))
     np.testing.assert_array_equal(theirs.indices, ours.indices)
     assert theirs.scores.tolist() == ours.scores.tolist()
-    assert "brings no points" in error_of(capsys, "theirs", "--to", "openlex3d")
+    assert "has no points" in error_of(capsys, "theirs", "--to", "openlex3d")
     write_open3dis(Path("indexed"), TOY)
     assert "name it, such as --scenes replica/scene0011_00" in error_of(capsys, "indexed", "--to", "scannet")
     message = error_of(capsys, "indexed", "--to", "scannet", "--scenes", f"{PAINTED}/scene0011_00")

@@ -1,4 +1,4 @@
-"""What ``evaluate`` says beside the numbers of predictions made elsewhere, in which formats and of which scenes."""
+"""Results and warnings of ``evaluate`` for external predictions, by format and by scene."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine
 from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol
 
-# ---- numbers and what stands beside them
+# ---- values and warnings
 
 
-def test_perfect_masks_score_exactly_one_and_classes_without_truth_are_null(tmp_path: Path) -> None:
+def test_perfect_masks_score_exactly_one_and_classes_without_ground_truth_are_null(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt")
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [5, 7], [0.9, 0.8]))
     found = numbers(tmp_path)
@@ -36,7 +36,7 @@ def test_perfect_masks_score_exactly_one_and_classes_without_truth_are_null(tmp_
     assert found["warnings"] == []
 
 
-def test_the_bound_equals_every_mask_listed_under_every_class() -> None:
+def test_upper_bound_equals_listing_every_mask_under_every_class() -> None:
     rng = np.random.default_rng(3)
     truth = np.repeat([5001, 5002, 7001, 0, 1001, 12003], [300, 60, 250, 200, 100, 190])
     masks = [np.flatnonzero(rng.random(len(truth)) < share) for share in (0.05, 0.3, 0.6)]
@@ -55,8 +55,8 @@ def test_the_bound_equals_every_mask_listed_under_every_class() -> None:
     assert combine([bound]).ap > 0
 
 
-def test_all_protocols_that_fit_are_scored_at_once_and_the_others_have_a_reason(tmp_path: Path) -> None:
-    write_truth(tmp_path / "gt", values=np.repeat([5001, 7002, 1163003], 200))  # 1163 is no id of NYU40
+def test_all_fitting_protocols_are_scored_and_the_others_have_a_reason(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([5001, 7002, 1163003], 200))  # 1163 is not an id of NYU40
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [5, 7]))
     found = document(tmp_path, None)
     assert set(found["protocols"]) == {
@@ -77,10 +77,10 @@ def test_all_protocols_that_fit_are_scored_at_once_and_the_others_have_a_reason(
 FORMS: tuple[tuple[ValuesForm, float], ...] = (("classes", 0.5), ("instances", 0.0))
 
 
-def test_low_values_are_what_they_are_said_to_be(tmp_path: Path) -> None:
+def test_ambiguous_values_need_truth_values_option(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt", values=np.repeat([1001, 1357, 0], 200))
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [1, 1]))
-    either = r"may be class ids alone, or class id \* 1000 \+ instance of class 1; say which with --ground-truth-values"
+    either = r"may be class ids only, or class id \* 1000 \+ instance of class 1; choose with --ground-truth-values"
     with pytest.raises(ConfigError, match=rf"1001 to 1357, {either}"):
         numbers(tmp_path, "class-agnostic-segment3d")
     named = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
@@ -95,14 +95,14 @@ def test_low_values_are_what_they_are_said_to_be(tmp_path: Path) -> None:
     for form, recall in FORMS:
         scored = evaluate(replace(request, ground_truth_values=form)).to_json()["protocols"]["scannet200-semantic"]
         assert scored["metrics"]["macc"] == recall
-    write_truth(tmp_path / "labels", values=np.repeat([2, 1163, 0], 200))  # as instances, 2 would be of no class
+    write_truth(tmp_path / "labels", values=np.repeat([2, 1163, 0], 200))  # as an instance value, 2 would have no class
     assert evaluate(request).to_json()["protocols"]["scannet200-semantic"]["metrics"]["macc"] == 0.5
 
 
 # ---- formats
 
 
-def test_masks_in_other_formats_give_the_numbers_of_the_text(tmp_path: Path) -> None:
+def test_masks_in_other_formats_score_like_the_text_format(tmp_path: Path) -> None:
     one = scene([CHAIR, TABLE[:120], np.arange(380, 560)], [5, 7, 5])
     write_truth(tmp_path / "gt")
     write_scannet_text(tmp_path / "pred", one)
@@ -116,7 +116,7 @@ def test_masks_in_other_formats_give_the_numbers_of_the_text(tmp_path: Path) -> 
         assert numbers(tmp_path / name)["metrics"] == expected
 
 
-def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the_original_keeps_them(
+def test_instance_numbers_that_restart_with_each_class_stay_separate_objects_as_in_the_original(
     tmp_path: Path,
 ) -> None:
     write_truth(tmp_path / "gt", values=np.repeat([4001, 5001, 6001], 200))
@@ -124,20 +124,20 @@ def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the
     for name in ("class-agnostic-open3dis", "class-agnostic-segment3d"):
         found = numbers(tmp_path, name)
         assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
-        assert not [line for line in found["warnings"] if "begin anew" in line]
+        assert not [line for line in found["warnings"] if "restart with each class" in line]
     melted = numbers(tmp_path, "class-agnostic-maskclustering")
     assert melted["metrics"]["ap50"] == 0.0
-    assert "and 2 of 3 objects melt with another" in said(melted, "scene0001_00: the instance numbers begin anew")
+    assert "so 2 of 3 objects merge with another" in said(melted, "scene0001_00: instance numbers restart")
 
 
-def test_features_need_the_protocols_encoder_or_a_file_of_texts(tmp_path: Path) -> None:
+def test_features_need_the_protocols_encoder_or_a_text_feature_file(tmp_path: Path) -> None:
     feature_scene(tmp_path)
     with pytest.raises(PredictionError, match=r"needs the encoder 'ViT-L-14-336/openai'.*--text-features FILE.npz"):
         numbers(tmp_path)
     names = [entry.name for entry in load_protocol("scannet-instance").classes]
     write_texts(tmp_path / "texts.npz", names, {"chair": 3, "table": 9})
     found = numbers(tmp_path, text_features=tmp_path / "texts.npz")
-    assert found["metrics"]["ap"] == 1.0  # the mask without a feature is called wall, which is not scored
+    assert found["metrics"]["ap"] == 1.0  # the mask without a feature is classified as wall, which is not scored
     assert said(found, "labels come from the encoder 'of texts.npz', the protocol's is 'ViT-L-14-336")
     write_texts(tmp_path / "texts.npz", names, {"chair": 3, "table": 9}, encoder="ViT-L-14-336/openai")
     named = numbers(tmp_path, text_features=tmp_path / "texts.npz")
@@ -157,7 +157,7 @@ def test_features_need_the_protocols_encoder_or_a_file_of_texts(tmp_path: Path) 
 # ---- scenes
 
 
-def test_scenes_without_a_prediction_are_left_out_loudly_under_the_originals_name(tmp_path: Path) -> None:
+def test_missing_scenes_are_skipped_with_a_warning_under_the_original_protocol(tmp_path: Path) -> None:
     for name in ("scene0001_00", "scene0001_01", "scene0002_00"):
         write_truth(tmp_path / "gt", name)
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [5, 7]))
@@ -167,7 +167,7 @@ def test_scenes_without_a_prediction_are_left_out_loudly_under_the_originals_nam
     assert said(found, "2 of 3 scenes have no prediction and are skipped, as in the original evaluator")
 
 
-def test_a_protocol_of_the_user_counts_missing_scenes(tmp_path: Path) -> None:
+def test_custom_protocol_counts_missing_scenes(tmp_path: Path) -> None:
     from su3d_bench.metrics.protocols.loading import rules_file
 
     text = rules_file("scannet-instance").read_text().replace('name = "scannet-instance"', 'name = "mine"')

@@ -1,4 +1,4 @@
-"""Predictions in the original formats on disk give what the original evaluators answer, by library and command line."""
+"""Predictions in the original formats on disk score as in the original evaluators, by library and command line."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def by_command(folder: Path, protocol: str, *more: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("case", INSTANCE_CASES)
-def test_an_instance_case_on_disk_has_the_answer_of_the_official_script(
+def test_instance_case_on_disk_equals_the_official_script(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_case(tmp_path, case)
@@ -90,7 +90,7 @@ def test_an_instance_case_on_disk_has_the_answer_of_the_official_script(
     assert protocol in capsys.readouterr().out
 
 
-def test_the_scannet200_case_on_disk_has_the_answer_of_openmask3d(tmp_path: Path) -> None:
+def test_scannet200_case_on_disk_equals_openmask3d(tmp_path: Path) -> None:
     write_case(tmp_path, "scannet200_01")
     averages = answer_of("scannet200_01")["openmask3d"]["avgs"]
     for found in (by_library(tmp_path, "scannet200-instance"), by_command(tmp_path, "scannet200-instance")):
@@ -103,7 +103,7 @@ def test_the_scannet200_case_on_disk_has_the_answer_of_openmask3d(tmp_path: Path
 
 
 @pytest.mark.parametrize("case", SEMANTIC_CASES)
-def test_a_semantic_case_on_disk_has_the_answer_of_the_official_script(case: str, tmp_path: Path) -> None:
+def test_semantic_case_on_disk_equals_the_official_script(case: str, tmp_path: Path) -> None:
     write_semantic_case(tmp_path, case)
     answer = answer_of(case)
     official = answer["official_py3"]
@@ -115,14 +115,14 @@ def test_a_semantic_case_on_disk_has_the_answer_of_the_official_script(case: str
         assert found["metrics"]["macc"] == answer["derived_mean_acc_over_classes_with_gt"]
 
 
-def test_every_mask_under_every_class_scores_what_was_measured_with_the_original(tmp_path: Path) -> None:
+def test_every_mask_under_every_class_scores_as_measured_with_the_original(tmp_path: Path) -> None:
     write_case(tmp_path, "replica01_all_ones")
     found = by_library(tmp_path, "replica-openmask3d")
     assert found["every_mask_every_class"]["ap"] == pytest.approx(0.212, abs=5e-4)
     assert found["metrics"]["ap"] == pytest.approx(0.202, abs=5e-4)
 
 
-def test_where_the_protocol_has_1_for_every_confidence_both_numbers_are_told(tmp_path: Path) -> None:
+def test_both_values_are_reported_if_the_protocol_sets_confidences_to_1(tmp_path: Path) -> None:
     write_case(tmp_path, "replica02_scores")
     as_in_files = by_library(tmp_path, "replica-openmask3d")
     by_rule = by_library(tmp_path, "replica-openmask3d", "protocol")

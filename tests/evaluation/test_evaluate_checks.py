@@ -1,4 +1,4 @@
-"""What ``evaluate`` refuses and warns of: masks, clouds, truths and texts that do not fit or are damaged."""
+"""Errors and warnings of ``evaluate``: masks, clouds, ground truth and texts that do not fit or are damaged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_masks_of_another_length_are_refused_with_both_lengths(tmp_path: Path) -
         numbers(tmp_path)
 
 
-def test_empty_double_and_foreign_masks_are_warned_of_with_their_index(tmp_path: Path) -> None:
+def test_empty_duplicate_and_foreign_masks_give_warnings_with_their_index(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt")
     masks = [CHAIR, [], CHAIR, CHAIR[:195], TABLE]
     write_scannet_text(tmp_path / "pred", scene(masks, [5, 5, 5, 5, 1]))
@@ -42,7 +42,7 @@ def test_empty_double_and_foreign_masks_are_warned_of_with_their_index(tmp_path:
     assert found["duplicates"] == {"near": 3, "identical": 1}
 
 
-def test_facts_of_masks_are_exact() -> None:
+def test_mask_facts_are_exact() -> None:
     masks = Masks(np.array([0, 3, 6, 8]), np.array([0, 1, 2, 0, 1, 2, 2, 5], np.int32))
     facts = mask_facts(masks, np.array([0.5, 1.0, 0.25]), 8)
     assert (facts.near, facts.identical) == (((0, 1),), ((0, 1),))
@@ -63,11 +63,11 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
         (BOX * 500, "a: the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
         (BOX * 100, "a: the cloud spans 640, the scene 6.4 m: centimetres\\?"),
         (BOX * 1e-3, "a: the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
-        (BOX + 50, "a: no point of the cloud lies in the box of the scene"),
-        (np.array([[0, 0, 0], [1, np.nan, 1]]), "a: point 1 is at \\[1.0, nan, 1.0\\]; coordinates are finite metres"),
+        (BOX + 50, "a: no point of the cloud is in the box of the scene"),
+        (np.array([[0, 0, 0], [1, np.nan, 1]]), "a: point 1 is at \\[1.0, nan, 1.0\\]; coordinates must be finite"),
     ],
 )
-def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) -> None:
+def test_cloud_in_other_units_or_position_is_refused(points: Any, line: str) -> None:
     with pytest.raises(PredictionError, match=line):
         check_cloud("a", points.astype(np.float32), BOX)
 
@@ -75,7 +75,7 @@ def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) 
 # ---- hostile files
 
 
-def test_every_damage_to_a_truth_file_is_one_error_with_its_name(tmp_path: Path) -> None:
+def test_every_damaged_ground_truth_file_is_one_error_with_its_name(tmp_path: Path) -> None:
     file = tmp_path / "scene0001_00.txt"
     content = "".join(f"{value}\n" for value in [0, 5001, 1163002, 39001, 7]).encode()
 

@@ -1,4 +1,4 @@
-"""The command ``evaluate``: what it prints, writes and refuses."""
+"""The command ``evaluate``: output, files and errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from su3d_bench.cli.main import main
 
 @pytest.fixture(autouse=True)
 def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two scenes with a chair and a table in ``gt``, predicted in ``pred``: one rightly, one with the table missed."""
+    """Two scenes with a chair and a table in ``gt``, predicted in ``pred``: one correctly, one without the table."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     for name, n in (("scene0001_00", 2), ("scene0001_01", 1)):
@@ -25,7 +25,7 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocol", "scannet-instance"]
 
 
-def test_the_table_has_the_numbers_with_what_stands_beside_them(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_has_values_with_interval_ceiling_and_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*WORDS, "--json", "out/numbers.json"]) == 0
     answer = capsys.readouterr()
     assert answer.out.startswith("**scannet-instance** (version 1), 2 scenes\n")
@@ -41,7 +41,7 @@ def test_the_table_has_the_numbers_with_what_stands_beside_them(capsys: pytest.C
     assert "written: out/numbers.json\n" in answer.err
 
 
-def test_the_json_file_has_the_promised_form(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_file_has_the_documented_form(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*WORDS, "--json", "out.json", "--quiet"]) == 0
     assert capsys.readouterr().err == ""
     value = json.loads(Path("out.json").read_text())
@@ -68,7 +68,7 @@ WRONG = {
 }
 
 
-def test_wrong_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_input_gives_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     for words, line in WRONG.items():
         assert main(["evaluate", *words.split(), "--json", "out.json"]) == 2
         answer = capsys.readouterr()
@@ -77,7 +77,7 @@ def test_wrong_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[s
         assert not Path("out.json").exists()
 
 
-def test_the_oracle_of_the_rooms_says_exactly_one(
+def test_oracle_on_rooms_scores_exactly_one(
     rooms_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))

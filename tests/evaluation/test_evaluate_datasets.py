@@ -1,4 +1,4 @@
-"""Predictions against the truth of datasets and of OpenLex3D's release."""
+"""Predictions against the ground truth of datasets and of OpenLex3D's release."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from su3d_bench.formats.ply import PlyElement, write_ply
 # ---- datasets
 
 
-def test_the_oracle_of_a_dataset_scores_one_and_scenes_that_a_run_lost_count_as_missed(tmp_path: Path) -> None:
+def test_oracle_scores_one_and_scenes_missing_from_a_run_count_as_missed(tmp_path: Path) -> None:
     def found(predictions: Path) -> Any:
         request = Request((predictions,), dataset=PAINTED, protocols=("rooms-instance", "rooms-semantic"))
         return evaluate(request).to_json()["protocols"]
@@ -31,14 +31,14 @@ def test_the_oracle_of_a_dataset_scores_one_and_scenes_that_a_run_lost_count_as_
     assert whole["rooms-instance"]["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
     assert whole["rooms-semantic"]["metrics"] == {"macc": 1.0, "miou": 1.0, "fmiou": 1.0}
     assert whole["rooms-instance"]["coverage"] == {"0.025": 1.0, "0.05": 1.0, "0.1": 1.0}
-    assert list(whole["rooms-instance"]["per_scene"]) == ["a", "b"]  # those of the run, not all of the dataset
+    assert list(whole["rooms-instance"]["per_scene"]) == ["a", "b"]  # the scenes of the run, not all of the dataset
     (run / "scenes/painted.b/oracle/prediction.npz").unlink()
     lost = found(run)
     assert lost["rooms-instance"]["metrics"]["ap"] == 0.5  # half of the recall, precision 1
     assert lost["rooms-instance"]["missed_scenes"] == ["b"]
     assert lost["rooms-semantic"]["metrics"]["macc"] < 1
     assert said(lost["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
-    for name in ("prediction.npz", "."):  # each stands for its scene, a folder of scenes for all
+    for name in ("prediction.npz", "."):  # each has only its scene, a folder of scenes has all
         assert found(run / "scenes/painted.a/oracle" / name)["rooms-instance"]["metrics"]["ap"] == 1.0
 
 
@@ -46,7 +46,7 @@ def test_the_oracle_of_a_dataset_scores_one_and_scenes_that_a_run_lost_count_as_
 
 
 def write_release(folder: Path) -> None:
-    """OpenLex3D's files of a room with a chair at the left and a table at the right."""
+    """OpenLex3D's files of a room with a chair on the left and a table on the right."""
     from replica_scene import QUADS, TWO_OBJECTS, write_original
 
     write_original(folder / "data", QUADS, [0, 0, 5, 5], TWO_OBJECTS)
@@ -65,7 +65,7 @@ def write_release(folder: Path) -> None:
     (room / "gt_categories_query_to_object_mapping_l0.json").write_text(json.dumps(queries))
 
 
-def test_openlex3ds_queries_are_scored_against_its_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_openlex3d_queries_are_scored_against_its_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from replica_scene import write_render
 
     write_release(tmp_path)
@@ -87,7 +87,7 @@ def test_openlex3ds_queries_are_scored_against_its_release(tmp_path: Path, monke
     one = found["protocols"]["openlex3d-queries"]
     assert one["per_scene"]["room0"]["ap25"] > 0
     assert one["ceiling"] is None
-    assert said(one, "what the truth itself would score is not known: masks grow by the threshold")
+    assert said(one, "the ground-truth ceiling is unknown: masks grow by the threshold")
     assert found["not_scored"]["replica-openmask3d"] == "is not meant for the labels of OpenLex3D"
     assert "visible" in found["not_scored"]["openlex3d-topn"]  # the cloud of visible points is not in this folder
     (tmp_path / "lex/replica/room0" / VISIBLE_NAME).write_text(header + tail)
@@ -106,7 +106,7 @@ HM3D, SCANNETPP = "00824", "0a76e06478"
 
 @pytest.fixture
 def release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """One scene of HM3D and one of ScanNet++ with their own data, a prediction of each and features of all texts."""
+    """One scene of HM3D and one of ScanNet++ with their own data, a prediction of each and all text features."""
     encoder = "ViT-H-14/laion2b_s32b_b79k"
     for dataset, scene in (("hm3d", HM3D), ("scannetpp", SCANNETPP)):
         problem = of_dataset(dataset)
@@ -138,7 +138,7 @@ def found(release: Path, maps: str, **asked: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("dataset", "scene"), [("hm3d", HM3D), ("scannetpp", SCANNETPP)])
-def test_the_dataset_is_told_from_the_names_of_the_scenes(release: Path, dataset: str, scene: str) -> None:
+def test_dataset_is_inferred_from_scene_names(release: Path, dataset: str, scene: str) -> None:
     protocols = found(release, dataset)["protocols"]
     assert set(protocols) == {"openlex3d-topn", "openlex3d-ranking", "openlex3d-queries"}
     assert list(protocols["openlex3d-topn"]["per_scene"]) == [scene]
@@ -158,7 +158,7 @@ def test_predictions_of_several_datasets_are_scored_one_dataset_at_a_time(releas
         found(release, ".", dataset="replica")
 
 
-def test_a_scene_without_its_own_data_says_what_to_get(release: Path) -> None:
+def test_scene_without_its_own_data_states_what_to_download(release: Path) -> None:
     (release / "data/scannetpp/prepared_semantics" / SAMPLED.name).unlink()
     with pytest.raises(PredictionError, match=r"prepare_training_data of github\.com/scannetpp/scannetpp"):
         found(release, "scannetpp")

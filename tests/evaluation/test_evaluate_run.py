@@ -1,4 +1,4 @@
-"""``evaluate --out``: predictions made elsewhere as a run, which every verb takes with equal numbers."""
+"""``evaluate --out``: external predictions as a run, with equal values in every command."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def both(*more: str) -> int:
 
 
 def files_of(folder: str) -> dict[str, str]:
-    """The digests of all files but those of the run's cache."""
+    """The digests of all files except the run's cache."""
     files = (file for file in sorted(Path(folder).rglob("*")) if file.is_file() and ".cache" not in file.parts)
     return {str(file): digest_file(file) for file in files}
 
@@ -72,7 +72,7 @@ def answered(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> 
     return answer.out if code == 0 else answer.err
 
 
-def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
+def test_predictions_in_two_formats_have_equal_values_in_every_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert both("--json", "numbers.json") == 0
@@ -134,7 +134,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     assert found == documents["mine"]["protocols"]["rooms-instance"]["per_scene"]["a"]["ap"]
 
 
-def test_the_same_again_leaves_the_folder_as_it_is_and_another_evaluation_is_refused(
+def test_same_evaluation_keeps_the_folder_and_another_one_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert both() == 0
@@ -149,17 +149,17 @@ def test_the_same_again_leaves_the_folder_as_it_is_and_another_evaluation_is_ref
     )
     for words, what in others:
         assert main(words) == 2
-        line = f"su3d-bench: {RUN}: holds a different evaluation (other {what}); choose another --out"
+        line = f"su3d-bench: {RUN}: contains a different evaluation (other {what}); choose another --out"
         assert capsys.readouterr().err.startswith(line)
     mask = next(Path("predB").glob("masks/a_0.txt"))
     mask.write_text(mask.read_text().replace("1", "0", 1))
     assert both() == 2
-    assert "holds a different evaluation (other predictions)" in capsys.readouterr().err
+    assert "contains a different evaluation (other predictions)" in capsys.readouterr().err
     assert files_of(RUN) == before
-    assert not [name for name in Path("runs").iterdir() if name.name != "both"]  # nothing is left of what was refused
+    assert not [name for name in Path("runs").iterdir() if name.name != "both"]  # no remains of refused ones
 
 
-def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder_with_other_content_is_refused_before_scoring(capsys: pytest.CaptureFixture[str]) -> None:
     Path("notes").mkdir()
     Path("notes/paper.txt").write_text("mine")
     assert main([*BOTH, *PROTOCOLS, "--out", "notes"]) == 2
@@ -170,12 +170,12 @@ def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys:
     Path(RUN, "run.json").write_text(json.dumps(record))
     capsys.readouterr()
     assert both() == 2
-    assert f"{RUN}: holds a run that is not an evaluation of external predictions" in capsys.readouterr().err
+    assert f"{RUN}: contains a run that is not an evaluation of external predictions" in capsys.readouterr().err
 
 
 @pytest.fixture
 def _texts() -> None:
-    """Ground truth as text, in which a chair and a table lie, and predictions of it."""
+    """Text ground truth with a chair and a table, and predictions of it."""
     for name, n in (("scene0001_00", 2), ("scene0001_01", 1), ("scene0002_00", 2)):
         write_truth(Path("gt"), name)
         masks = [np.arange(150), np.arange(220, 400)][:n]
@@ -186,7 +186,7 @@ TEXTS = ["evaluate", "pred", "--ground-truth", "gt", "--protocol", "scannet-inst
 
 
 @pytest.mark.usefixtures("_texts")
-def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_it_lacks(
+def test_run_from_text_ground_truth_has_attribution_and_states_what_is_missing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main([*TEXTS, "--json", "numbers.json"]) == 0
@@ -212,7 +212,9 @@ def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_i
     assert "is not the one of runs/mine" in answered(capsys, "report", "attribution", "runs/mine", code=2)
 
 
-def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_feature_file_classifies_features_and_is_needed_for_attribution(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     names = [entry.name for entry in load_protocol("rooms-instance").classes]
     features = EmbeddedEncoder().encode_texts(names)
     np.savez("texts.npz", names=np.array(names), features=features, encoder=np.array("theirs/v1"))
@@ -244,7 +246,7 @@ NO_RUNS = {
 
 
 @pytest.mark.usefixtures("_texts")
-def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_than_a_run_is_refused_with_instructions(capsys: pytest.CaptureFixture[str]) -> None:
     main([*TEXTS, "--json", "numbers.json", "--quiet"])
     numbers = json.loads(Path("numbers.json").read_text())
     Path("both.json").write_text(json.dumps({"schema": 1, "methods": {"mine": numbers}}))

@@ -1,4 +1,4 @@
-"""One label a mask or point, or the likeliest of several: told from the prediction, said of a number, never mixed."""
+"""One label per mask or point, or the most likely of several: detected, reported with values, never mixed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAIRS = scene([CHAIR, CHAIR, TABLE, TABLE], [5, 6, 7, 4], [0.9, 0.4, 0.8, 0.3])
 
 
 def evaluated(folder: Path, name: str, written: dict[str, Any], *more: str) -> None:
-    """A run ``name`` below ``folder`` of masks over the small scene."""
+    """A run ``name`` in ``folder`` with masks over the small scene."""
     write_truth(folder / "gt")
     write_scannet_text(folder / f"pred-{name}", written)
     words = ["evaluate", str(folder / f"pred-{name}"), "--ground-truth", str(folder / "gt"), "--quiet"]
@@ -38,7 +38,7 @@ def evaluated(folder: Path, name: str, written: dict[str, Any], *more: str) -> N
     assert main(words) == 0
 
 
-def test_a_mask_counts_as_under_several_labels_only_with_another_label() -> None:
+def test_mask_has_several_labels_only_with_a_different_label() -> None:
     masks = Masks.of_sets([np.array(one) for one in ([0, 1], [0, 1], [0, 1, 2], [], [], [3], [3])])
     found = under_several_labels(masks, [5, 6, 5, 1, 2, 8, 8])
     assert found.tolist() == [True, True, False, False, False, False, False]
@@ -58,13 +58,15 @@ def test_a_mask_counts_as_under_several_labels_only_with_another_label() -> None
         ("rooms-retrieval", True, False, None),
     ],
 )
-def test_each_kind_of_protocol_says_of_how_many_labels_its_number_is(
+def test_each_kind_of_protocol_states_its_number_of_labels(
     name: str, by_features: bool, are_several: bool, said: str | None
 ) -> None:
     assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
 
 
-def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_masks_with_several_labels_are_detected_and_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_truth(tmp_path / "gt")
     for written, expected in ((ONE, "one label"), (PAIRS, "the top labels of a mask")):
         write_scannet_text(tmp_path / "pred", written)
@@ -74,7 +76,7 @@ def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: py
     assert numbers(tmp_path, "class-agnostic-open3dis")["labels"] is None
 
 
-def test_a_ranking_has_numbers_of_as_many_labels_and_names_the_others(
+def test_ranking_has_one_number_of_labels_and_lists_the_excluded_entries(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, written in (("a", ONE), ("b", PAIRS), ("c", ONE)):
@@ -91,7 +93,7 @@ def test_a_ranking_has_numbers_of_as_many_labels_and_names_the_others(
     assert "Labels: one label." in shown and "Excluded: b, b / scannet-instance: uses the top labels" in shown
 
 
-def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, written in (("a", ONE), ("b", PAIRS)):
         evaluated(tmp_path, name, written, "scannet-instance", "class-agnostic-open3dis")
     capsys.readouterr()
@@ -107,7 +109,7 @@ def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(("labels", "fits", "fails"), [("one", ONE, PAIRS), ("top-k", PAIRS, ONE)])
-def test_own_rules_may_take_one_of_the_two_alone(
+def test_custom_rules_may_accept_only_one_of_the_two(
     tmp_path: Path, labels: str, fits: dict[str, Any], fails: dict[str, Any]
 ) -> None:
     rules = tmp_path / "mine.toml"
@@ -120,7 +122,7 @@ def test_own_rules_may_take_one_of_the_two_alone(
         document(tmp_path, str(rules))
 
 
-def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes_with_one_label_mixed_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = load_protocol("openlex3d-topn")
     truths = cast("SceneTruths", SimpleNamespace(has_points=True, incompatibility=lambda *_, **__: None))
     scoring = Scoring(truths, [rules.name], None, file_confidences=False)

@@ -1,4 +1,4 @@
-"""The OpenSUN3D challenge: its submissions and its truth in files give what its own script answers."""
+"""The OpenSUN3D challenge: submissions and ground truth in files score as in its own script."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAMES = ("ap", "ap50", "ap25")
 
 
 def scenes_of(index: int) -> Iterator[tuple[str, np.ndarray, np.ndarray, list[float], list[int]]]:
-    """Name, truth, masks (K, N), scores and the file of each mask, of each scene of a problem."""
+    """Name, ground truth, masks (K, N), scores and mask files of each scene of a problem."""
     with np.load(CASES / f"{CASE}.npz") as archive:
         for s in range(PROBLEMS[index]["n_scenes"]):
             values = archive[f"gt_{index}_{s}"].astype(int)
@@ -54,7 +54,7 @@ def numbers(folder: Path, **more: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS)))
-def test_a_submission_on_disk_has_the_answer_of_the_script_of_the_challenge(index: int, tmp_path: Path) -> None:
+def test_submission_on_disk_equals_the_challenge_script(index: int, tmp_path: Path) -> None:
     write_problem(tmp_path, index)
     assert recognise(tmp_path / "pred").name == PROTOCOL
     metrics = numbers(tmp_path)["metrics"]
@@ -71,12 +71,12 @@ def test_a_scene_without_a_submission_counts_as_missed(tmp_path: Path) -> None:
     assert any("have no prediction and count as missed" in line for line in found["warnings"])
 
 
-def test_the_truth_may_be_said_to_hold_class_and_instance(tmp_path: Path) -> None:
+def test_ground_truth_can_be_declared_as_class_and_instance(tmp_path: Path) -> None:
     write_problem(tmp_path, 0)
     for file in (tmp_path / "gt").iterdir():
         values = np.loadtxt(file, dtype=int)
         file.write_text("".join(f"{5000 + value if value else 0}\n" for value in values % 1000))
-    assert numbers(tmp_path)["metrics"]["ap"] is None  # as the script: no object from 2000 up
+    assert numbers(tmp_path)["metrics"]["ap"] is None  # as in the script: no objects from 2000 on
     metrics = numbers(tmp_path, ground_truth_values="instances")["metrics"]
     assert [metrics[name] for name in NAMES] == [PROBLEMS[0][name] for name in NAMES]
 
@@ -85,13 +85,11 @@ def test_the_truth_may_be_said_to_hold_class_and_instance(tmp_path: Path) -> Non
     ("line", "message"),
     [
         ("masks/a.txt 1 0.5", "pred/a.txt:1: 3 fields in 'masks/a.txt 1 0.5'; expected 'mask file, confidence'"),
-        ("../a.txt 0.5", "pred/a.txt:1: '../a.txt' is no path inside the folder of the list"),
+        ("../a.txt 0.5", "pred/a.txt:1: '../a.txt' is not a path inside the folder of the list"),
         ("masks/b.txt 0.5", "pred/a.txt:1: mask 'masks/b.txt' does not exist"),
     ],
 )
-def test_a_line_that_is_no_mask_is_named(
-    line: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_mask_line_is_named(line: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("pred").mkdir()
     Path("pred/a.txt").write_text(line + "\n")
@@ -107,12 +105,10 @@ def test_values_that_may_be_classes_or_instances_are_not_guessed(tmp_path: Path)
     write_truth(tmp_path / "gt", values=np.repeat([1000, 1001, 1067], 200))
     write_scannet_text(tmp_path / "pred", scene([np.arange(200, 400)], [3]))
     request = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
-    with pytest.raises(
-        ConfigError, match=r"1000 to 1067, may be class ids alone, .* say which with --ground-truth-values"
-    ):
+    with pytest.raises(ConfigError, match=r"1000 to 1067, may be class ids only, .* choose with --ground-truth-values"):
         evaluate(request)
     with pytest.raises(
-        ConfigError, match=r"1000 to 1067, are said to be class ids alone: .* --ground-truth-values numbers"
+        ConfigError, match=r"1000 to 1067, are configured as class ids only: .* --ground-truth-values numbers"
     ):
         evaluate(replace(request, ground_truth_values="classes"))
     forms: tuple[tuple[ValuesForm, float], ...] = (("instances", 1 / 2), ("numbers", 1 / 3))  # there 1000 is an object

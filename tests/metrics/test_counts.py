@@ -1,4 +1,4 @@
-"""Counts: those of each kind that no scene gives are refused, and what scenes are joined and drawn to."""
+"""Counts: impossible ones of each kind are refused; joining and resampling of scenes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from su3d_bench.metrics.scoring import METRICS
 
 KINDS = {metric.counts.stored_as: metric.counts for metric in METRICS.values()}
 NAN = np.nan
-# Of each kind the arrays of a scene, and changes that make them impossible, each with the array that is named.
+# For each kind the arrays of a scene, and changes that make them impossible, each with the array named in the error.
 POSSIBLE: dict[str, dict[str, Any]] = {
     "instance": {
         "class_index": [0, 0], "threshold_index": [0, 1], "score": [0.5, 0.25], "is_true": [True, False],
@@ -95,14 +95,14 @@ def checked(kind: str, **changed: Any) -> Counts:
 
 
 @pytest.mark.parametrize(("kind", "changed", "named"), IMPOSSIBLE)
-def test_counts_that_no_scene_gives_are_refused(kind: str, changed: dict[str, Any], named: str) -> None:
+def test_impossible_counts_are_refused(kind: str, changed: dict[str, Any], named: str) -> None:
     with pytest.raises(DataError, match=r"counts: .*; score the scene again") as caught:
         checked(kind, **changed)
     assert named in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_scenes_are_joined_row_after_row_and_added_up_and_drawn_with_weights(kind: str) -> None:
+def test_scenes_are_concatenated_summed_and_resampled_with_weights(kind: str) -> None:
     one = checked(kind)
     twice = type(one).joined([one, one])
     for name, (number_kind, axes) in one.arrays().items():

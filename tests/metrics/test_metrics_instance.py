@@ -1,4 +1,4 @@
-"""The instance AP answers what the original evaluators answer, to the last bit."""
+"""The instance AP equals the original evaluators to the last bit."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def as_table(answer: dict[str, Any]) -> Any:
     return np.array([[np.nan if v is None else v for v in row] for row in answer["ap"]])
 
 
-def test_a_number_above_all_others_gives_what_the_refused_infinity_would() -> None:
+def test_largest_confidence_scores_like_the_refused_infinity() -> None:
     truth = np.repeat([5001, 5002, 7001], 200)
     masks = [np.arange(200), np.arange(400, 600), np.arange(200, 400)]  # a hit, a false positive, a hit
     indptr, indices = np.array([0, 200, 400, 600]), np.concatenate(masks)
@@ -70,13 +70,13 @@ def test_a_number_above_all_others_gives_what_the_refused_infinity_would() -> No
         per_scene(truth, indptr, indices, np.full(3, 5), np.array([np.inf, 0.8, 0.1]), [5, 7])
 
 
-def test_the_thresholds_are_the_original_doubles() -> None:
+def test_thresholds_are_the_original_doubles() -> None:
     _, expected = load("inst01_basic")
     assert list(THRESHOLDS) == expected["official_py3_pr26"]["overlaps"]
 
 
 @pytest.mark.parametrize("case", INSTANCE_CASES)
-def test_every_ap_of_a_reference_case_and_their_averages_are_equal_in_every_bit(case: str) -> None:
+def test_reference_case_aps_and_averages_are_equal_in_every_bit(case: str) -> None:
     ours, answer = evaluate(case, "official_py3_pr26")
     assert np.array_equal(ours.table, as_table(answer), equal_nan=True)
     assert (ours.ap, ours.ap50, ours.ap25) == (answer["all_ap"], answer["all_ap50"], answer["all_ap25"])
@@ -85,7 +85,7 @@ def test_every_ap_of_a_reference_case_and_their_averages_are_equal_in_every_bit(
         assert [None if np.isnan(value) else value for value in ours.of_class(index)] == expected
 
 
-def test_openmask3ds_own_replica_script_gives_the_same_bits() -> None:
+def test_openmask3d_replica_script_is_equal_in_every_bit() -> None:
     for case in ("replica01_all_ones", "replica02_scores"):
         ours, answer = evaluate(case, "replica_script")
         assert np.array_equal(ours.table, as_table(answer), equal_nan=True)
@@ -107,7 +107,7 @@ def test_the_scannet200_case_is_equal_in_every_bit() -> None:
         assert tuple(groups[group].values()) == tuple(averages[f"{group}_{key}"] for key in ("ap", "ap50%", "ap25%"))
 
 
-# ---- hand-worked values
+# ---- hand-computed values
 
 
 def one_scene(
@@ -130,30 +130,30 @@ TWO = np.repeat([5001, 5002, 0], [200, 200, 100])  # two instances of class 5, t
 FIRST, SECOND, VOID = np.arange(200), np.arange(200, 400), np.arange(400, 500)
 
 
-def test_a_perfect_prediction_is_exactly_one_and_a_class_without_truth_is_nan() -> None:
+def test_perfect_prediction_is_exactly_one_and_class_without_ground_truth_is_nan() -> None:
     ours = one_scene(TWO, [FIRST, SECOND], [5, 5], [0.9, 0.8])
     assert (ours.ap, ours.ap50, ours.ap25) == (1.0, 1.0, 1.0)
     assert np.isnan(ours.table[1]).all()
 
 
-def test_an_iou_equal_to_the_threshold_is_no_match() -> None:
+def test_iou_equal_to_the_threshold_is_not_a_match() -> None:
     assert one_scene(np.full(200, 5001), [np.arange(100)], [5], [1.0]).ap50 == 0.0
     assert one_scene(np.full(200, 5001), [np.arange(101)], [5], [1.0]).ap50 == 1.0
 
 
-def test_with_constant_confidences_ap_is_recall_times_one_plus_precision_by_two() -> None:
+def test_ap_with_constant_confidences_is_recall_times_one_plus_precision_over_two() -> None:
     masks = [FIRST, np.concatenate([FIRST[:60], SECOND[:60]])]
     assert one_scene(TWO, masks, [5, 5], [1.0, 1.0]).ap50 == 0.5 * (1 + 0.5) / 2
 
 
-def test_a_duplicate_is_a_false_positive_with_the_lower_of_the_two_scores() -> None:
+def test_duplicate_is_a_false_positive_with_the_lower_score() -> None:
     counts = counts_of(np.full(200, 5001), [np.arange(150), np.arange(200)], [5, 5], [0.3, 0.8])
     at_50 = counts.threshold_index == 0
     assert counts.score[at_50].tolist() == [0.8, 0.3]
     assert counts.is_true[at_50].tolist() == [True, False]
 
 
-def test_a_prediction_with_more_void_than_the_threshold_is_ignored_and_with_as_much_counted() -> None:
+def test_prediction_with_void_above_the_threshold_is_ignored_and_at_it_counted() -> None:
     half_void = np.concatenate([SECOND[:100], VOID])
     assert one_scene(TWO, [FIRST, half_void], [5, 5], [0.5, 0.9]).ap50 < 0.5
     more_void = np.concatenate([SECOND[:99], VOID])
@@ -176,9 +176,9 @@ def test_a_small_instance_is_neither_found_nor_missed() -> None:
     assert one_scene(truth, [FIRST, np.arange(199, 299)], [5, 5], [0.5, 1.0]).ap50 == 1.0
 
 
-def test_what_lies_on_void_and_on_small_instances_is_ignored_together() -> None:
+def test_void_and_small_instances_are_ignored_together() -> None:
     truth = np.repeat([5001, 5002, 0], [200, 60, 30])
-    mask = np.concatenate([FIRST[160:], np.arange(200, 230), np.arange(260, 290)])  # of 100 points 30 on each
+    mask = np.concatenate([FIRST[160:], np.arange(200, 230), np.arange(260, 290)])  # 30 of 100 points on each
     assert one_scene(truth, [FIRST, mask], [5, 5], [0.5, 0.9]).ap50 == 1.0
 
 
@@ -196,18 +196,18 @@ def test_scenes_share_one_curve() -> None:
     assert combine([hit, false]).table[0, 0] == pytest.approx((2 / 3) / 2)
 
 
-def test_a_scene_without_predictions_counts_its_truth_as_missed() -> None:
+def test_scene_without_predictions_counts_all_instances_as_missed() -> None:
     hit = counts_of(TWO, [FIRST, SECOND], [5, 5], [0.5, 0.5])
     assert combine([hit, counts_of(TWO, [], [], [])]).ap == 0.5
 
 
-def test_no_truth_at_all_is_nan_and_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
+def test_no_ground_truth_is_nan_without_warnings(recwarn: pytest.WarningsRecorder) -> None:
     ours = one_scene(np.zeros(300, np.int64), [FIRST], [5], [1.0])
     assert np.isnan([ours.ap, ours.ap50, ours.ap25]).all()
     assert not recwarn.list
 
 
-def test_an_instance_covers_the_vertices_whose_nearest_map_point_is_its_own() -> None:
+def test_instance_covers_vertices_whose_nearest_map_point_it_has() -> None:
     points = np.array([[k, 0, 0] for k in range(6)], np.float32)
     objects = np.array([0, 1, 1, 2, 2, -1], np.int32)
     truth = GroundTruth(points, objects, objects, LABELS, "mesh-vertices", "made for a test")
@@ -225,7 +225,7 @@ def test_an_instance_covers_the_vertices_whose_nearest_map_point_is_its_own() ->
 @given(
     case=st.sampled_from(["inst02_ties", "inst04_missing_classes_void", "inst06_empty_scenes"]), seed=st.integers(0, 99)
 )
-def test_the_order_of_scenes_and_classes_changes_no_bit(case: str, seed: int) -> None:
+def test_order_of_scenes_and_classes_changes_no_bit(case: str, seed: int) -> None:
     arrays, expected = load(case)
     answer = expected["official_py3_pr26"]
     rng = np.random.default_rng(seed)
@@ -247,7 +247,7 @@ def test_counts_of_parts_combine_to_the_whole(case: str, data: st.DataObject) ->
     assert np.array_equal(combine(halves).table, as_table(answer), equal_nan=True)
 
 
-# ---- what is refused
+# ---- errors
 
 
 @pytest.mark.parametrize(
@@ -265,16 +265,16 @@ def test_masks_that_do_not_fit_the_scene_are_refused(masks: Any, labels: Any, sc
         one_scene(TWO, masks, labels, scores)
 
 
-def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:
+def test_ground_truth_beyond_the_encoding_is_refused() -> None:
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
         encode_ground_truth(np.array([5]), np.array([1000]))
-    with pytest.raises(DataError, match="holds the id -1"):
+    with pytest.raises(DataError, match="contains the id -1"):
         encode_ground_truth(np.array([5, 5]), np.array([3, -1]))
-    with pytest.raises(DataError, match="holds the id -2"):
+    with pytest.raises(DataError, match="contains the id -2"):
         encode_ground_truth(np.array([-2, 5]), np.array([1, 3]))
-    with pytest.raises(DataError, match="holds the value -5;"):
+    with pytest.raises(DataError, match="contains the value -5;"):
         one_scene(np.repeat([-5, 5001], 100), [FIRST], [5], [1.0])
-    with pytest.raises(DataError, match="holds the value 10000001;"):
+    with pytest.raises(DataError, match="contains the value 10000001;"):
         one_scene(np.repeat([10_000_001, 0], 100), [FIRST], [5], [1.0])
     with pytest.raises(DataError, match="class ids start at 1"):
         one_scene(TWO, [FIRST], [5], [1.0], class_ids=(0, 5))

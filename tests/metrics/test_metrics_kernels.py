@@ -1,4 +1,4 @@
-"""Curves are formed many at a time: the bits are those of one curve after another, worked out with exact sums."""
+"""Batched curves equal single curves, computed with exact sums, in every bit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ N_CLASSES = 3
 
 
 def many(rng: np.random.Generator, n: int, levels: int) -> InstanceCounts:
-    """``n`` counted predictions of ``levels`` confidences: class 2 has no truth, class 1 no true positive."""
+    """``n`` counted predictions of ``levels`` confidences: class 2 has no ground truth, class 1 no true positive."""
     class_index = rng.integers(0, N_CLASSES, n).astype(np.int32)
     threshold_index = rng.integers(0, len(THRESHOLDS), n).astype(np.int32)
     is_true = (rng.random(n) < 0.6) & (class_index == 0)
@@ -42,7 +42,7 @@ def many(rng: np.random.Generator, n: int, levels: int) -> InstanceCounts:
 
 
 def one_by_one(counts: InstanceCounts) -> Float64Array:
-    """The table of classes and thresholds, each curve by itself."""
+    """The table of classes and thresholds, one curve at a time."""
     table = np.full((N_CLASSES, len(THRESHOLDS)), np.nan)
     for c in np.flatnonzero(counts.n_truth):
         for t in range(len(THRESHOLDS)):
@@ -52,7 +52,7 @@ def one_by_one(counts: InstanceCounts) -> Float64Array:
 
 
 def area(score: Float64Array, is_true: BoolArray, n_missed: int) -> float:
-    """The area of one curve as the official script forms it, products added as OpenBLAS adds them: sums by ``fsum``."""
+    """The area of one curve as in the official script, with products added in OpenBLAS's order: sums by ``fsum``."""
     order = np.argsort(score, kind="stable")
     n_true_up_to = np.cumsum(is_true[order])
     _, first = np.unique(score[order], return_index=True)
@@ -85,7 +85,7 @@ def exact_dot(left: Float64Array, right: Float64Array) -> float:
 
 
 @pytest.mark.parametrize("levels", [1, 7, 40, 10**9])
-def test_every_curve_of_many_has_the_bits_of_the_curve_by_itself(levels: int) -> None:
+def test_batched_curves_equal_single_curves_in_every_bit(levels: int) -> None:
     counts = many(np.random.default_rng(levels), 20_500, levels)
     found = combine([counts])
     assert np.array_equal(found.table, one_by_one(counts), equal_nan=True)
@@ -94,7 +94,7 @@ def test_every_curve_of_many_has_the_bits_of_the_curve_by_itself(levels: int) ->
     assert 0 < found.ap < 1
 
 
-def test_a_wanted_cell_without_rows_is_zero_and_an_unwanted_one_no_number() -> None:
+def test_wanted_cell_without_rows_is_zero_and_unwanted_one_nan() -> None:
     score, is_true = np.linspace(0, 1, 500), np.ones(500, bool)
     cell = np.full(500, 1)
     areas = average_precisions(cell, score, is_true, np.zeros(4, np.int64), np.array([True, True, False, True]))
@@ -104,7 +104,7 @@ def test_a_wanted_cell_without_rows_is_zero_and_an_unwanted_one_no_number() -> N
     assert average_precision(nothing, nothing.astype(bool), 2) == 0.0
 
 
-def test_products_of_many_stretches_add_up_as_those_of_each_alone() -> None:
+def test_batched_sums_of_products_equal_single_ones() -> None:
     rng = np.random.default_rng(0)
     lengths = np.array([0, 1, 15, 16, 17, 31, 32, 33, 47, 48, 63, 64, 65, 97, 1000])
     starts = np.cumsum(lengths) - lengths
@@ -114,7 +114,7 @@ def test_products_of_many_stretches_add_up_as_those_of_each_alone() -> None:
 
 
 @pytest.mark.parametrize("levels", [1, 6])
-def test_resampled_curves_above_the_limit_are_those_of_the_scenes_drawn(levels: int) -> None:
+def test_resampled_curves_above_the_limit_equal_the_drawn_scenes(levels: int) -> None:
     rng = np.random.default_rng(8)
     scenes = [many(rng, n, levels) for n in (MANY_ROWS, 700, 50)]
     drawn = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [2, 0, 1], [0, 0, 3], [0, 3, 0]])

@@ -1,4 +1,4 @@
-"""Votes of several neighbours and masks that reach what is near: exact, whatever the tree, with ties settled."""
+"""Votes of several neighbours and masks that include near points: exact, independent of the tree, with fixed ties."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def plain_votes(points: np.ndarray, values: np.ndarray, targets: np.ndarray, k: 
     on_a_grid=st.booleans(),
     cap_m=st.sampled_from([np.inf, 0.5]),
 )
-def test_votes_equal_a_plain_count_with_the_lowest_indices_of_equals(
+def test_votes_equal_brute_force_with_the_lowest_indices_on_ties(
     seed: int, n: int, k: int, on_a_grid: bool, cap_m: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    if on_a_grid:  # few places, many points on each, so that equals lie beyond the last neighbour
+    if on_a_grid:  # few positions, many points at each, so that there are ties beyond the last neighbour
         points, targets = rng.integers(0, 3, (n, 3)).astype(np.float64), rng.integers(0, 5, (30, 3)) / 2
     else:
         points, targets = rng.random((n, 3)), rng.random((30, 3))
@@ -46,7 +46,7 @@ def test_votes_equal_a_plain_count_with_the_lowest_indices_of_equals(
     np.testing.assert_allclose(distance, np.where(exact > cap_m, np.inf, exact), rtol=1e-12)
 
 
-def test_the_lowest_indices_vote_among_more_equals_than_are_asked_for_at_once() -> None:
+def test_lowest_indices_vote_among_more_ties_than_one_request() -> None:
     points = np.zeros((5000, 3), np.float32)
     values = np.array([8, 9, 9] + [1] * 4997)
     value, _ = transfer_votes(points, values, np.zeros((2, 3), np.float32), np.array([True, True]), 3)
@@ -54,9 +54,9 @@ def test_the_lowest_indices_vote_among_more_equals_than_are_asked_for_at_once() 
 
 
 @pytest.mark.parametrize("first", [-1.0, 1.0])
-def test_the_lowest_indices_vote_whichever_of_two_equally_near_places_is_searched_first(first: float) -> None:
+def test_lowest_indices_vote_in_any_search_order(first: float) -> None:
     points = np.zeros((82, 3))
-    points[:40, 0], points[40:80, 0] = first, -first  # more of each than are asked for at once
+    points[:40, 0], points[40:80, 0] = first, -first  # more of each than one request returns
     values = np.repeat([5, 4, 3], [3, 37, 42])
     value, _ = transfer_votes(points[:80], values[:80], np.zeros((2, 3)), np.ones(2, bool), 3)
     assert value.tolist() == [5, 5]
@@ -65,7 +65,7 @@ def test_the_lowest_indices_vote_whichever_of_two_equally_near_places_is_searche
     assert value.tolist() == [5, 5]
 
 
-def test_the_smallest_value_of_as_many_votes_wins() -> None:
+def test_smallest_value_wins_on_equal_votes() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
     value, _ = transfer_votes(points, np.array([7, 3, 7, 3, 5]), points[:1], np.ones(1, bool), 5)
     assert value.tolist() == [3]
@@ -81,12 +81,10 @@ def test_unwanted_targets_and_a_map_without_points_get_no_vote() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), n_masks=st.integers(0, 6), on_a_grid=st.booleans())
-def test_masks_reach_what_is_nearer_than_the_cap_to_a_point_of_their_own(
-    seed: int, n_masks: int, on_a_grid: bool
-) -> None:
+def test_masks_include_points_nearer_than_the_cap(seed: int, n_masks: int, on_a_grid: bool) -> None:
     rng = np.random.default_rng(seed)
     points, targets = rng.random((80, 3)), rng.random((100, 3))
-    if on_a_grid:  # distances that equal the cap, and targets that share their place
+    if on_a_grid:  # distances equal to the cap, and targets that share their position
         points, targets = np.round(points * 4) / 4, np.round(targets * 4) / 4
     sets = [np.sort(rng.permutation(80)[: rng.integers(0, 30)]) for _ in range(n_masks)]
     masks = Masks(

@@ -1,4 +1,4 @@
-"""Average precision of text queries: the original's answers, ceilings, and what changes nothing."""
+"""Average precision of text queries: equal to the original, ceilings, and invariants."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ OPENLEX, PLAIN = load_protocol("openlex3d-queries"), load_protocol("query-ap")
 PROTOCOLS = {"openlex3d-queries": OPENLEX, "query-ap": PLAIN}
 
 
-# ---- what the original answers
+# ---- equal to the original
 
 
 def golden_counts(case: dict[str, Any], top_k: int) -> instance_ap.InstanceCounts:
-    """A golden case as masks with a confidence for each query; the masks that a query does not list come last."""
+    """A golden case as masks with a confidence for each query; masks that a query does not list come last."""
     sets = sorted({tuple(rows) for _, rows, *_ in [*case["gt"], *case["pred"]]})
     texts = sorted({text for text, *_ in case["gt"]})
     objects = np.full(30, -1)
@@ -48,7 +48,7 @@ def golden_counts(case: dict[str, Any], top_k: int) -> instance_ap.InstanceCount
 @pytest.mark.parametrize(
     ("name", "top_k"), [("ol_ap_perfect", 1), ("ol_ap_perfect_geometry_top3", 3), ("ol_ap_multi_gt_top3", 3)]
 )
-def test_the_golden_average_precisions_come_out(name: str, top_k: int) -> None:
+def test_golden_average_precisions_are_reproduced(name: str, top_k: int) -> None:
     case = GOLDEN[name]
     ours = instance_ap.combine([golden_counts(case, top_k)])
     np.testing.assert_allclose(ours.table[0], case["ap_per_threshold"], rtol=0, atol=1e-15)
@@ -59,19 +59,19 @@ def test_the_golden_average_precisions_come_out(name: str, top_k: int) -> None:
 # ---- confidences
 
 
-def test_stretched_confidences_give_the_best_mask_of_every_query_one_and_the_worst_zero() -> None:
+def test_rescaled_confidences_are_one_for_the_best_mask_and_zero_for_the_worst() -> None:
     rng = np.random.default_rng(0)
     stretched = confidences(rng.uniform(-1, 1, (9, 5)), "similarity-min-max")
     assert (stretched.max(axis=0) == 1).all() and (stretched.min(axis=0) == 0).all()
     assert confidences(np.full((4, 1), 0.3), "similarity-min-max").tolist() == [[0.0]] * 4
 
 
-def test_confidences_of_masks_that_hardly_differ_are_not_stretched_to_the_full_range() -> None:
+def test_nearly_equal_confidences_are_not_rescaled_to_the_full_range() -> None:
     stretched = confidences(np.array([[0.0], [1e-8], [4e-9]]), "similarity-min-max")  # (s + 1) / 2 over at least 1e-8
     assert stretched[:, 0].tolist() == pytest.approx([0.0, 0.5, 0.2], abs=1e-6)
 
 
-def test_a_mask_of_a_single_point_counts_and_points_of_no_object_answer_nothing() -> None:
+def test_single_point_mask_counts_and_points_without_object_match_nothing() -> None:
     objects, masks = np.array([-1, 7]), Masks(np.array([0, 1, 2]), np.arange(2, dtype=np.int32))
     found = per_scene(objects, [TextQuery("seat", (7,))], masks, np.array([[0.1], [0.9]]))
     assert instance_ap.combine([found]).ap == 1.0
@@ -80,7 +80,7 @@ def test_a_mask_of_a_single_point_counts_and_points_of_no_object_answer_nothing(
     assert nothing.n_truth.tolist() == [0]
 
 
-def test_the_top_masks_of_each_query_count_and_of_equals_the_first() -> None:
+def test_top_masks_of_each_query_count_and_the_first_on_ties() -> None:
     objects = np.repeat([1, 2, 3], 4)
     masks = Masks(np.array([0, 4, 8, 12]), np.arange(12, dtype=np.int32))
     counts = per_scene(objects, [TextQuery("x", (2,))], masks, np.array([[0.5], [0.5], [0.5]]), top_k=1)
@@ -119,8 +119,8 @@ def test_perfect_masks_with_a_query_for_each_score_exactly_one(rules: ProtocolRu
     assert metrics(rules, truth, with_words(truth, OWN_WORD)) == [1.0, 1.0, 1.0]
 
 
-def test_the_truth_does_not_reach_one_under_openlex3d_where_a_query_has_two_objects_and_does_under_ours() -> None:
-    """Stretching lifts the wrong second mask of a query above the right second mask of another."""
+def test_ground_truth_scores_below_one_for_two_object_queries_only_in_openlex3d() -> None:
+    """Rescaling ranks the wrong second mask of a query above the right second mask of another."""
     words = {
         7: {"seat": 1.0},
         12: {"seat": 0.7, "lamp": 0.7},
@@ -133,13 +133,13 @@ def test_the_truth_does_not_reach_one_under_openlex3d_where_a_query_has_two_obje
     assert metrics(PLAIN, ruled(PLAIN, truth), with_words(truth, words)) == pytest.approx([1.0, 1.0, 1.0])
 
 
-def test_of_queries_it_is_said_why_the_truth_has_no_score() -> None:
+def test_queries_state_why_there_is_no_ceiling() -> None:
     said = {name: metric_of(rules).ceiling_remark for name, rules in PROTOCOLS.items()}
     assert "masks grow by the threshold" in str(said["openlex3d-queries"])
-    assert "how well perfect masks are ranked is up to the encoder" in str(said["query-ap"])
+    assert "the ranking of perfect masks depends on the encoder" in str(said["query-ap"])
 
 
-def test_a_mask_meets_only_the_objects_of_its_own_query() -> None:
+def test_mask_matches_only_objects_of_its_own_query() -> None:
     truth = asking(query_truth(), ("seat", (30,)), ("light", (7,)))
     assert metrics(OPENLEX, truth, with_words(truth, OWN_WORD))[0] < 0.5
 
@@ -165,7 +165,7 @@ def touching() -> tuple[QueryTruth, Instances]:
     return truth, instances_with(points, [np.flatnonzero(objects == one) for one in (7, 30)], features)
 
 
-def test_masks_of_objects_that_meet_grow_over_each_other_under_openlex3d_and_keep_their_shape_under_ours() -> None:
+def test_touching_masks_grow_in_openlex3d_and_keep_their_shape_in_ours() -> None:
     truth, perfect_masks = touching()
     wide = OPENLEX.model_copy(update={"transfer": OPENLEX.transfer.model_copy(update={"cap_m": 0.3})})
     assert 0 < metrics(wide, truth, perfect_masks)[0] < 1
@@ -181,7 +181,7 @@ def test_a_mask_reaches_a_point_nearer_than_the_root_of_a_thousandth(offset_m: f
     assert metrics(OPENLEX, truth, mask) == [float(is_reached)] * 3
 
 
-def test_an_object_of_number_zero_may_be_asked_for_and_points_of_none_may_not() -> None:
+def test_object_zero_can_be_queried_and_points_without_object_cannot() -> None:
     queries = (TextQuery("seat", (0,)), TextQuery("air", (-1,)))
     truth = QueryTruth(np.zeros((5, 3), np.float32), np.array([0, 0, 1, -1, -1]), queries, OPENLEX.ground_truth, "test")
     mask = instances_with(truth.points, [np.arange(5)], WordEncoder().feature({"seat": 1.0})[None])
@@ -196,19 +196,19 @@ def test_overlapping_masks_are_all_ranked() -> None:
     assert metrics(OPENLEX, truth, both)[:2] == [1.0, 1.0]
 
 
-# ---- what is refused
+# ---- errors
 
 
 def test_dense_features_and_masks_without_features_cannot_be_ranked() -> None:
     truth = query_truth()
     dense = DenseFeatures(truth.points, np.zeros((len(truth.points), 4), np.float16))
     assert kind_incompatibility(OPENLEX, dense) == (
-        "openlex3d-queries: needs instances, and the method gives one feature a point"
+        "openlex3d-queries: needs instances, and the method gives one feature per point"
     )
     with pytest.raises(PredictionError, match="openlex3d-queries: needs features to compare with texts"):
         score_scene(OPENLEX, truth, instances_with(truth.points, [np.arange(3)], None, ["chair"]), ENCODER)
 
 
 def test_a_query_names_an_object_once() -> None:
-    with pytest.raises(DataError, match="query 'seat': an object stands there twice"):
+    with pytest.raises(DataError, match="query 'seat': an object is listed twice"):
         TextQuery("seat", (7, 7))

@@ -1,4 +1,4 @@
-"""What combine and the reader get: several scenes, warnings, bytes, and what cannot be scored."""
+"""Combined results: several scenes, warnings, stored bytes, and errors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_pooled_values_differ_from_the_mean_of_the_scenes(name: str) -> None:
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
 @pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
-def test_the_interval_is_student_s_on_the_values_without_each_scene(name: str, aggregate: str) -> None:
+def test_interval_is_student_t_on_leave_one_out_values(name: str, aggregate: str) -> None:
     rules = load_protocol(name).model_copy(update={"aggregate": aggregate})
     scores = noisy_scores(name, 6)
     result = combine(rules, scores)
@@ -67,7 +67,7 @@ def test_a_single_scene_has_no_interval_and_two_have_one() -> None:
 
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
-def test_the_reported_values_alone_are_those_of_the_whole_result(aggregate: str) -> None:
+def test_reported_values_equal_those_of_the_full_result(aggregate: str) -> None:
     rules, scores = ROOM.model_copy(update={"aggregate": aggregate}), noisy_scores("rooms-semantic", 2)
     assert combined_metrics(rules, scores) == combine(rules, scores).metrics
 
@@ -79,7 +79,7 @@ def test_groups_are_averaged_over_the_classes_that_have_ground_truth() -> None:
     assert result.groups == {"head": result.per_class["chair"]}
 
 
-# ---- what a reader is told
+# ---- warnings
 
 
 def warnings_of(name: str, prediction: Prediction, encoder: Encoder | None = None) -> str:
@@ -94,26 +94,26 @@ def chairs(masks: list[np.ndarray], *scores: float) -> Instances:
     return instances(room().points, masks, ["chair"] * len(masks), scores=scores or None)
 
 
-def test_constant_confidences_are_told_where_they_count() -> None:
+def test_constant_confidences_give_a_warning_if_they_count() -> None:
     alike = chairs(CHAIRS, 0.25, 0.25)
     told = warnings_of("rooms-instance", alike)
     assert told == "rooms/a: all confidences are 0.25: AP per class is recall x (1 + precision) / 2"
     assert warnings_of("rooms-instance", chairs(CHAIRS, 0.25, 0.5)) == ""
-    assert warnings_of("rooms-instance", chairs(CHAIRS[:1])) == ""  # one has no order
+    assert warnings_of("rooms-instance", chairs(CHAIRS[:1])) == ""  # a single one has no order
     assert warnings_of("replica-openmask3d", alike) == ""
     for name in (*SEMANTIC, "rooms-instance"):
         assert warnings_of(name, LABELLED) == ""
 
 
-def test_duplicates_are_told() -> None:
+def test_duplicates_give_a_warning() -> None:
     of_one = CHAIRS[0]
-    small = [of_one[:99], of_one[50:], of_one[50:], of_one[:99]]  # of 100 points two, and two that do not count
+    small = [of_one[:99], of_one[50:], of_one[50:], of_one[:99]]  # two of 100 points, and two that do not count
     told = warnings_of("rooms-instance", chairs(small))
     assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
     assert "3 pairs of predictions overlap with" in warnings_of("rooms-instance", chairs([of_one] * 3))
 
 
-def test_another_encoder_than_the_protocols_is_told_once_for_all_scenes() -> None:
+def test_different_encoder_gives_one_warning_for_all_scenes() -> None:
     rules = load_protocol("replica-mesh-ex6")
     told = combine(rules, dict.fromkeys("abc", score_scene(rules, room(), UNLABELLED, ENCODER))).warnings
     assert len(told) == 1
@@ -121,7 +121,7 @@ def test_another_encoder_than_the_protocols_is_told_once_for_all_scenes() -> Non
     assert warnings_of("rooms-semantic", UNLABELLED, ENCODER) == ""
 
 
-def test_a_class_of_the_truth_without_scored_points_is_told_and_counts_zero_in_its_scene_alone() -> None:
+def test_class_without_scored_points_gives_a_warning_and_counts_zero_only_in_its_scene() -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     points = room().points[room().semantic != ID["lamp"]]
     truth = replace(room(), variant="conceptgraphs", evaluation_points=points)
@@ -134,7 +134,7 @@ def test_a_class_of_the_truth_without_scored_points_is_told_and_counts_zero_in_i
     assert result.pooled["mAcc"] == 1.0
 
 
-def test_a_class_with_small_instances_only_is_told() -> None:
+def test_class_with_only_small_instances_gives_a_warning() -> None:
     truth = room(n_each=99)
     rules = load_protocol("rooms-instance")
     result = combine(rules, {"a": score_scene(rules, truth, truth_as_prediction(truth, with_labels=True), None)})
@@ -146,7 +146,7 @@ def test_a_class_with_small_instances_only_is_told() -> None:
 
 
 @pytest.mark.parametrize("name", [*SEMANTIC, "rooms-instance"])
-def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_that_near(name: str) -> None:
+def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_in_the_radius(name: str) -> None:
     truth = room()
     rules = load_protocol(name)
     half = [k for k in range(8) if k != 4]  # the lamp is missing; the nearest object is 20 cm or more away
@@ -160,7 +160,7 @@ def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_that_n
 # ---- bytes
 
 
-def test_packed_scores_hold_no_pickle_come_back_whole_and_have_the_same_bytes_at_any_time(
+def test_packed_scores_contain_no_pickle_and_are_reproducible(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scores = {name: score_scene(load_protocol(name), *noisy(0), None) for name in (*SEMANTIC, *INSTANCE)}
@@ -185,10 +185,10 @@ def test_damaged_counts_are_a_data_error(cut: int) -> None:
         ({"n_scored": 7e300}, r"'n_scored' is 7e\+300"),
         ({"n_farther": [2, 1, 9]}, r"'n_farther' is \[2, 1, 9\] of 3 scored points"),
         ({"n_farther": [1, 2, 0]}, r"'n_farther' is \[1, 2, 0\] of 3 scored points"),
-        ({"protocol": "other"}, "'rooms-semantic' holds those of 'other'"),
+        ({"protocol": "other"}, "'rooms-semantic' contains those of 'other'"),
     ],
 )
-def test_what_stands_beside_the_counts_is_checked_too(changed: dict[str, Any], line: str) -> None:
+def test_metadata_of_counts_is_checked(changed: dict[str, Any], line: str) -> None:
     score = replace(score_scene(ROOM, *noisy(0), None), n_scored=3, n_farther=np.array([2, 1, 0]))
     assert unpack_scores(pack_scores({ROOM.name: score}))[ROOM.name].n_scored == 3
     if "n_farther" in changed:
@@ -203,7 +203,7 @@ def test_a_result_has_no_nan_in_its_json() -> None:
     assert '"sofa": {"AP": null' in text
 
 
-# ---- what cannot be scored
+# ---- errors
 
 
 UNFIT: list[tuple[str, Instances, Encoder | None, str]] = [
@@ -218,19 +218,19 @@ UNFIT: list[tuple[str, Instances, Encoder | None, str]] = [
 
 
 @pytest.mark.parametrize(("name", "prediction", "encoder", "said"), UNFIT)
-def test_a_prediction_that_cannot_be_named_or_is_no_number_is_refused(
+def test_prediction_without_names_or_with_non_finite_values_is_refused(
     name: str, prediction: Instances, encoder: Encoder | None, said: str
 ) -> None:
     with pytest.raises(PredictionError, match=said):
         score_scene(load_protocol(name), room(), prediction, encoder)
 
 
-def test_a_truth_of_another_kind_is_refused() -> None:
+def test_ground_truth_of_another_kind_is_refused() -> None:
     prediction = truth_as_prediction(room(), with_labels=True)
-    with pytest.raises(DataError, match="scores the truth 'mesh-vertices', this one is 'face-corners'"):
+    with pytest.raises(DataError, match="needs ground truth 'mesh-vertices', this one is 'face-corners'"):
         score_scene(ROOM, replace(room(), variant="face-corners"), prediction, None)
     scannet = replace(room(), labels=LabelSet("scannet", (5,), ("chair",)))
-    with pytest.raises(DataError, match="scores the label space 'replica', the truth has 'scannet'"):
+    with pytest.raises(DataError, match="needs the label space 'replica', ground truth has 'scannet'"):
         score_scene(ROOM, scannet, prediction, None)
 
 

@@ -1,4 +1,4 @@
-"""A scene through score_scene: ceilings, floors, what changes nothing and what counts."""
+"""A scene through score_scene: ceilings, empty maps, invariants and what counts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from su3d_bench.metrics.scoring import combine, score_scene
 
 
 @pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
-def test_the_truth_scores_one_where_faces_share_places(name: str) -> None:
+def test_ground_truth_scores_one_if_faces_share_positions(name: str) -> None:
     truth = room()
     twice = replace(
         truth,
@@ -41,7 +41,7 @@ def test_the_truth_scores_one_where_faces_share_places(name: str) -> None:
     assert set(headline(name, twice, instances(twice.points, masks, names))) == {1.0}
 
 
-def test_a_map_on_other_points_reaches_the_truth_through_its_nearest_points() -> None:
+def test_map_on_other_points_is_transferred_by_nearest_points() -> None:
     truth = room()
     moved = truth_as_prediction(truth, with_labels=True)
     shifted = replace(moved, points=truth.points + np.float32(0.001))
@@ -49,7 +49,7 @@ def test_a_map_on_other_points_reaches_the_truth_through_its_nearest_points() ->
         assert min(headline(name, truth, shifted)) > 0.97
 
 
-def test_a_mask_farther_than_the_cap_is_no_instance_but_still_names_points_for_conceptgraphs() -> None:
+def test_mask_beyond_the_cap_is_no_instance_but_labels_points_for_conceptgraphs() -> None:
     truth = room()
     far = replace(truth_as_prediction(truth, with_labels=True), points=truth.points + np.array([0, 0, 50], np.float32))
     assert headline("rooms-instance", truth, far) == [0.0, 0.0, 0.0]
@@ -75,7 +75,7 @@ def test_a_partition_scores_as_the_same_instances() -> None:
         assert headline(name, truth, partition) == [1.0] * len(load_protocol(name).headline)
 
 
-def test_a_partition_into_nothing_scores_zero_and_one_beyond_its_features_is_refused() -> None:
+def test_empty_partition_scores_zero_and_one_beyond_its_features_is_refused() -> None:
     truth = room()
     nowhere = np.full(len(truth.points), -1, np.int32)
     empty = Partition(truth.points, nowhere, np.zeros((0, OneHotEncoder().dim), np.float32))
@@ -83,11 +83,11 @@ def test_a_partition_into_nothing_scores_zero_and_one_beyond_its_features_is_ref
         assert headline(name, truth, empty) == [0.0] * len(load_protocol(name).headline)
     one = replace(empty, features=np.ones((1, OneHotEncoder().dim), np.float32))
     assert headline("rooms-instance", truth, one) == [0.0, 0.0, 0.0]
-    with pytest.raises(PredictionError, match="needs one row of its 1 features a point, -1 for none"):
+    with pytest.raises(PredictionError, match="needs one row of its 1 features per point, -1 for none"):
         headline("rooms-instance", truth, replace(one, instance=np.where(np.arange(len(nowhere)) == 5, 1, nowhere)))
 
 
-def test_each_object_keeps_its_first_point_a_voxel_where_a_semantic_protocol_says_so() -> None:
+def test_each_object_keeps_its_first_point_per_voxel_in_semantic_protocols_with_voxels() -> None:
     truth = room()
     chair, table = (truth.semantic[np.flatnonzero(truth.instance == k)[0]] for k in (2, 4))
     points = np.array([[0.0, 0, 0], [0.024, 0, 0], [0.03, 0, 0]], np.float32)  # the first two share a voxel of 0.025
@@ -105,7 +105,7 @@ def test_each_object_keeps_its_first_point_a_voxel_where_a_semantic_protocol_say
     assert recalls == [1.0, 0.0]  # the chair's second point is gone, and the table's is nearest
 
 
-def test_dense_features_score_as_the_same_instances_under_a_semantic_protocol() -> None:
+def test_dense_features_score_like_the_same_instances() -> None:
     truth = room()
     encoder = OneHotEncoder()
     dense = np.zeros((len(truth.points), encoder.dim), np.float16)
@@ -117,7 +117,7 @@ def test_dense_features_score_as_the_same_instances_under_a_semantic_protocol() 
     rules = load_protocol("rooms-instance")
     assert (
         kind_incompatibility(rules, prediction)
-        == "rooms-instance: needs instances, and the method gives one feature a point"
+        == "rooms-instance: needs instances, and the method gives one feature per point"
     )
     with pytest.raises(PredictionError, match="needs instances"):
         score_scene(rules, truth, prediction, encoder)
@@ -141,13 +141,13 @@ def test_the_scene_vocabulary_offers_only_classes_of_the_scene_and_the_full_one_
     sofa, table = OneHotEncoder().feature("sofa"), OneHotEncoder().feature("table")
     assert prediction.features is not None
     features = prediction.features.copy()
-    features[3] = sofa + 0.1 * table  # a table that looks more like a sofa, and no sofa is there
+    features[3] = sofa + 0.1 * table  # a table that resembles a sofa more, in a scene without a sofa
     prediction = replace(prediction, features=features)
     assert headline("replica-mesh-ex6", truth, prediction) == [1.0, 1.0]
     assert headline("rooms-semantic", truth, prediction)[0] == pytest.approx(5 / 6)
 
 
-def test_classes_outside_the_protocol_are_void_in_the_truth_and_dropped_in_the_prediction() -> None:
+def test_classes_outside_the_protocol_are_void_in_ground_truth_and_dropped_in_predictions() -> None:
     truth = room()
     prediction = truth_as_prediction(truth, with_labels=True)
     rules = load_protocol("replica-openmask3d")
@@ -156,7 +156,7 @@ def test_classes_outside_the_protocol_are_void_in_the_truth_and_dropped_in_the_p
     assert result.metrics["AP"] == 1.0
 
 
-def test_points_of_another_cloud_may_take_their_class_from_the_first_point_of_the_truth() -> None:
+def test_points_of_another_cloud_can_take_their_class_from_the_first_true_point() -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     chairs = np.flatnonzero(room().semantic == ID["chair"])
     first = replace(
@@ -171,7 +171,7 @@ def test_points_of_another_cloud_may_take_their_class_from_the_first_point_of_th
     assert combine(rules, {"room": score}).per_class["chair"]["recall"] == 1.0
 
 
-def test_a_class_that_no_truth_has_takes_points_away_from_the_true_one() -> None:
+def test_class_absent_from_ground_truth_takes_points_from_the_true_one() -> None:
     truth = room()
     table = np.flatnonzero(truth.semantic == ID["table"])
     prediction = instances(truth.points, [table[:75], table[75:]], ["table", "sofa"])
@@ -179,7 +179,7 @@ def test_a_class_that_no_truth_has_takes_points_away_from_the_true_one() -> None
     assert combine(ROOM, {"room": score}).per_class["table"]["recall"] == 0.5
 
 
-def test_confidences_count_where_the_protocol_says_so_and_are_all_one_elsewhere() -> None:
+def test_confidences_count_only_if_the_protocol_uses_them() -> None:
     truth = room()
     lamp, book = np.flatnonzero(truth.instance == 5), np.flatnonzero(truth.instance == 7)
 
@@ -193,7 +193,7 @@ def test_confidences_count_where_the_protocol_says_so_and_are_all_one_elsewhere(
     assert ap_of_lamp("replica-openmask3d", 0.9, 0.1) == ap_of_lamp("replica-openmask3d", 0.1, 0.9) == 0.75
 
 
-def test_a_semantic_protocol_with_a_cap_takes_farther_points_for_missing() -> None:
+def test_semantic_protocol_with_a_cap_treats_farther_points_as_missing() -> None:
     rules = load_protocol("scannet-semantic")
     labels = LabelSet("scannet", tuple(c.id for c in rules.classes), tuple(c.name for c in rules.classes))
     points = np.random.default_rng(0).random((200, 3)).astype(np.float32)
@@ -205,15 +205,15 @@ def test_a_semantic_protocol_with_a_cap_takes_farther_points_for_missing() -> No
         score = score_scene(rules, alone, instances(moved, [np.arange(1)], ["chair"]), None)
         per_class = combine(rules, {"a": score}).per_class
         assert per_class["chair"]["recall"] == value
-        assert all(np.isnan(row["IoU"]) for name, row in per_class.items() if name != "chair")  # nothing is called so
+        assert all(np.isnan(row["IoU"]) for name, row in per_class.items() if name != "chair")  # never predicted
     assert headline("scannet-semantic", truth, truth_as_prediction(truth, with_labels=True)) == [1.0, 1.0, 1.0]
 
 
-def test_where_two_objects_have_a_point_in_one_place_the_first_names_it() -> None:
+def test_first_of_two_objects_at_one_position_labels_the_point() -> None:
     truth = room()
     chairs = np.flatnonzero(truth.semantic == ID["chair"])
     place = np.repeat(truth.points[chairs[:1]], 40, axis=0) + np.float32(0.01)
-    masks = [np.arange(20, 40), np.arange(20)]  # the first object holds the later points of the map
+    masks = [np.arange(20, 40), np.arange(20)]  # the first object has the later points of the map
     for names, recall in ((("chair", "table"), 1.0), (("table", "chair"), 0.0)):
         score = score_scene(ROOM, truth, instances(place, masks, names), None)
         assert combine(ROOM, {"room": score}).per_class["chair"]["recall"] == recall
@@ -222,8 +222,8 @@ def test_where_two_objects_have_a_point_in_one_place_the_first_names_it() -> Non
 # ---- labels for some
 
 
-def test_a_background_object_with_a_label_counts_only_where_its_class_is_scored() -> None:
-    """ConceptGraphs' evaluation: with 1 excluded class background has its own name, with 6 it is not loaded."""
+def test_background_object_with_a_label_counts_only_if_its_class_is_scored() -> None:
+    """ConceptGraphs' evaluation: with 1 excluded class background keeps its own name, with 6 it is not loaded."""
     truth = replace(room(), variant="conceptgraphs")
     masks = [np.flatnonzero(truth.instance == 2).astype(np.int32), np.flatnonzero(truth.instance == 1).astype(np.int32)]
     features = np.stack([OneHotEncoder().feature("chair"), OneHotEncoder().feature("lamp")])

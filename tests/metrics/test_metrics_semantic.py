@@ -1,4 +1,4 @@
-"""The semantic metrics answer what the original evaluators answer."""
+"""The semantic metrics equal the original evaluators."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ def test_classes_above_a_level_are_counted_in_float32_by_default_too() -> None:
     assert metrics.n_classes_above[0] == case["metrics"]["acc0.15"] == 3
 
 
-def test_the_f1_of_conceptgraphs_has_its_own_name_beside_the_harmonic_mean() -> None:
+def test_conceptgraphs_f1_and_harmonic_mean_have_separate_names() -> None:
     metrics = conceptgraphs_metrics(np.array(GOLDEN["cg_f1_quirk"]["conf"]), np.arange(3))
     np.testing.assert_allclose(metrics.f1, [0.1379, 0.1818, 0.2979], atol=5e-5)
     np.testing.assert_allclose(metrics.f1_conceptgraphs, [0.0444, 0.0667, 0.1815], atol=5e-5)
 
 
-def test_points_in_the_extra_column_lower_recall_and_no_precision() -> None:
+def test_points_in_the_extra_column_lower_recall_but_not_precision() -> None:
     metrics = conceptgraphs_metrics(np.array([[6, 0, 2], [0, 4, 0]]), np.arange(2))
     assert metrics.recall.tolist() == [0.75, 1.0]
     assert metrics.precision.tolist() == [1.0, 1.0]
@@ -114,9 +114,9 @@ def test_scannet_cases_are_equal_in_every_bit(case: str) -> None:
         assert ours == expected[key] or (np.isnan(ours) and expected[key] is None)
 
 
-def test_scannet_values_are_those_worked_out_by_hand() -> None:
-    # of 9 points of the first class 3 are called so, 1 the second and 5 the third, which is never true; 2 of the second
-    # are called nothing
+def test_scannet_values_equal_hand_computed_ones() -> None:
+    # of 9 points of the first class 3 are correct, 1 is called the second and 5 the third, which is never true;
+    # 2 of the second have no prediction
     with np.errstate(all="raise"):  # nothing is divided by zero
         metrics = scannet_metrics(np.array([[3, 1, 5, 0], [0, 0, 0, 2], [0, 0, 0, 0]]))
     assert metrics.class_index.tolist() == [0, 1, 2]
@@ -132,14 +132,14 @@ def test_scannet_values_are_those_worked_out_by_hand() -> None:
     assert metrics.n_classes_above == (1, 1, 0, 0)
 
 
-def test_classes_are_counted_above_a_level_and_not_at_it() -> None:
-    n_hit = np.array([4, 5, 6, 8, 10, 12, 15, 18])  # of 20 points each, the others called nothing
+def test_classes_are_counted_above_but_not_at_a_level() -> None:
+    n_hit = np.array([4, 5, 6, 8, 10, 12, 15, 18])  # of 20 points each, the others without a prediction
     metrics = scannet_metrics(np.column_stack([np.diag(n_hit), 20 - n_hit]))
     assert metrics.iou.tolist() == [0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9]
     assert metrics.n_classes_above == (8, 6, 3, 1)
 
 
-def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:
+def test_points_of_unscored_classes_are_excluded() -> None:
     counts = per_scene(np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([True, False]))
     assert counts.confusion.tolist() == [[1, 0, 0], [0, 0, 0]]
 
@@ -150,7 +150,7 @@ def test_concatenated_scenes_contain_the_classes_of_each() -> None:
     assert SemanticCounts.joined([a, b]).is_present.tolist() == [True, True]
 
 
-def test_ovo_counts_a_class_that_is_only_predicted_as_0_in_the_mean_accuracy_too() -> None:
+def test_ovo_counts_only_predicted_classes_as_0_in_mean_accuracy() -> None:
     confusion = np.array([[3, 1, 0], [0, 0, 0]])
     plain, of_ovo = scannet_metrics(confusion), scannet_metrics(confusion, counts_unseen=True)
     assert (plain.mean_accuracy, of_ovo.mean_accuracy) == (0.75, 0.375)

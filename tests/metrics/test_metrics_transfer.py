@@ -1,4 +1,4 @@
-"""From the prediction's points to the truth's: exact, the lowest index of equals, overlaps kept."""
+"""From predicted to ground-truth points: exact, the lowest index on ties, overlaps kept."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=80, deadline=None)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 300), on_a_grid=st.booleans(), is_ordered=st.booleans())
-def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(
+def test_nearest_equals_brute_force_with_the_lowest_index_on_ties(
     seed: int, n: int, on_a_grid: bool, is_ordered: bool
 ) -> None:
     rng = np.random.default_rng(seed)
-    if on_a_grid:  # few places, many points on each, queries half-way between
+    if on_a_grid:  # few positions, many points at each, queries half-way between
         candidates = rng.integers(0, 3, (n, 3)).astype(np.float64)
         queries = rng.integers(0, 5, (50, 3)) / 2
     else:
         candidates, queries = rng.random((n, 3)), rng.random((50, 3))
     with pytest.MonkeyPatch.context() as patch:
-        if is_ordered:  # as large clouds are
+        if is_ordered:  # as for large clouds
             patch.setattr(transfer, "MIN_SORTED_CANDIDATES", 0)
         distance, index = nearest(candidates, queries)
         capped = nearest(candidates, queries, cap_m=0.2)[1]
@@ -50,16 +50,16 @@ def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(
     np.testing.assert_allclose(distance, exact, rtol=1e-12, atol=0)
 
 
-def test_the_lowest_index_wins_among_more_equals_than_are_asked_for_at_once() -> None:
+def test_lowest_index_wins_among_more_ties_than_one_request() -> None:
     candidates = np.zeros((5000, 3), np.float32)
     candidates[:4000] += 1
     assert nearest(candidates, np.zeros((3, 3), np.float32))[1].tolist() == [4000] * 3
 
 
 @pytest.mark.parametrize("first", [-1.0, 1.0])
-def test_the_lowest_index_wins_whichever_of_two_equally_near_places_is_searched_first(first: float) -> None:
+def test_lowest_index_wins_in_any_search_order(first: float) -> None:
     candidates = np.zeros((40, 3))
-    candidates[:20, 0], candidates[20:, 0] = first, -first  # more of each than are asked for at once
+    candidates[:20, 0], candidates[20:, 0] = first, -first  # more of each than one request returns
     distance, index = nearest(candidates, np.zeros((2, 3)))
     assert (index.tolist(), distance.tolist()) == ([0, 0], [1.0, 1.0])
 
@@ -77,7 +77,7 @@ def test_no_candidates_means_no_neighbours() -> None:
     assert (index.tolist(), distance.tolist()) == ([-1, -1], [np.inf, np.inf])
 
 
-def test_what_shares_a_place_keeps_its_own_value_on_a_copy_of_its_points_too() -> None:
+def test_points_at_one_position_keep_their_values_on_a_copy() -> None:
     points, rank, wanted = np.zeros((3, 3)), np.array([0, 1, -1]), np.array([True, True, True])
     values, distance = transfer_values(points, np.array([7, 8, 9]), rank, points.copy(), wanted)
     assert (values.tolist(), distance.tolist()) == ([7, 8, 7], [0.0, 0.0, 0.0])
@@ -85,7 +85,7 @@ def test_what_shares_a_place_keeps_its_own_value_on_a_copy_of_its_points_too() -
     assert transfer_masks(points, masks, points.copy()).indices.tolist() == [0, 1]
 
 
-def test_what_is_not_wanted_or_beyond_the_cap_has_no_value() -> None:
+def test_unwanted_targets_and_those_beyond_the_cap_have_no_value() -> None:
     points, targets = np.array([[1.0, 0, 0]]), np.array([[1.0, 0, 0], [1, 0, 0], [9, 0, 0]])
     wanted = np.array([True, False, True])
     values, distance = transfer_values(points, np.array([7]), np.array([0]), targets, wanted, 0.5)
@@ -132,7 +132,7 @@ def test_duplicates_are_those_of_a_comparison_of_every_pair(seed: int, n: int, i
     rng = np.random.default_rng(seed)
     sets: list[set[int]] = []
     for _ in range(rng.integers(0, 14)):
-        if sets and rng.random() < 0.6:  # almost one of those before
+        if sets and rng.random() < 0.6:  # almost equal to a previous one
             sets.append(sets[rng.integers(len(sets))] ^ set(rng.integers(0, n, rng.integers(0, 6)).tolist()))
         else:
             sets.append(set(np.flatnonzero(rng.random(n) < rng.random()).tolist()))
@@ -142,7 +142,7 @@ def test_duplicates_are_those_of_a_comparison_of_every_pair(seed: int, n: int, i
     assert duplicate_pairs(masks, n, iou) == sorted(pairs)
 
 
-def test_features_that_no_class_may_name_are_none_of_the_classes() -> None:
+def test_features_without_candidate_classes_have_no_class() -> None:
     features = np.ones((2, OneHotEncoder().dim), np.float32)
     partition = Partition(np.zeros((3, 3), np.float32), np.array([0, 1, -1], np.int32), features)
     rules, none = ROOM.model_copy(update={"vocabulary": "scene"}), np.zeros(len(ROOM.classes), bool)
@@ -157,12 +157,12 @@ def test_the_first_class_wins_ties_and_features_without_direction() -> None:
     assert most_similar(features, text).tolist() == [1, 0, 0, 0]
 
 
-def test_a_feature_that_holds_what_is_no_number_is_near_to_nothing() -> None:
+def test_feature_with_non_finite_values_has_zero_similarity() -> None:
     features = np.array([[np.nan, 1], [1, np.inf], [np.nan, np.nan], [0, 2]])
     assert labelling.cosines(features, np.array([[1.0, 0], [0, 1]])).tolist() == [[0, 0], [0, 0], [0, 0], [0, 1]]
 
 
-def test_cosines_are_added_up_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cosines_are_summed_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     n_threads: list[int] = []
 
     def normalised(rows: Float64Array) -> Float64Array:
@@ -173,10 +173,10 @@ def test_cosines_are_added_up_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> 
     labelling.cosines(np.eye(3), np.eye(3))
     assert n_threads == [1, 1]
     most_similar(np.eye(3), np.eye(3))
-    assert n_threads[3:] == [1]  # after the directions of the texts, which are found before
+    assert n_threads[3:] == [1]  # after the directions of the texts, which are computed first
 
 
-def test_labels_do_not_depend_on_the_number_of_rows_named_at_once() -> None:
+def test_labels_do_not_depend_on_the_block_size() -> None:
     rng = np.random.default_rng(0)
     features, text = rng.normal(size=(20_000, 16)).astype(np.float16), rng.normal(size=(9, 16))
     whole = most_similar(features, text)

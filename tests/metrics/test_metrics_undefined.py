@@ -1,4 +1,4 @@
-"""Values that are not defined: a class without truth, a scene in which nothing counts, sums that leave them out."""
+"""Undefined values: a class without ground truth, a scene in which nothing counts, and means that ignore them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from su3d_bench.numerics.statistics import nan_mean, row_means
 NAN = float("nan")
 ROOM, INSTANCE = load_protocol("rooms-semantic"), load_protocol("rooms-instance")
 N = len(ROOM.classes)
-# the first classes that count; what else the label set has does not matter here
+# the first scored classes; the rest of the label set does not matter here
 A, B, C = [index for index, entry in enumerate(ROOM.classes) if not ROOM.is_ignored(entry.name)][:3]
 
 
@@ -36,7 +36,7 @@ def score(rules: ProtocolRules, counts: SemanticCounts | InstanceCounts) -> Scen
 
 
 def confusion(rows: dict[int, dict[int, int]], *, present: Sequence[int] = ()) -> SemanticCounts:
-    """Points by true and predicted class; ``present``: classes that the scene has without a scored point."""
+    """Points by true and predicted class; ``present``: classes of the scene without a scored point."""
     table = np.zeros((N, N + 1), np.int64)
     for true, of_row in rows.items():
         for predicted, n in of_row.items():
@@ -62,7 +62,7 @@ def masks(*classes: tuple[int, bool]) -> InstanceCounts:
 # ---- means
 
 
-def test_a_mean_leaves_out_what_is_undefined_and_is_undefined_where_all_is() -> None:
+def test_mean_ignores_undefined_values_and_is_undefined_if_all_are() -> None:
     assert nan_mean(np.array([NAN, 0.2, NAN, 0.6])) == pytest.approx(0.4)
     assert math.isnan(nan_mean(np.array([NAN, NAN])))
     assert math.isnan(nan_mean(np.zeros(0)))
@@ -72,7 +72,7 @@ def test_a_mean_leaves_out_what_is_undefined_and_is_undefined_where_all_is() -> 
     assert math.isnan(mean["y"])
 
 
-def test_no_file_holds_a_value_that_is_no_finite_number() -> None:
+def test_no_file_contains_non_finite_values() -> None:
     value = {"a": [NAN, math.inf, -math.inf, 0.5], "b": (NAN, {"c": 1})}
     assert plain_json(value) == {"a": [None, None, None, 0.5], "b": [None, {"c": 1}]}
 
@@ -86,7 +86,7 @@ WEIGHTS = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 0, 2], [0, 3
 def of_drawn(
     rules: ProtocolRules, counts: Sequence[SemanticCounts | InstanceCounts], weights: Int64Array
 ) -> list[Values]:
-    """The metrics over the scenes drawn, each as a scene of its own, by the function that knows no weights."""
+    """The metrics over the drawn scenes, each as a separate scene, with the function without weights."""
     metric = metric_of(rules)
     return [metric.combine([counts[s] for s in range(len(counts)) for _ in range(n[s])]) for n in weights]
 
@@ -96,7 +96,7 @@ def assert_as_drawn(found: dict[str, Float64Array], expected: list[Values], name
         np.testing.assert_allclose(found[name], [row[name] for row in expected], rtol=0, atol=1e-12, err_msg=name)
 
 
-def test_ap_over_drawn_scenes_leaves_out_classes_that_none_of_them_has() -> None:
+def test_ap_over_drawn_scenes_ignores_absent_classes() -> None:
     counts = [masks((0, True), (1, True)), masks((1, False), (2, False)), masks()]
     found = resampled_ap(counts, WEIGHTS, INSTANCE.thresholds)
     expected = of_drawn(INSTANCE, counts, WEIGHTS)
@@ -105,7 +105,7 @@ def test_ap_over_drawn_scenes_leaves_out_classes_that_none_of_them_has() -> None
     assert np.isnan(found["AP"][4])
 
 
-def test_semantic_values_over_drawn_scenes_leave_out_classes_that_none_of_them_has() -> None:
+def test_semantic_values_over_drawn_scenes_ignore_absent_classes() -> None:
     counts = [confusion({A: {A: 3, B: 1}}), confusion({B: {B: 2, N: 2}, C: {A: 5}}), confusion({})]
     found = metric_of(ROOM).resampled(counts, WEIGHTS)
     assert_as_drawn(dict(found), of_drawn(ROOM, counts, WEIGHTS), ("mAcc", "mIoU", "F-mIoU"))
@@ -113,7 +113,7 @@ def test_semantic_values_over_drawn_scenes_leave_out_classes_that_none_of_them_h
     assert all(np.isnan(found[name][4]) for name in ("mAcc", "mIoU", "F-mIoU"))
 
 
-def test_a_mean_over_drawn_scenes_leaves_out_those_without_a_value() -> None:
+def test_mean_over_drawn_scenes_ignores_those_without_a_value() -> None:
     rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
     rows = [{"mAcc": 0.2, "F-mIoU": 0.5}, {"mAcc": 0.8, "F-mIoU": NAN}, {"mAcc": NAN, "F-mIoU": NAN}]
     found = metric_of(rules).resampled_headline([], rows, WEIGHTS)
@@ -130,9 +130,9 @@ def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> No
     assert set(found) == {ROOM.classes[A].name, ROOM.classes[B].name}
 
 
-def test_under_scannet_a_class_that_is_neither_true_nor_called_leaves_the_mean_of_drawn_scenes() -> None:
+def test_scannet_mean_of_drawn_scenes_ignores_classes_neither_true_nor_predicted() -> None:
     found = resampled_semantic([confusion({A: {A: 3, B: 1}})], np.array([[1], [2]]), "scannet")
-    assert found["mIoU"].tolist() == [0.375, 0.375]  # 3/4 and 0 for the one that is only called
+    assert found["mIoU"].tolist() == [0.375, 0.375]  # 3/4 and 0 for the one that is only predicted
     assert found["mAcc"].tolist() == [0.75, 0.75]
 
 
@@ -153,14 +153,14 @@ def test_counts_without_the_axis_of_a_single_class_are_refused() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_classes_that_should_have_points_and_have_none_score_zero(dtype: type[np.float32] | type[np.float64]) -> None:
+def test_expected_classes_without_points_score_zero(dtype: type[np.float32] | type[np.float64]) -> None:
     with np.errstate(all="raise"):
         metrics = conceptgraphs_metrics(np.zeros((2, 3), np.int64), np.arange(2), dtype)
     assert (metrics.mean_accuracy, metrics.mean_iou) == (0.0, 0.0)
-    assert math.isnan(metrics.frequency_weighted_iou)  # of no point at all
+    assert math.isnan(metrics.frequency_weighted_iou)  # without any point
 
 
-def test_a_scene_without_truth_has_no_value_and_moves_none() -> None:
+def test_scene_without_ground_truth_has_no_value_and_affects_none() -> None:
     scored = {"a": score(INSTANCE, masks((0, True), (1, False))), "b": score(INSTANCE, masks((0, True)))}
     with_nothing = combine(INSTANCE, scored | {"c": score(INSTANCE, masks())})
     assert math.isnan(with_nothing.per_scene["c"]["AP"])
@@ -172,7 +172,7 @@ def test_a_scene_without_truth_has_no_value_and_moves_none() -> None:
     assert shown["per_class"][INSTANCE.scored[2].name]["AP"] is None
 
 
-def test_where_nothing_counts_the_numbers_are_undefined_and_have_no_interval() -> None:
+def test_values_without_any_counts_are_undefined_without_interval() -> None:
     result = combine(INSTANCE, {"a": score(INSTANCE, masks()), "b": score(INSTANCE, masks())})
     assert all(math.isnan(result.metrics[name]) for name in INSTANCE.headline)
     assert result.intervals == dict.fromkeys(INSTANCE.headline)
@@ -181,7 +181,7 @@ def test_where_nothing_counts_the_numbers_are_undefined_and_have_no_interval() -
     assert empty.intervals == {"mAcc": None, "F-mIoU": None}
 
 
-def test_an_undefined_scene_takes_no_part_in_an_interval() -> None:
+def test_undefined_scene_is_excluded_from_the_interval() -> None:
     rng = np.random.default_rng(1)
     scored = {
         f"s{k}": score(ROOM, confusion({A: {A: int(rng.integers(5, 30)), N: 10}, B: {B: 4, A: int(rng.integers(9))}}))
@@ -193,7 +193,7 @@ def test_an_undefined_scene_takes_no_part_in_an_interval() -> None:
     assert interval[0] < combine(ROOM, scored).metrics["mAcc"] < interval[1]
 
 
-def test_a_scene_that_moves_no_mean_takes_part_in_the_interval() -> None:
+def test_scene_that_does_not_change_the_mean_is_included_in_the_interval() -> None:
     rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
     scored = {str(n): score(ROOM, confusion({A: {A: n, N: 10 - n}})) for n in (4, 5, 6)}
     # 4.303, of Student's t with 2 degrees of freedom, times 0.1 / sqrt(3)
@@ -216,9 +216,9 @@ def test_a_scene_without_a_scored_point_has_no_f_miou_under_conceptgraphs_and_ad
 # ---- the column that ConceptGraphs slices away
 
 
-def test_what_is_called_a_class_without_points_is_sliced_away_from_the_pooled_rows_alone() -> None:
+def test_predictions_of_a_class_without_points_are_sliced_away_only_from_pooled_rows() -> None:
     # eval_replica_semseg.py keeps the rows and columns of classes with points over all scenes: of six points of A that
-    # are called C, which the truth has and no scored point, nothing is left; of a scene's own keep_index C is one
+    # are predicted as C, a true class without a scored point, nothing remains; a scene's own keep_index has C
     one = confusion({A: {A: 4, C: 6}, B: {B: 3, A: 1}}, present=[C])
     other = confusion({A: {A: 2}, B: {B: 1, N: 3}})
     result = combine(ROOM, {"a": score(ROOM, one), "b": score(ROOM, other)})
@@ -241,7 +241,7 @@ def test_values_over_drawn_scenes_slice_away_what_the_pooled_rows_do() -> None:
         assert_as_drawn(dict(found), of_drawn(ROOM, counts, drawn), ("mAcc", "mIoU", "F-mIoU"))
 
 
-def test_what_is_called_a_class_that_no_scene_has_stays_wrong() -> None:
+def test_prediction_of_a_class_absent_from_all_scenes_is_wrong() -> None:
     result = combine(ROOM, {"a": score(ROOM, confusion({A: {A: 4, C: 6}}))})
     assert result.pooled["mAcc"] == result.per_scene["a"]["mAcc"] == 0.4
 

@@ -1,4 +1,4 @@
-"""The example by hand in docs/numbers/from-map-to-metric.md is what the code computes, and its modules exist."""
+"""The hand-computed example in docs/numbers/from-map-to-metric.md equals the code, and its modules exist."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ def by_hand(threshold: float) -> Fraction:
     return sum((precision[n] * (around[n + 2] - around[n]) / 2 for n in taken), Fraction(0))
 
 
-def test_three_things_are_found() -> None:
+def test_three_instances_of_the_page_are_found() -> None:
     assert sorted(FOUND) == [(0.8, 0.6), (0.85, 0.0), (0.9, 1.0)]
 
 
 @pytest.mark.parametrize("threshold", [0.5, 0.6, 0.25])
-def test_the_area_by_hand_is_that_of_the_evaluator(threshold: float) -> None:
+def test_hand_computed_area_equals_the_evaluator(threshold: float) -> None:
     scores, is_true = np.array([one[0] for one in FOUND]), np.array([iou > threshold for _, iou in FOUND])
     assert average_precision(scores, is_true, N_CHAIRS - int(is_true.sum())) == pytest.approx(float(by_hand(threshold)))
 
 
-def test_the_fractions_of_the_page_are_those_of_its_sum() -> None:
+def test_fractions_on_the_page_add_up_to_its_sum() -> None:
     of_ap = [THRESHOLDS[column] for column in ap_columns(THRESHOLDS)]
     ap = sum(map(by_hand, of_ap), Fraction(0)) / len(of_ap)
     assert f"= {by_hand(0.5)} = {100 * float(by_hand(0.5)):.1f} %" in PAGE
     assert f"= {ap} = {100 * float(ap):.1f} %" in PAGE
     told = " / ".join(f"{50 * float(value):.1f}" for value in (ap, by_hand(0.5), by_hand(0.25)))
-    assert told in PAGE  # half of the chair's, the table's being 0
+    assert told in PAGE  # half of the chair's, because the table's is 0
 
 
-def test_every_module_that_the_page_names_is_there() -> None:
+def test_every_module_named_on_the_page_exists() -> None:
     way = PAGE.split("## Steps")[1].split("\n## ")[0]
     named = re.findall(r"`([a-z_]+/[a-z_/]*(?:\.py)?)`", way)
     assert len(named) >= 12

@@ -1,4 +1,4 @@
-"""What is exported and read back is what it was, and what a format cannot say is said."""
+"""Exported predictions survive a round trip, with remarks on what a format does not support."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 # ---- OpenLex3D
 
 
-def test_a_map_without_overlaps_comes_back_whole(tmp_path: Path) -> None:
+def test_map_without_overlaps_survives_a_round_trip(tmp_path: Path) -> None:
     made = a_map([[0, 2], [1, 3, 4], [5, 6, 7]])
     assert export.write_openlex(made, tmp_path / "s") == ()
     found = read_openlex(tmp_path / "s")
@@ -58,13 +58,13 @@ def test_a_map_without_overlaps_comes_back_whole(tmp_path: Path) -> None:
         assert (tmp_path / "s" / file).read_bytes() == (tmp_path / "t" / file).read_bytes()
 
 
-def test_shared_points_go_to_the_first_object_and_unowned_ones_nowhere(tmp_path: Path) -> None:
+def test_shared_points_are_assigned_to_the_first_object_and_unassigned_ones_omitted(tmp_path: Path) -> None:
     made = a_map([[0, 1, 2], [1, 2, 4], [2]])
     remarks = export.write_openlex(made, tmp_path / "s")
     assert remarks == (
-        "2 points are in several objects and went to the first of them",
-        "4 of 8 points are in no object and were left out",
-        "1 of 3 objects have no point left",
+        "2 points are in several objects and were assigned to the first",
+        "4 of 8 points are in no object and were omitted",
+        "1 of 3 objects have no points",
     )
     found = read_openlex(tmp_path / "s")
     np.testing.assert_array_equal(found.points, made.points[[0, 1, 2, 4]])
@@ -81,14 +81,14 @@ def test_every_point_of_an_object_is_exported_once_to_one_of_its_objects(members
     assert [min(k for k, one in enumerate(members) if point in one) for point in kept] == parts.index.tolist()
 
 
-def test_partitions_and_dense_maps_leave_out_what_has_no_object(tmp_path: Path) -> None:
+def test_partitions_and_dense_maps_omit_points_without_object(tmp_path: Path) -> None:
     points, features = RNG.normal(size=(4, 3)).astype(np.float32), RNG.normal(size=(2, 3)).astype(np.float32)
     remarks = export.write_openlex(Partition(points, np.array([1, -1, 0, 1], np.int32), features), tmp_path / "p")
-    assert remarks == ("1 of 4 points are in no object and were left out",)
+    assert remarks == ("1 of 4 points are in no object and were omitted",)
     assert read_openlex(tmp_path / "p").instance.tolist() == [1, 0, 1]
     rows = np.array([[1, 2], [0, 0], [3, 4], [0, -1]], np.float16)
     remarks = export.write_openlex(DenseFeatures(points, rows), tmp_path / "d")
-    assert remarks[1] == "1 of 4 points have no feature and were left out"
+    assert remarks[1] == "1 of 4 points have no feature and were omitted"
     found = read_openlex(tmp_path / "d")
     np.testing.assert_array_equal(found.points, points[[0, 2, 3]])
     assert found.instance.tolist() == [0, 1, 2]
@@ -99,16 +99,16 @@ def test_partitions_and_dense_maps_leave_out_what_has_no_object(tmp_path: Path) 
     ("content", "message"),
     [
         (a_map([[0]], features=None), "has no features, and OpenLex3D needs one for each object"),
-        (a_map([[], []]), "has no point in any object; there is nothing to export"),
+        (a_map([[], []]), "has no points in any object; there is nothing to export"),
         (a_map([[0]], points=np.full((8, 3), np.nan, np.float32)), "has points that are NaN or infinite"),
         (
             Partition(np.zeros((1, 3), np.float32), np.array([2], np.int32), np.ones((2, 2), np.float32)),
-            "needs one of its 2 rows of features for each point",
+            "needs one of its 2 rows of features per point",
         ),
-        (VertexLabels(np.zeros(3, np.int32)), "is over the points of the ground truth and brings no points"),
+        (VertexLabels(np.zeros(3, np.int32)), "is over the points of the ground truth and has no points"),
     ],
 )
-def test_what_openlex3d_cannot_hold_is_refused(content: Any, message: str) -> None:
+def test_maps_unsupported_by_openlex3d_are_refused(content: Any, message: str) -> None:
     with pytest.raises(PredictionError, match=message):
         export.openlex_parts(content)
 
@@ -116,7 +116,7 @@ def test_what_openlex3d_cannot_hold_is_refused(content: Any, message: str) -> No
 # ---- ScanNet
 
 
-def test_masks_labels_and_scores_come_back_to_the_last_bit(tmp_path: Path) -> None:
+def test_masks_labels_and_scores_survive_a_round_trip_in_every_bit(tmp_path: Path) -> None:
     scores = np.array([0.1 + 0.2, 1 / 3, 1e-17, 0.30000000000000004 + 1e-16])
     members = [np.array(one, np.int32) for one in ([0, 3], [1], [0, 1, 2, 3], [2, 4])]
     made = vertex_masks("x", members, 5, scores=scores, class_numbers=np.arange(1, 5, dtype=np.int32))
@@ -132,7 +132,7 @@ def test_masks_labels_and_scores_come_back_to_the_last_bit(tmp_path: Path) -> No
 
 
 def labelled_room() -> Instances:
-    """The truth of a room as a map on other points, with own labels and scores."""
+    """The ground truth of a room as a map on other points, with its own labels and scores."""
     truth = room()
     ids = np.unique(truth.instance[truth.instance > 0])
     name_of = {value: name for name, value in ID.items()}
@@ -142,7 +142,7 @@ def labelled_room() -> Instances:
     return a_map(members, len(points), points=points.astype(np.float32), labels=labels, features=None)
 
 
-def test_a_map_on_other_points_is_moved_to_the_vertices_and_scores_the_same(tmp_path: Path) -> None:
+def test_map_on_other_points_is_transferred_to_vertices_and_scores_equally(tmp_path: Path) -> None:
     truth, made = room(), labelled_room()
     export.write_scannet(export.masks_on_truth(made, RULES, truth, None), "living0", tmp_path)
     found = read_text(tmp_path, "living0")
@@ -158,7 +158,7 @@ def test_a_map_on_other_points_is_moved_to_the_vertices_and_scores_the_same(tmp_
     assert before == after and 0 < before["AP"] < 1
 
 
-def test_features_are_named_by_the_encoder_among_the_classes_of_the_protocol() -> None:
+def test_features_are_classified_by_the_encoder_among_the_protocols_classes() -> None:
     made = labelled_room()
     assert made.labels is not None
     featured = replace(made, labels=None, features=ENCODER.encode_texts(made.labels))
@@ -181,11 +181,11 @@ def test_a_partition_is_exported_with_scores_of_one_and_a_remark(tmp_path: Path)
     found = read_text(tmp_path, "living0")
     assert found.scores.tolist() == [1.0] * len(made)
     np.testing.assert_array_equal(found.indices, made.indices)
-    with pytest.raises(PredictionError, match="for each point, -1 for none"):
+    with pytest.raises(PredictionError, match="per point, -1 for none"):
         export.masks_on_truth(replace(partition, instance=owner + 100), RULES, truth, ENCODER)
 
 
-def test_positions_in_the_list_of_classes_become_class_ids() -> None:
+def test_class_list_indices_become_class_ids() -> None:
     n = len(room().points)
     members = [np.array([0, 1], np.int32)] * 3
     made = vertex_masks("x", members, n, class_numbers=np.array([0, 2, 10_000], np.int32), numbering="index")
@@ -193,7 +193,7 @@ def test_positions_in_the_list_of_classes_become_class_ids() -> None:
     assert labelled.class_ids.tolist() == [RULES.scored[0].id, RULES.scored[2].id, 0]
 
 
-def test_what_scannets_list_cannot_hold_is_refused() -> None:
+def test_predictions_unsupported_by_scannets_list_are_refused() -> None:
     dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 2), np.float16))
     for content in (dense, VertexLabels(np.zeros(3, np.int32))):
         with pytest.raises(PredictionError, match="has no masks"):
@@ -205,12 +205,12 @@ def test_what_scannets_list_cannot_hold_is_refused() -> None:
 
 
 @pytest.mark.parametrize("scene", ["", "..", "a/b", "a\nb", "-x", "/etc"])
-def test_a_scene_whose_name_leads_elsewhere_is_refused(scene: str, tmp_path: Path) -> None:
-    with pytest.raises(PredictionError, match="cannot be the name of a file"):
+def test_scene_name_outside_the_folder_is_refused(scene: str, tmp_path: Path) -> None:
+    with pytest.raises(PredictionError, match="is not a valid file name"):
         export.file_name(scene)
 
 
-def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_export_folder_is_written_atomically(tmp_path: Path) -> None:
     with export.whole_folder(tmp_path / "deep/out") as folder:
         (folder / "x").write_text("1")
         assert not (tmp_path / "deep/out").exists()

@@ -1,4 +1,4 @@
-"""OpenLex3D's text files: read as the original reads them, and one clear line for any that is damaged."""
+"""OpenLex3D's text files: read as in the original, and one clear line for any damaged file."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def written(tmp_path: Path) -> release.OpenLexFiles:
     return release.OpenLexFiles(tmp_path, "replica", "room0")
 
 
-# ---- what is read
+# ---- reading
 
 
 def test_the_three_files_of_a_scene_are_read(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_visible_point_far_from_every_corner_has_no_object(tmp_path: Path) -> 
     assert truth.object_of_point.tolist() == [7, -1]
 
 
-def test_the_corners_of_a_replica_mesh_keep_the_numbers_of_all_objects() -> None:
+def test_corners_of_a_replica_mesh_keep_all_object_numbers() -> None:
     vertices = np.arange(12, dtype=np.float32).reshape(4, 3)
     faces = ListColumn(np.array([0, 3, 6]), np.array([0, 1, 2, 1, 2, 3]))
     without_class = np.zeros(2, np.int32)
@@ -106,7 +106,7 @@ def test_the_corners_of_a_replica_mesh_keep_the_numbers_of_all_objects() -> None
     assert found.points[3].tolist() == vertices[1].tolist()
 
 
-# ---- what is refused
+# ---- errors
 
 Reader = Callable[[Path, str], object]
 
@@ -142,15 +142,13 @@ FAULTS = (
         '{"level0": {"a\\u001b[31m": 7}}',
         "level0.a\\x1b[31m: Input should be a valid list; found 7",
     ),
-    (release.read_queries, '{"level0": {"a": [7, 7]}}', "query 'a': an object stands there twice"),
+    (release.read_queries, '{"level0": {"a": [7, 7]}}', "query 'a': an object is listed twice"),
     (release.read_queries, '{"level0": {"a": [NaN]}}', "level0.a.0: Input should be a finite number; found nan"),
 )
 
 
 @pytest.mark.parametrize(("read", "content", "message"), FAULTS, ids=[fault[2] for fault in FAULTS])
-def test_a_file_that_cannot_be_used_is_told_in_one_line(
-    tmp_path: Path, read: Reader, content: str, message: str
-) -> None:
+def test_unusable_openlex3d_file_gives_one_line(tmp_path: Path, read: Reader, content: str, message: str) -> None:
     told = refusal(tmp_path, read, content)
     assert told.startswith(WHERE)
     assert message in told
@@ -158,7 +156,7 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
 
 
 @pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])
-def test_a_name_that_leaves_its_folder_is_refused(tmp_path: Path, name: str) -> None:
+def test_name_outside_its_folder_is_refused(tmp_path: Path, name: str) -> None:
     for dataset, scene in ((name, "room0"), ("replica", name)):
         with pytest.raises(DataError, match="is no name of a dataset or scene"):
             release.OpenLexFiles(tmp_path, dataset, scene)

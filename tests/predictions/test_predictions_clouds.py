@@ -1,4 +1,4 @@
-"""Predictions that bring their own points: what the programs write comes back, and hostile files do nothing."""
+"""Predictions with their own points: files of the programs are read, and malicious files have no effect."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def instances(prediction: ScenePrediction) -> Instances:
 
 
 @pytest.mark.parametrize("format", made.WITH_POINTS)
-def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: str) -> None:
+def test_each_cloud_format_is_recognized_uniquely_at_every_level(tmp_path: Path, format: str) -> None:
     folder = made.write_small(tmp_path, format)
     for path in (folder, folder / "room0"):
         assert [name for name in READERS if READERS[name].recognise(path) is not None] == [format]
@@ -46,8 +46,8 @@ def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: st
         assert all(remark == remark.strip() and "\n" not in remark for remark in prediction.remarks)
 
 
-@pytest.mark.parametrize("format", [name for name in made.WITH_POINTS if name != "esam"])  # which names nothing
-def test_the_truth_in_each_format_is_scored_as_perfect(
+@pytest.mark.parametrize("format", [name for name in made.WITH_POINTS if name != "esam"])  # which has no names
+def test_ground_truth_in_each_format_scores_perfectly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
@@ -103,8 +103,10 @@ def settings(monkeypatch: pytest.MonkeyPatch) -> Any:
     return made
 
 
-@pytest.mark.parametrize("protocol", range(2, 6))  # ConceptGraphs writes 4; before 2 objects were written otherwise
-def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
+@pytest.mark.parametrize("protocol", range(2, 6))  # ConceptGraphs writes 4; before 2 objects had another format
+def test_map_survives_a_round_trip_object_by_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int
+) -> None:
     value = made.a_map(cfg=settings(monkeypatch))
     made.write_map(tmp_path / "room0/pcd_saves/full_pcd_none_x.pkl.gz", value, protocol)
     prediction = read(tmp_path)
@@ -115,7 +117,7 @@ def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.M
         np.testing.assert_array_equal(found.points[found.mask(k)], one["pcd_np"].astype(np.float32))
     np.testing.assert_array_equal(found.features, np.stack([one["clip_ft"] for one in [*value["objects"], background]]))
     assert found.scores.tolist() == [1, 1, 1, 1]
-    assert found.names == ("couch", "lamp", "couch", "wall")  # the lowest of equals
+    assert found.names == ("couch", "lamp", "couch", "wall")  # the lowest on ties
     np.testing.assert_array_equal(found.boxes[0, 1], value["objects"][0]["pcd_np"].astype(np.float32).max(axis=0))
     assert not found.boxes[1].any() and not found.centroids[1].any()
     assert any("1 for every object" in remark for remark in prediction.remarks)
@@ -143,7 +145,7 @@ def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:
     assert "both of scene 'room0'" in message and "exps/again" in message and "exps/rerun" in message
 
 
-def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: Path) -> None:
+def test_names_of_detections_are_the_classes_without_features(tmp_path: Path) -> None:
     objects = [made.an_object(3, [1]), made.an_object(2, [0])]
     for one in objects:
         del one["clip_ft"]
@@ -155,7 +157,7 @@ def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: 
     assert any("the names of their detections decide" in remark for remark in prediction.remarks)
 
 
-def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path) -> None:
+def test_map_after_the_last_merging_is_read_of_two(tmp_path: Path) -> None:
     folder = tmp_path / "room0/pcd_saves"
     made.write_map(folder / "full_pcd_a.pkl.gz", made.a_map())
     made.write_map(folder / "full_pcd_a_post.pkl.gz", made.a_map(objects=[made.an_object(2, [0])]))
@@ -165,7 +167,7 @@ def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path
     assert len(instances(read(folder / "full_pcd_a.pkl.gz"))) == 4
     made.write_map(folder / "full_pcd_a_post2.pkl.gz", made.a_map())
     message = made.refused(tmp_path, "room0", "conceptgraphs")
-    assert "holds 3 maps (full_pcd_a.pkl.gz, full_pcd_a_post.pkl.gz, full_pcd_a_post2.pkl.gz)" in message
+    assert "contains 3 maps (full_pcd_a.pkl.gz, full_pcd_a_post.pkl.gz, full_pcd_a_post2.pkl.gz)" in message
 
 
 @pytest.mark.parametrize(
@@ -187,7 +189,7 @@ def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path
         ({"objects": [], "bg_objects": 5}, "'bg_objects' is 5; expected a list"),
     ],
 )
-def test_each_fault_of_a_map_is_one_line(tmp_path: Path, value: object, message: str) -> None:
+def test_each_invalid_conceptgraphs_map_is_one_line(tmp_path: Path, value: object, message: str) -> None:
     path = made.write_map(tmp_path / "pcd_x.pkl.gz", value)
     text = made.refused(path, "pcd_x", "conceptgraphs")
     assert text.startswith(f"{path}: ") and message in text
@@ -197,7 +199,7 @@ def test_each_fault_of_a_map_is_one_line(tmp_path: Path, value: object, message:
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32])
-def test_a_dense_map_comes_back(tmp_path: Path, kind: Any) -> None:
+def test_dense_map_survives_a_round_trip(tmp_path: Path, kind: Any) -> None:
     points, features = made.RNG.normal(size=(50, 3)).astype(np.float32), made.RNG.normal(size=(50, 8)).astype(kind)
     features[[3, 7]] = 0
     made.write_gradslam(tmp_path / "room0/saved-map/pointclouds", points, features)
@@ -209,18 +211,18 @@ def test_a_dense_map_comes_back(tmp_path: Path, kind: Any) -> None:
     assert any("first camera" in remark and "first_pose.txt" in remark for remark in prediction.remarks)
 
 
-def test_the_first_pose_beside_the_points_brings_them_to_the_world(tmp_path: Path) -> None:
+def test_first_pose_next_to_the_points_transforms_them_to_the_world(tmp_path: Path) -> None:
     made.write_gradslam(tmp_path / "room0", np.array([[1, 2, 3]], np.float32), np.ones((1, 4), np.float16))
     pose = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]], float)
     (tmp_path / "room0/traj.txt").write_text(" ".join(map(repr, pose.reshape(-1).tolist())) + "\nnext pose\n")
     prediction = read(tmp_path)
     assert prediction.content.points.tolist() == [[8, 21, 33]]  # type: ignore[union-attr]
-    assert prediction.remarks == ("points were brought to the world with the first pose of traj.txt",)
+    assert prediction.remarks == ("points were transformed to the world with the first pose of traj.txt",)
     (tmp_path / "room0/first_pose.txt").write_text("1 2 3\n")
     assert "first_pose.txt line 1 has 3 values; expected 16" in made.refused(tmp_path, "room0", "gradslam")
 
 
-def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
+def test_rows_outside_the_float16_range_have_no_feature(tmp_path: Path) -> None:
     features = np.ones((4, 2), np.float32)
     features[0, 0], features[1, 1], features[2, 0] = np.nan, np.inf, 1e6
     made.write_gradslam(tmp_path / "room0", np.zeros((4, 3), np.float32), features)
@@ -234,12 +236,12 @@ def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
     [
         (np.full((4, 3), np.nan), np.ones((4, 2)), "pc_points.h5: point 0 is at [nan, nan, nan]"),
         (np.zeros((4, 2)), np.ones((4, 2)), "pc_points.h5: has the shape (4, 2); expected (N, 3)"),
-        (np.zeros((4, 3)), np.ones((5, 2)), "pc_embeddings.h5: has other rows than pc_points.h5, which has 4"),
+        (np.zeros((4, 3)), np.ones((5, 2)), "pc_embeddings.h5: has other rows than pc_points.h5 (4)"),
         (np.zeros((4, 3)), np.ones(4), "pc_embeddings.h5: has the shape (4,); expected (N, D)"),
         (np.zeros((4, 3)), np.ones((4, 2), int), "pc_embeddings.h5: holds values of type int64"),
     ],
 )
-def test_each_fault_of_a_dense_map_is_one_line(tmp_path: Path, points: Any, features: Any, message: str) -> None:
+def test_each_invalid_dense_map_is_one_line(tmp_path: Path, points: Any, features: Any, message: str) -> None:
     made.write_gradslam(tmp_path / "room0", points, features)
     assert message in made.refused(tmp_path, "room0", "gradslam")
 
@@ -247,18 +249,18 @@ def test_each_fault_of_a_dense_map_is_one_line(tmp_path: Path, points: Any, feat
 # ---- HOV-SG
 
 
-def test_objects_come_back_with_the_row_of_their_number(tmp_path: Path) -> None:
+def test_objects_have_the_feature_row_of_their_number(tmp_path: Path) -> None:
     clouds = {k: made.RNG.normal(size=(k % 3 + 1, 3)) for k in range(12)}
-    features = made.RNG.normal(size=(12, 8))  # as HOV-SG saves them: doubles
+    features = made.RNG.normal(size=(12, 8))  # doubles, as saved by HOV-SG
     made.write_hovsg(tmp_path / "room0", clouds, features)
     found = instances(read(tmp_path))
-    assert found.ids.tolist() == list(range(12))  # 10 and 11 are not sorted as texts
+    assert found.ids.tolist() == list(range(12))  # 10 and 11 are not sorted as strings
     np.testing.assert_array_equal(found.features, features.astype(np.float32))
     for k, cloud in clouds.items():
         np.testing.assert_array_equal(found.points[found.mask(k)], cloud.astype(np.float32))
 
 
-def test_missing_numbers_leave_their_rows_out_and_lose_no_object(tmp_path: Path) -> None:
+def test_missing_numbers_skip_their_rows_and_lose_no_object(tmp_path: Path) -> None:
     features = made.RNG.normal(size=(6, 4)).astype(np.float16)
     made.write_hovsg(tmp_path / "room0", {k: np.full((1, 3), k) for k in (0, 2, 5)}, features)
     write_pcd_points(tmp_path / "room0/objects/pcd_3.pcd", np.full((2, 3), 3, np.float32))
@@ -271,13 +273,13 @@ def test_missing_numbers_leave_their_rows_out_and_lose_no_object(tmp_path: Path)
     assert "the original's loader would not read the last 1 objects (5)" in prediction.remarks
 
 
-def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
+def test_each_invalid_hovsg_map_is_one_line(tmp_path: Path) -> None:
     scene = tmp_path / "room0"
     made.write_hovsg(scene, {0: np.zeros((2, 3)), 4: np.zeros((1, 3))}, np.ones((3, 4), np.float32))
     assert "pcd_4.ply: object 4 has no feature, mask_feats.pt has 3 rows" in made.refused(tmp_path, "room0", "hovsg")
     (scene / "objects/pcd_4.ply").unlink()
     write_pcd_points(scene / "objects/pcd_0.pcd", np.zeros((1, 3), np.float32))
-    assert "object 0 is there as .ply and .pcd" in made.refused(tmp_path, "room0", "hovsg")
+    assert "object 0 exists as .ply and .pcd" in made.refused(tmp_path, "room0", "hovsg")
     (scene / "objects/pcd_0.pcd").unlink()
     made.write_object(scene / "objects/pcd_0.ply", [[0, 0, np.inf]])
     assert "pcd_0.ply: point 0 is at [0.0, 0.0, inf]" in made.refused(tmp_path, "room0", "hovsg")
@@ -291,7 +293,7 @@ def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cloud", ["point_cloud.pcd", "point_cloud.ply", "input.ply"])
-def test_the_three_files_come_back_as_a_partition(tmp_path: Path, cloud: str) -> None:
+def test_three_openlex3d_files_are_read_as_a_partition(tmp_path: Path, cloud: str) -> None:
     points, index, features = (
         made.RNG.normal(size=(9, 3)).astype(np.float32),
         np.arange(9) % 3,
@@ -305,12 +307,12 @@ def test_the_three_files_come_back_as_a_partition(tmp_path: Path, cloud: str) ->
     np.testing.assert_array_equal(prediction.content.features, features.astype(np.float32))
 
 
-def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path) -> None:
+def test_cloud_that_the_original_reads_is_used_of_several(tmp_path: Path) -> None:
     made.write_openlex(tmp_path / "room0", np.zeros((2, 3)), np.zeros(2, int), np.zeros((1, 4)), "input.ply")
     made.write_openlex(tmp_path / "room0", np.ones((2, 3)), np.zeros(2, int), np.zeros((1, 4)))
     prediction = read(tmp_path)
     assert prediction.content.points.all()  # type: ignore[union-attr]
-    assert prediction.remarks[0] == "point_cloud.pcd is read, as the original does, and not input.ply"
+    assert prediction.remarks[0] == "point_cloud.pcd is read, as in the original, and not input.ply"
     assert prediction.remarks[1] == "1 objects have no feature (a row of zeros or NaN)"
 
 
@@ -319,12 +321,12 @@ def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path
     [
         (np.array([0, -1]), np.ones((2, 4)), "index.npy: point 1 is of object -1, embeddings.npy has 2 rows"),
         (np.array([0, 2**63], np.uint64), np.ones((2, 4)), "point 1 is of object 9223372036854775808"),
-        (np.array([0, 1, 1]), np.ones((2, 4)), "expected an integer for each of the 2 points of point_cloud.pcd"),
+        (np.array([0, 1, 1]), np.ones((2, 4)), "expected one integer for each of the 2 points of point_cloud.pcd"),
         (np.array([0.0, 1.0]), np.ones((2, 4)), "holds an array of shape (2,) float64"),
         (np.array([0, 1]), np.ones(4), "embeddings.npy: holds an array of shape (4,)"),
         (np.array([0, 1]), np.array([[{}]]), "embeddings.npy: not a whole .npy array"),
     ],
 )
-def test_each_fault_of_the_three_files_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:
+def test_each_invalid_openlex3d_file_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:
     made.write_openlex(tmp_path / "room0", np.zeros((2, 3)), index, features)
     assert message in made.refused(tmp_path, "room0", "openlex3d")

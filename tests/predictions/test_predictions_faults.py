@@ -1,4 +1,4 @@
-"""What is wrong in predictions of other programs is one clear error, however they are damaged."""
+"""Any damage to predictions of other programs is one clear error."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ import pytest
 from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.store.predictions import prediction_arrays
 
-# ---- what is wrong in a text list
+# ---- errors in a text list
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         ("pred_mask/a.txt 5", ":1: 2 fields"),
-        ("pred_mask/a.txt five 0.5", "'five' is no class id"),
-        ("pred_mask/a.txt 5 nan", "confidence 'nan' is no finite number"),
-        ("../a.txt 5 0.5", "'../a.txt' is no path inside the folder"),
-        ("/etc/passwd 5 0.5", "'/etc/passwd' is no path inside the folder"),
+        ("pred_mask/a.txt five 0.5", "'five' is not a class id"),
+        ("pred_mask/a.txt 5 nan", "confidence 'nan' is not a finite number"),
+        ("../a.txt 5 0.5", "'../a.txt' is not a path inside the folder"),
+        ("/etc/passwd 5 0.5", "'/etc/passwd' is not a path inside the folder"),
         ("pred_mask/none.txt 5 0.5", "mask 'pred_mask/none.txt' does not exist"),
-        ("pred_mask/link.txt 5 0.5", "is no file inside the folder"),
-        ("links/a.txt 5 0.5", "is no file inside the folder"),
+        ("pred_mask/link.txt 5 0.5", "is not a file inside the folder"),
+        ("links/a.txt 5 0.5", "is not a file inside the folder"),
         ("loop 5 0.5", "mask 'loop' cannot be read"),
         ("\x1b[31m" + "x" * 9000 + " 5 0.5", "cannot be read"),
         ("pred_mask/short.txt 5 0.5", "is of 2 points and 'pred_mask/a.txt' of 3;"),
         ("pred_mask/word.txt 5 0.5", ":2: 'one' is not an integer"),
-        ("pred_mask/bad.json 5 0.5", "is not readable as JSON"),
+        ("pred_mask/bad.json 5 0.5", "is not valid JSON"),
         ("pred_mask/huge.json 5 0.5", "'length' is 1000000000000"),
         ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 on, of 3 points"),
     ],
 )
-def test_each_fault_of_a_list_is_one_line_with_its_place(tmp_path: Path, line: str, message: str) -> None:
+def test_each_invalid_mask_list_is_one_line_with_its_position(tmp_path: Path, line: str, message: str) -> None:
     folder = tmp_path / "predictions"
     (folder / "pred_mask").mkdir(parents=True)
     (tmp_path / "a.txt").write_text("1\n0\n1\n")
@@ -63,7 +63,7 @@ def test_each_fault_of_a_list_is_one_line_with_its_place(tmp_path: Path, line: s
     ("content", "message"),
     [("", "is empty"), ("3\nx\n", ":2: 'x' is not an integer"), ("1\n4294967296\n", ":2: 42949")],
 )
-def test_each_fault_of_labels_is_one_line(tmp_path: Path, content: str, message: str) -> None:
+def test_each_invalid_label_file_is_one_line(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "s.txt").write_text(content)
     assert message in made.refused(tmp_path, "s", "scannet-semantic-text")
 
@@ -86,7 +86,7 @@ MASKS = made.TOY["masks"].T
         ({"pred_masks": np.zeros((0, 200_000), bool)}, "200000 masks of 0 points; is it damaged?"),
     ],
 )
-def test_each_fault_of_an_archive_of_masks_is_one_line(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
+def test_each_invalid_mask_archive_is_one_line(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "s.npz", **arrays)
     text = made.refused(tmp_path, "s", "maskclustering")
     assert text.startswith(f"{tmp_path}/s.npz") and message in text
@@ -102,9 +102,9 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
         tmp_path, made.TOY["name"], "openmask3d"
     )
     made.write_torch(tmp_path / "c.pth", np.zeros((2, 2), np.int64))
-    assert "expected one group number a point" in made.refused(tmp_path, "c", "sam3d")
+    assert "expected one group number per point" in made.refused(tmp_path, "c", "sam3d")
     np.save(tmp_path / "d.npy", np.zeros(4))
-    assert "expected one group number a point" in made.refused(tmp_path, "d", "sam3d")
+    assert "expected one group number per point" in made.refused(tmp_path, "d", "sam3d")
     made.write_torch(tmp_path / "e.pt", made.Sparse(np.zeros((2, 0), np.int64), (5, 10**12)))
     assert "1000000000000 masks of 5 points" in made.refused(tmp_path, "e", "openins3d")
 
@@ -121,7 +121,7 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
         ({"boxes": None}, "lacks 'boxes'"),
     ],
 )
-def test_each_fault_of_our_own_file_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_each_invalid_prediction_file_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     arrays = {
         name: array
         for name, array in {**prediction_arrays(made.own_instances()), **changes}.items()

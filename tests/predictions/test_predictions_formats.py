@@ -1,4 +1,4 @@
-"""Predictions in the formats of other programs come back as they were written, and each is known as itself."""
+"""Predictions in the formats of other programs survive a round trip, and each format is recognized uniquely."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def assert_masks(content: VertexMasks, masks: Any, labels: Any = None, scores: A
         np.testing.assert_array_equal(content.class_numbers, labels)
 
 
-# ---- the reference cases in every format that can hold them
+# ---- the reference cases in every format that supports them
 
 
 @pytest.mark.parametrize("case", MASK_CASES)
-def test_reference_cases_come_back_from_scannets_text_files(tmp_path: Path, case: str) -> None:
+def test_reference_cases_survive_a_round_trip_through_scannet_text_files(tmp_path: Path, case: str) -> None:
     scenes = made.scenes_of(case)
     for scene in scenes:
         made.write_scannet_text(tmp_path, scene)
@@ -61,7 +61,7 @@ def test_reference_cases_come_back_from_scannets_text_files(tmp_path: Path, case
         lines = last_line_of_each_mask_file(scene["files"])
         first, last = [a for a, _ in lines], [b for _, b in lines]
         prediction = reader.read(tmp_path, scene["name"])
-        # Of two lines with one file the file itself is that of the last writer.
+        # With two lines for one file, the file itself is that of the last writer.
         assert_masks(masks_of(prediction), scene["masks"][last], scene["labels"][last], scene["scores"][last])
         assert masks_of(prediction).keys == tuple(scene["files"][line] for line in first)
         assert masks_of(prediction).numbering == "id"
@@ -69,7 +69,7 @@ def test_reference_cases_come_back_from_scannets_text_files(tmp_path: Path, case
 
 
 @pytest.mark.parametrize("case", MASK_CASES)
-def test_reference_cases_come_back_from_archives_of_masks(tmp_path: Path, case: str) -> None:
+def test_reference_cases_survive_a_round_trip_through_mask_archives(tmp_path: Path, case: str) -> None:
     for scene in made.scenes_of(case):
         masks, labels, scores = scene["masks"], scene["labels"], scene["scores"]
         made.write_maskclustering(tmp_path / "maskclustering", scene)
@@ -90,7 +90,7 @@ def test_reference_cases_come_back_from_archives_of_masks(tmp_path: Path, case: 
 
 
 @pytest.mark.parametrize("case", LABEL_CASES)
-def test_reference_cases_of_labels_come_back_from_text_files(tmp_path: Path, case: str) -> None:
+def test_reference_labels_survive_a_round_trip_through_text_files(tmp_path: Path, case: str) -> None:
     with np.load(CASES / f"{case}.npz") as archive:
         labels = {key: archive[key] for key in archive.files if key.startswith("pred_")}
     for key, values in labels.items():
@@ -102,7 +102,7 @@ def test_reference_cases_of_labels_come_back_from_text_files(tmp_path: Path, cas
         np.testing.assert_array_equal(prediction.content.class_ids, values)
 
 
-# ---- each format alone
+# ---- each format
 
 
 def test_a_folder_as_mask3d_and_segment3d_export_it_is_read(tmp_path: Path) -> None:
@@ -122,19 +122,19 @@ def test_masks_of_scannetpp_are_read_from_run_lengths(tmp_path: Path) -> None:
     assert_masks(masks_of(read(tmp_path, made.TOY["name"])), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"])
 
 
-def test_the_official_answer_in_the_folder_is_no_scene(tmp_path: Path) -> None:
+def test_official_result_file_in_the_folder_is_not_a_scene(tmp_path: Path) -> None:
     made.write_scannet_text(tmp_path, made.TOY)
     (tmp_path / "semantic_instance_evaluation.txt").write_text("class,class id,ap,ap50,ap25\n")
     assert list(recognise(tmp_path).scenes(tmp_path)) == ["scene0011_00"]
 
 
-def test_a_mask_file_named_twice_by_two_ways_is_one_mask(tmp_path: Path) -> None:
+def test_mask_file_listed_under_two_spellings_is_one_mask(tmp_path: Path) -> None:
     made.write_scannet_text(tmp_path, made.TOY)
     list_file = tmp_path / "scene0011_00.txt"
     list_file.write_text(list_file.read_text() + "pred_mask/../pred_mask/./scene0011_00_0.txt 3 0.125\n")
     prediction = read(tmp_path, "scene0011_00")
     assert_masks(masks_of(prediction), made.TOY["masks"], [3, 7, 39], [0.125, 0.25, 0.75])
-    assert prediction.remarks[0].startswith("1 lines name a mask file again: class and confidence of its last line")
+    assert prediction.remarks[0].startswith("1 lines repeat a mask file: class and confidence of its last line")
 
 
 def test_maskclustering_and_mask3d_name_the_scores_differently(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_maskclustering_and_mask3d_name_the_scores_differently(tmp_path: Path) -
         assert len(prediction.remarks) == remarks
 
 
-def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp_path: Path) -> None:
+def test_open3dis_tensors_have_masks_in_rows_unless_the_number_of_scores_differs(tmp_path: Path) -> None:
     made.write_open3dis(tmp_path, made.TOY, as_tensor=True)
     assert_masks(masks_of(read(tmp_path, made.TOY["name"])), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"])
     turned = {"ins": made.Tensor(made.TOY["masks"].T), "conf": made.Tensor(made.TOY["scores"])}
@@ -165,15 +165,15 @@ def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp
     assert_masks(masks_of(read(tmp_path, "alone")), made.TOY["masks"])
 
 
-def test_labelled_masks_of_openyolo3d_are_told_from_its_proposals(tmp_path: Path) -> None:
+def test_labelled_masks_of_openyolo3d_are_distinguished_from_proposals(tmp_path: Path) -> None:
     made.write_openyolo3d(tmp_path, made.TOY, has_labels=True)
     prediction = read(tmp_path, made.TOY["name"])
     assert prediction.format == "openyolo3d" and masks_of(prediction).numbering == "index"
     assert_masks(masks_of(prediction), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"].astype(np.float32))
-    assert prediction.remarks == ("Open-YOLO 3D's own evaluator puts 1 for every score",)
+    assert prediction.remarks == ("Open-YOLO 3D's own evaluator uses 1 for every score",)
 
 
-def test_scores_of_all_classes_that_open3dis_leaves_are_those_of_the_masks_own(tmp_path: Path) -> None:
+def test_open3dis_scores_of_all_classes_give_the_score_of_the_masks_class(tmp_path: Path) -> None:
     table = np.random.default_rng(2).random((3, 50))
     made.write_open3dis(tmp_path, made.TOY | {"scores": table.ravel()})
     own = table[np.arange(3), made.TOY["labels"]]
@@ -239,7 +239,7 @@ def test_colours_of_sam3d_are_groups_and_black_is_none(tmp_path: Path) -> None:
         read(tmp_path / "plain.ply", "plain", "sam3d-colours")
 
 
-def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
+def test_run_folders_and_prediction_files_are_read(tmp_path: Path) -> None:
     dense = DenseFeatures(np.zeros((4, 3), np.float32), np.ones((4, 8), np.float16))
     parts = Partition(np.zeros((4, 3), np.float32), np.zeros(4, np.int32), np.ones((1, 8), np.float32))
     contents: dict[str, Prediction] = {
@@ -266,7 +266,7 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
     for path, advice in ((tmp_path / "run", "/scenes/*/opensu3d"), (one.parent, "/opensu3d")):
         with pytest.raises(PredictionError) as caught:
             recognise(path).scenes(path)
-        assert "holds predictions of 2 methods (opensu3d, other)" in str(caught.value)
+        assert "contains predictions of 2 methods (opensu3d, other)" in str(caught.value)
         assert str(caught.value).endswith(f"give the folders of one: {path}{advice}")
 
 
@@ -274,7 +274,7 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("format", made.OURS)
-def test_each_format_is_recognised_as_itself_alone(tmp_path: Path, format: str) -> None:
+def test_each_format_is_recognized_uniquely(tmp_path: Path, format: str) -> None:
     folder = made.written_in(tmp_path, format)
     assert recognise(folder).name == format
     assert [name for name in READERS if READERS[name].recognise(folder) is not None] == [format]
@@ -283,12 +283,12 @@ def test_each_format_is_recognised_as_itself_alone(tmp_path: Path, format: str) 
     assert recognise(folder, format).name == format
 
 
-def test_a_path_in_no_format_or_in_two_is_an_error_that_says_so(tmp_path: Path) -> None:
+def test_path_in_no_format_or_in_two_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(PredictionError, match="no such file or folder"):
         recognise(tmp_path / "none")
     (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8")
     for path in (tmp_path, tmp_path / "photo.jpg"):
-        with pytest.raises(PredictionError, match="in none of the known formats"):
+        with pytest.raises(PredictionError, match="is in no known format"):
             recognise(path)
     made.write_scannet_text(tmp_path, made.TOY)
     made.write_maskclustering(tmp_path, made.TOY)
@@ -298,12 +298,12 @@ def test_a_path_in_no_format_or_in_two_is_an_error_that_says_so(tmp_path: Path) 
         recognise(tmp_path, "maskclusterin")
 
 
-# ---- integers a line
+# ---- one integer per line
 
 
 @settings(max_examples=300, deadline=None)
 @given(content=st.text("019-+ \n\r.x", max_size=12).map(str.encode))
-def test_integer_lines_refuse_what_python_refuses(content: bytes) -> None:
+def test_integer_lines_reject_what_python_rejects(content: bytes) -> None:
     try:
         expected: list[int] | None = [int(line) for line in content.splitlines()]
     except ValueError:
@@ -319,7 +319,7 @@ PAGE = (ROOT / "docs/evaluate.md").read_text(encoding="utf-8")
 SECTIONS = dict(re.findall(r"^### `([^`]+)`\n(.*?)(?=^### |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 
 
-def test_the_page_has_a_section_of_each_format_and_of_no_other() -> None:
+def test_docs_page_has_one_section_per_format() -> None:
     assert list(SECTIONS) == list(READERS)
 
 

@@ -1,8 +1,9 @@
-"""Maps of OVO, RayFronts, ESAM and OnlineAnySeg: what their own lines saved is read to the last value.
+"""Maps of OVO, RayFronts, ESAM and OnlineAnySeg: files saved by their own code are read to the last value.
 
-``tests/cases/online_maps`` was saved by the originals' own functions on made inputs: OVO at cf3b68e (``VanillaMapper``,
-``Instance3D``, ``save_dict_to_ckpt``; features in float32, float16 and bfloat16), RayFronts at cfa0e6a (``save`` of
-three maps), ESAM at 188fc6d (``mask_to_color``), OnlineAnySeg at 152466e (``export_instance_mask``); torch 2.13.0.
+``tests/cases/online_maps`` was saved by the originals' own functions on synthetic inputs: OVO at cf3b68e
+(``VanillaMapper``, ``Instance3D``, ``save_dict_to_ckpt``; features in float32, float16 and bfloat16), RayFronts at
+cfa0e6a (``save`` of three maps), ESAM at 188fc6d (``mask_to_color``), OnlineAnySeg at 152466e
+(``export_instance_mask``); torch 2.13.0.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def expected() -> dict[str, Any]:
 
 
 def copied(tmp_path: Path, **names: str) -> Path:
-    """A folder ``room0`` with the saved files under the names that they have in a result."""
+    """A folder ``room0`` with the saved files, named as in a result."""
     folder = tmp_path / "room0"
     folder.mkdir()
     for name in names.values():
@@ -42,7 +43,7 @@ def read(path: Path, scene: str = "room0") -> Any:
     return recognise(path).read(path, scene).content
 
 
-# ---- what the originals wrote
+# ---- files of the originals
 
 
 def test_a_map_of_ovo_has_the_object_of_each_point_and_its_feature(tmp_path: Path) -> None:
@@ -55,7 +56,7 @@ def test_a_map_of_ovo_has_the_object_of_each_point_and_its_feature(tmp_path: Pat
 
 
 @pytest.mark.parametrize(("file", "name"), [("semantic_voxel_map.pt", "voxels"), ("semantic_point_cloud.pt", "points")])
-def test_both_maps_of_rayfronts_that_can_be_saved_are_features_of_places(tmp_path: Path, file: str, name: str) -> None:
+def test_both_saved_rayfronts_maps_are_read_as_dense_features(tmp_path: Path, file: str, name: str) -> None:
     shutil.copy(FILES / file, tmp_path / "room0.pt")
     content, known = read(tmp_path), expected()
     assert isinstance(content, DenseFeatures)
@@ -63,7 +64,7 @@ def test_both_maps_of_rayfronts_that_can_be_saved_are_features_of_places(tmp_pat
     np.testing.assert_array_equal(content.features, known[f"{name}_feat"].astype(np.float16))
 
 
-def test_masks_of_onlineanyseg_lie_on_its_own_points_with_a_feature_each(tmp_path: Path) -> None:
+def test_onlineanyseg_masks_have_their_own_points_and_features(tmp_path: Path) -> None:
     folder, known = copied(tmp_path, masks="ckpt_final.npz"), expected()
     points = np.random.default_rng(0).normal(size=(30, 3))
     made.write_object(folder / "final.ply", points)
@@ -79,16 +80,16 @@ def test_colours_of_esam_are_masks_and_grey_is_none(tmp_path: Path) -> None:
     content = read(copied(tmp_path, points="points.npy", colours="points_color.npy"))
     assert isinstance(content, Instances)
     masks = expected()["esam_masks"]
-    first = np.where(masks.any(0), masks.argmax(0), -1)  # of masks that share a point the original draws the first
+    first = np.where(masks.any(0), masks.argmax(0), -1)  # the original draws the first of masks that share a point
     np.testing.assert_array_equal(content.points, np.load(FILES / "points.npy").reshape(-1, 3))
     found = {tuple(members.tolist()) for members in content.sets()}
     assert found == {tuple(np.flatnonzero(first == k).tolist()) for k in range(len(masks)) if (first == k).any()}
 
 
-# ---- forms and faults
+# ---- variants and errors
 
 
-def test_caches_of_an_evaluation_are_read_by_the_folder_of_the_scene(tmp_path: Path) -> None:
+def test_evaluation_caches_are_read_by_scene_folder(tmp_path: Path) -> None:
     value = {"feats_xyz": POINTS, "feats_feats": np.ones((6, 4), np.float32)}
     for scene in ("office0", "room0"):
         made.write_torch(tmp_path / "SemSegReplica" / scene / "map.pt", made.tensors(value))
@@ -100,7 +101,7 @@ def test_caches_of_an_evaluation_are_read_by_the_folder_of_the_scene(tmp_path: P
         assert len(read(path).points) == 6
 
 
-def test_a_map_of_ovo_as_an_archive_or_with_gaussians_is_read_too(tmp_path: Path) -> None:
+def test_ovo_map_as_an_archive_or_with_gaussians_is_read(tmp_path: Path) -> None:
     made.write_ovo(tmp_path / "room0", POINTS, [2, 2, 7, -1, 7, 7], {7: ROW, 2: 2 * ROW}, is_stream=False)
     content = read(tmp_path)
     np.testing.assert_array_equal(content.instance, [1, 1, 0, -1, 0, 0])
@@ -111,12 +112,12 @@ def test_a_map_of_ovo_as_an_archive_or_with_gaussians_is_read_too(tmp_path: Path
     assert (content.instance == -1).all() and len(content.features) == 0
 
 
-def test_objects_of_ovo_without_points_or_features_are_told(tmp_path: Path) -> None:
+def test_ovo_objects_without_points_or_features_give_a_remark(tmp_path: Path) -> None:
     made.write_ovo(tmp_path / "room0", POINTS, [0] * 6, {0: ROW, 3: None})
     prediction = recognise(tmp_path).read(tmp_path, "room0")
     assert prediction.remarks == (
         "1 objects have no feature (a row of zeros or NaN)",
-        "1 of 2 objects have no point left",
+        "1 of 2 objects have no points",
     )
 
 
@@ -129,7 +130,7 @@ def test_objects_of_ovo_without_points_or_features_are_told(tmp_path: Path) -> N
         ([0] * 6, {0: np.ones((2, 2), np.float32)}, "the feature of object 0 is an array of shape (2, 2) float32"),
     ],
 )
-def test_each_fault_of_a_map_of_ovo_is_one_line(
+def test_each_invalid_ovo_map_is_one_line(
     tmp_path: Path, ids: list[int], features: dict[int, Any], message: str
 ) -> None:
     made.write_ovo(tmp_path / "room0", POINTS, ids, features)
@@ -141,19 +142,19 @@ def test_each_fault_of_a_map_of_ovo_is_one_line(
     [
         ({"feats_xyz": POINTS}, "holds feats_xyz; expected a map of RayFronts, such as map.pt"),
         ({"feats_xyz": None, "feats_feats": None}, "the points are a NoneType"),
-        ({"feats_xyz": POINTS, "feats_feats": np.ones((5, 4), np.float32)}, "6 places, but the features are"),
+        ({"feats_xyz": POINTS, "feats_feats": np.ones((5, 4), np.float32)}, "6 positions, but the features are"),
         ({"global_vox_xyz": POINTS, "global_vox_rgb_feat_conf": np.ones((6, 4), np.float32)}, "(6, 0) float32; expect"),
         ({"global_xyz_pc": [], "global_feat_pc": []}, "holds no cloud"),
         ({"global_xyz_pc": [POINTS], "global_feat_pc": [POINTS[:, :2], POINTS]}, "expected tables of one width"),
     ],
 )
-def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
+def test_each_invalid_rayfronts_map_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
     made.write_torch(tmp_path / "room0.pt", made.tensors(value))
     assert message in made.refused(tmp_path, "room0", "rayfronts")
 
 
-def test_objects_and_clouds_that_share_one_table_are_refused(tmp_path: Path) -> None:
-    """A reference costs a few bytes of the file, what it stands for memory each time."""
+def test_objects_and_clouds_sharing_one_array_are_refused(tmp_path: Path) -> None:
+    """A reference takes a few bytes in the file, but its target takes memory each time."""
     n, wide = 5_000, made.Tensor(np.ones(100_000, np.float16))
     cloud = made.tensors({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
     objects = {"ins_3d_ids": np.arange(n)} | {f"ins3d_{k}_clip_feature": wide for k in range(n)}
@@ -164,7 +165,7 @@ def test_objects_and_clouds_that_share_one_table_are_refused(tmp_path: Path) -> 
     assert "unpacks to more than" in made.refused(tmp_path / "room0.pt", "room0", "rayfronts")
 
 
-def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Path) -> None:
+def test_each_invalid_esam_or_onlineanyseg_result_is_one_line(tmp_path: Path) -> None:
     made.write_esam(tmp_path / "room0", POINTS, [0, 1, 0, 1, -1, 0])
     colours = np.load(tmp_path / "room0/points_color.npy")
     for wrong, message in (

@@ -1,4 +1,4 @@
-"""Submissions of ScanNet++: recognised, read, written and read back; what is damaged is told in one line."""
+"""Submissions of ScanNet++: recognized, read, written and read back; one line for damaged files."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def test_ranked_classes_are_recognised_by_their_commas(text: str, rows: list[lis
     [
         ("1,2,3\n1,2\n", ":2: has 2 classes; expected one in every line, or 3 in each"),
         ("1,2,3\n1,x,3\n", ":2: 'x' is not an integer"),
-        ("1,2,3\n1,-1,3\n", ":2: 1,-1,3 is no place in a list of classes; they count from 0"),
-        ("1,2,99999999999\n", ":1: 1,2,99999999999 is no place in a list"),
-        ("", "is empty; expected one or three classes a line"),
+        ("1,2,3\n1,-1,3\n", ":2: 1,-1,3 is not a class index (0-based)"),
+        ("1,2,99999999999\n", ":1: 1,2,99999999999 is not a class index"),
+        ("", "is empty; expected one or three classes per line"),
     ],
 )
-def test_what_is_no_line_of_classes_is_named(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_class_line_is_named(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "0a7cc12c0e.txt").write_text(text)
     with pytest.raises(PredictionError) as raised:
         READERS["scannetpp-semantic"].read(tmp_path, "0a7cc12c0e")
@@ -89,7 +89,7 @@ def test_what_is_no_line_of_classes_is_named(text: str, message: str, tmp_path: 
 
 @given(members=st.sets(st.integers(0, 40)))
 @settings(max_examples=100, deadline=None)
-def test_runs_come_back_as_the_points_that_they_were(members: set[int]) -> None:
+def test_run_lengths_survive_a_round_trip(members: set[int]) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -100,7 +100,7 @@ def test_runs_come_back_as_the_points_that_they_were(members: set[int]) -> None:
         assert content.n_points == 41 and content.mask(0).tolist() == sorted(members)
 
 
-def test_a_map_is_written_with_the_places_of_its_classes_and_read_back(tmp_path: Path) -> None:
+def test_map_is_written_with_class_indices_and_read_back(tmp_path: Path) -> None:
     truth = room_truth()
     made = instances(
         truth.points,
@@ -123,15 +123,15 @@ def test_a_map_is_written_with_the_places_of_its_classes_and_read_back(tmp_path:
         assert (tmp_path / "s" / file).read_bytes() == (tmp_path / "t" / file).read_bytes()
 
 
-def test_confidences_that_the_benchmark_refuses_become_ranks_and_it_is_said(tmp_path: Path) -> None:
+def test_confidences_that_the_benchmark_rejects_become_ranks_with_a_remark(tmp_path: Path) -> None:
     masks = vertex_masks("x", [np.array([k], np.int32) for k in range(3)], 3, class_numbers=np.zeros(3, np.int32))
     labelled = export.LabelledMasks(masks, 3, np.full(3, 1), np.array([7.0, -2.0, 7.0]))
     remarks = export.write_scannetpp(labelled, None, "s", tmp_path)
-    assert "as their ranks" in remarks[0]
+    assert "as ranks divided by their number" in remarks[0]
     assert [line.split()[-1] for line in (tmp_path / "s.txt").read_text().splitlines()] == ["1.0", "0.5", "1.0"]
 
 
-def test_the_three_likeliest_classes_of_every_vertex_are_written_and_read_back(tmp_path: Path) -> None:
+def test_three_most_likely_classes_per_vertex_are_written_and_read_back(tmp_path: Path) -> None:
     truth = room_truth()
     features = np.stack([ENCODER.feature(f"a {LABELS.name_of(int(one))} in a scene") for one in truth.semantic])
     features += 0.5 * ENCODER.feature("a sofa in a scene") + 0.25 * ENCODER.feature("a plate in a scene")
@@ -145,7 +145,7 @@ def test_the_three_likeliest_classes_of_every_vertex_are_written_and_read_back(t
     assert (tmp_path / "again.txt").read_bytes() == (tmp_path / "room.txt").read_bytes()
 
 
-def test_one_class_a_vertex_is_written_as_one_and_none_at_all_is_refused(tmp_path: Path) -> None:
+def test_one_class_per_vertex_is_written_and_none_is_refused(tmp_path: Path) -> None:
     truth = room_truth()
     labels = VertexLabels(truth.semantic)
     export.write_scannetpp_labels(labels, TOP_K, truth, None, "room", tmp_path)
@@ -155,7 +155,7 @@ def test_one_class_a_vertex_is_written_as_one_and_none_at_all_is_refused(tmp_pat
         export.write_scannetpp_labels(unknown, TOP_K, truth, None, "room", tmp_path)
 
 
-def test_ranked_labels_are_kept_in_a_run_as_they_are(tmp_path: Path) -> None:
+def test_ranked_labels_are_stored_unchanged_in_a_run(tmp_path: Path) -> None:
     made = VertexLabels(np.array([1, 2], np.int32), np.array([[0, 3], [4, 5]], np.int32), "line")
     write_content(tmp_path / "prediction.npz", made)
     found = read_stored(tmp_path / "prediction.npz")

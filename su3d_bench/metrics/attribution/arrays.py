@@ -1,7 +1,7 @@
-"""What a protocol's evaluator sees of a scene, as plain arrays: the masks with their classes, or the scored points.
+"""The inputs of a protocol's evaluator for one scene as arrays: masks with their classes, or the scored points.
 
-They are those that scoring itself counts; whoever uses them compares the counts with those stored. ``EXPLAINED`` is
-the one table of the kinds of protocols whose errors can be told apart.
+They are the same as in scoring; callers compare the counts with the stored ones. ``EXPLAINED`` lists the kinds of
+protocols whose errors can be attributed.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from su3d_bench.metrics.semantic.score import SemanticMetric, call_points, trans
 class SingleError:
     """An error with its ``gains`` in the headline metrics, as fractions.
 
-    ``true`` and ``called`` are class ids of masks and class indices of points, each once, the first the one that the
-    error is told by; ``masks`` are rows of the prediction. ``score`` is the confidence of the first mask, ``iou`` that
-    of mask and instance, or the highest where one of them is wanting; both are None of points. ``predicted`` are the
-    points of each mask, or the wrong ones, ``truth`` those of each instance.
+    ``true`` and ``called`` are class ids for masks and class indices for points, without repeats, first the one that
+    identifies the error; ``masks`` are rows of the prediction. ``score`` is the confidence of the first mask, ``iou``
+    that of mask and instance, or the highest if one of them is missing; both are None for points. ``predicted`` are the
+    points of each mask, or the wrong points, ``truth`` those of each instance.
     """
 
     kind: str
@@ -59,7 +59,7 @@ class SingleError:
 
 
 class Pool(Generic[C]):
-    """The counts of all scenes under a protocol, of which those of one scene are to change."""
+    """The counts of all scenes under a protocol, in which those of one scene can be replaced."""
 
     def __init__(self, metric: Metric[C], mine: C, others: Sequence[C]) -> None:
         self.metric, self.mine, self._others = metric, mine, others
@@ -67,33 +67,33 @@ class Pool(Generic[C]):
         self.before = self.values(mine)
 
     def values(self, mine: C) -> Values:
-        """The headline metrics with those counts of the scene: over all scenes, or of the scene alone where the
-        protocol reports the mean over scenes."""
+        """The headline metrics with counts ``mine`` for the scene: over all scenes, or of this scene if the protocol
+        reports the mean over scenes."""
         found = self.metric.combine([mine, *self.others])
         return {name: found[name] for name in self.metric.rules.headline}
 
     @cached_property
     def others(self) -> Sequence[C]:
-        """What joins the counts of the scene before ratios are formed: those of all other scenes as one, or nothing."""
+        """The counts pooled with those of the scene: all other scenes joined into one, or nothing."""
         return [type(self.mine).joined(self._others)] if self.is_pooled and self._others else []
 
     @cached_property
     def _n_scenes(self) -> Mapping[str, int]:
-        """Of how many scenes each metric is the mean."""
+        """The number of scenes that each metric is averaged over."""
         if self.is_pooled:
             return dict.fromkeys(self.before, 1)
         rows = [*self.metric.combine_each(self._others), self.before] if self._others else [self.before]
         return {name: max(1, sum(not np.isnan(row[name]) for row in rows)) for name in self.before}
 
     def gains(self, after: Values) -> Values:
-        """What the reported metrics gain where those of ``values`` become ``after``."""
+        """The gain of each reported metric if the values change from ``before`` to ``after``."""
         return {name: (after[name] - value) / self._n_scenes[name] for name, value in self.before.items()}
 
 
 def single_mask_errors(
     truth: Int64Array, overlaps: Overlaps, rules: ScoringRules, pool: Pool[InstanceCounts]
 ) -> list[SingleError]:
-    """The errors of the masks of a scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
+    """The errors of the masks of a scene; ``truth`` (N,) is label * 1000 + instance, 0 if void."""
     errors = find_errors(overlaps)
     corrected = _CorrectedClasses(truth, overlaps, rules)
     classes = [corrected.of_error(error) for error in errors]
@@ -102,7 +102,7 @@ def single_mask_errors(
 
 
 class _CorrectedClasses:
-    """The counts of the classes of a scene that one error moves: masks of other classes are as they were."""
+    """The counts of the classes of a scene that one error affects; masks of other classes do not change."""
 
     def __init__(self, truth: Int64Array, overlaps: Overlaps, rules: ScoringRules) -> None:
         self._overlaps, self._rules = overlaps, rules
@@ -113,7 +113,7 @@ class _CorrectedClasses:
         )
 
     def of_error(self, error: MaskError) -> dict[int, InstanceCounts]:
-        """The counts of each class that mending ``error`` moves, by its place among the scored ones."""
+        """The counts of each class that correcting ``error`` affects, by its index among the scored classes."""
         rules, predicted = self._rules, self._overlaps.predicted
         repair = repaired(self._overlaps, [error])
         touched, shared, size = repair.is_changed, self._shared, predicted.masks.sizes
@@ -150,7 +150,7 @@ class _CorrectedClasses:
 
 
 def _values_after(pool: Pool[InstanceCounts], corrected: Sequence[Mapping[int, InstanceCounts]]) -> Iterator[Values]:
-    """The metrics after each mending: the curves of the classes that it moves are formed again, the others stay."""
+    """The metrics after each correction: only the curves of the affected classes are computed again."""
     thresholds = pool.metric.rules.thresholds
     before = instance_ap.combine([pool.mine, *pool.others], thresholds).table
     others: dict[int, list[InstanceCounts]] = {}
@@ -175,7 +175,7 @@ def _single_error(error: MaskError, overlaps: Overlaps, gains: Values) -> Single
     predicted = overlaps.predicted
     first = error.masks[0] if error.masks else None
     score = None if first is None else float(predicted.scores[first])
-    # a split object is told by all its parts, a repeated one by the mask that repeats
+    # a split object is shown with all its parts, a duplicate with the repeated mask only
     shown = error.masks if error.kind == "split" else error.masks[:1]
     of_masks = tuple(predicted.masks.mask(k) for k in shown)
     of_truth = tuple(overlaps.members[g] for g in error.instances)
@@ -191,7 +191,7 @@ def _single_error(error: MaskError, overlaps: Overlaps, gains: Values) -> Single
 def single_point_errors(
     points: LabelledPoints, is_counted: BoolArray, pool: Pool[SemanticCounts], *, has_masks: bool, most: int
 ) -> tuple[int, list[SingleError]]:
-    """How many errors the points of a scene have, and the ``most`` that cost most of the first headline metric."""
+    """The number of errors of a scene's points, and the ``most`` that cost most of the first headline metric."""
     cause = causes_of(points, has_masks=has_masks)
     wrong = np.flatnonzero((cause >= 0) & is_counted[points.true_class])
     n_classes = len(is_counted)
@@ -235,7 +235,7 @@ NO_CLASS = "none"
 def scored_masks(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
 ) -> tuple[Int64Array, LabelledMasks, ScoringRules]:
-    """The truth (N,) as label * 1000 + instance, and the masks on its points, under a protocol of kind ``instance``."""
+    """Ground truth (N,) as label * 1000 + instance, and the masks on its points (kind ``instance``)."""
     assert rules.min_region_size is not None
     scored = masks_on_truth(rules, truth, prediction, encoder)
     masks = LabelledMasks(scored.masks, scored.labels.astype(np.int64), scored.scores)
@@ -260,15 +260,15 @@ class ScoredPoints:
 def scored_points(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
 ) -> ScoredPoints:
-    """What each evaluation point is, is called, and by which mask.
+    """The true and predicted class of each evaluation point, and the mask that gave it.
 
-    Where several neighbours vote, the mask is the one that most of them belong to.
+    If several neighbours vote, the mask is the one that most of them belong to.
     """
     called = call_points(rules, truth, prediction, encoder)
     mask = called.mask
     if mask is None:
         mask, _ = transfer_votes(rules, prediction, called.classes, called.targets, called.is_wanted, of_masks=True)
-    # a mask is part of the map: only beyond it can more of the map be nearer
+    # masks are part of the map: only points far from any mask can be nearer to another part of it
     map_distance_m = called.distance_m.copy()
     far = np.flatnonzero(called.is_wanted & (called.distance_m > corrections.NEAR_M))
     map_distance_m[far], _ = transfer.nearest(prediction.points, called.targets[far], corrections.NEAR_M)
@@ -285,7 +285,7 @@ def scored_points(
 
 
 def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
-    """One number an object: its instance, or where there is none one for all of its class."""
+    """One number per object: its instance, or one for all points of its class if there is no instance."""
     instance = truth.instance.astype(np.int64)
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
 
@@ -295,9 +295,9 @@ Errors = tuple[int, Sequence[SingleError]]
 
 
 class SceneOfMasks:
-    """A scene as an evaluator of masks sees it; ``evaluated``: the truth's values, the masks and the rules.
+    """The evaluator's view of a scene with masks; ``evaluated``: ground-truth values, masks and rules.
 
-    ``points`` (N, 3) are those that errors are told of, ``instance`` (N,) the truth's at each, 0 for none.
+    ``points`` (N, 3) are those that errors refer to, ``instance`` (N,) the true instance of each, 0 for none.
     """
 
     def __init__(
@@ -323,9 +323,9 @@ class SceneOfMasks:
         return replace(corrected, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
-        """How many errors the scene has, and the ``most`` that cost most, the dearest first.
+        """The number of errors of the scene, and the ``most`` that cost most, the most costly first.
 
-        ``counts`` of the protocol's kind are its own as they are, ``others`` those of the other scenes.
+        ``counts`` are the stored ones of this scene, ``others`` those of the other scenes.
         """
         pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others)
         found = single_mask_errors(self._values, self.overlaps, self._scoring, pool)
@@ -333,12 +333,12 @@ class SceneOfMasks:
         return len(found), sorted(found, key=lambda error: -error.gains[first])[:most]
 
     def class_name(self, number: int) -> str:
-        """What a class of an error is called."""
+        """The name of a class of an error."""
         return self._names.get(number, NO_CLASS) if self._has_classes else "object"
 
 
 class SceneOfPoints:
-    """A scene as an evaluator of points sees it; ``scored`` are the points that count."""
+    """The evaluator's view of a scene with points; ``scored`` are the points that count."""
 
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
@@ -363,7 +363,7 @@ class SceneOfPoints:
 
 
 EvaluatedScene = SceneOfMasks | SceneOfPoints
-# Of each kind the causes of its errors, and what looks at a scene.
+# For each kind of protocol: the causes of its errors, and the class that reads a scene.
 Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], EvaluatedScene]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
     "instance": (corrections.KINDS, SceneOfMasks),

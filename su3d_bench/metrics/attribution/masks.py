@@ -1,37 +1,36 @@
-"""Where the points of an AP are lost: six kinds of error, each with the gain in AP when it alone is corrected.
+"""Error attribution for AP: six kinds of error, each with the gain in AP when only that kind is corrected.
 
 In the spirit of TIDE (Bolya et al., ECCV 2020), for masks on points and the ScanNet AP. Nothing is estimated: a
-mending turns the predictions into others, which are scored anew by the same evaluator. *Counted* instances are those
-of scored classes with at least the minimum size; predictions of any class, and of none, may be the cause of an error.
+correction changes the predictions, and the same evaluator scores them again. *Counted* instances are those of scored
+classes with at least the minimum size; predictions of any class, or without a class, may cause an error.
 
-A mask *lies in* an instance that has more than half of its points, and *holds* an instance of which it has more than
-half. A mask *matches* an instance at IoU above 0.5, so at most one. The kinds:
+A mask *lies in* an instance that has more than half of the mask's points, and *holds* an instance if it has more than
+half of the instance's points. A mask *matches* an instance at IoU above 0.5, so at most one. The kinds:
 
 - ``merged`` (over-merge): a mask that holds several instances, and whose label is that of one of them or of the one
-  it lies in. Mended: it is cut. Each instance that it holds becomes a mask with the class of that instance and the
-  same confidence, except the one that has most points of the mask: what is left goes with it, and takes its class if
-  it then matches. Pieces of instances that a mask finds (matches with the right class) already are dropped.
+  it lies in. Correction: the mask is cut. Each instance that it holds becomes a mask with the class of that instance
+  and the same confidence, except the one with most points of the mask: it gets the remaining points too, and its class
+  if it then matches. Pieces of instances that a mask already finds (matches with the right class) are dropped.
 - ``split`` (under-merge): an instance with at least two parts, which no merged mask finds. Its parts are taken from
   the masks that lie in it and are not merged: first the match with the right class and the highest IoU, then other
-  matches, then by points in common; a further mask is a part where less than half of it is in the parts before, and
-  it raises the IoU of their union. The union must match, and the class of the first part if that matches, else the
-  class with most points among the parts, must be right. Mended: the parts become one mask of that class, with the
-  highest confidence that a part of it has.
+  matches, then by points in common; a further mask is a part if less than half of it is in the previous parts and it
+  raises the IoU of their union. The union must match, and the class (of the first part if that matches, otherwise the
+  one with most points among the parts) must be right. Correction: the parts become one mask of that class, with the
+  highest confidence of any part.
 - ``duplicate``: a mask of at least the minimum size and of a scored class that lies in an instance and has at least
-  half of itself in the parts before. Mended: it is dropped; the first part takes its confidence where that is higher
-  and the class the same, as the evaluator itself does.
+  half of itself in the previous parts. Correction: it is dropped; the first part takes its confidence if that is higher
+  and the class is the same, as in the evaluator itself.
 - ``mislabelled``: the first part of an instance matches it and has another class, and no mask finds the instance.
-  Mended: it gets the right class.
+  Correction: it gets the right class.
 - ``background``: a mask of at least the minimum size and of a scored class that lies in no counted instance, holds
-  none, and of which too little is void for the evaluator to ignore it at all thresholds. Mended: it is dropped.
-- ``missed``: no mask of at least the minimum size lies in the instance or holds it, and it is not split. Mended:
-  its exact mask is added, with the right class and the highest confidence of the scene (1 where there is none).
+  none, and has too few void points for the evaluator to ignore it at all thresholds. Correction: it is dropped.
+- ``missed``: no mask of at least the minimum size lies in the instance or holds it, and it is not split. Correction:
+  its exact mask is added, with the right class and the highest confidence of the scene (1 if there are no masks).
 
-Sum rules: ``AP + sum of gains + overlap + rest = 1``. ``rest`` is 1 less the AP with all six corrected, one after the
-other in the order merged, split, duplicate, mislabelled, background, missed: masks that fit their one instance badly,
-and those that are wrong in mask and label at once. ``overlap`` is what all mendings give together beyond the sum of
-what each gives alone. A gain in AP is below 0 where a corrected mask is still too poor for the
-higher thresholds.
+Sum rules: ``AP + sum of gains + overlap + rest = 1``. ``rest`` is 1 minus the AP with all six kinds corrected, in the
+order merged, split, duplicate, mislabelled, background, missed: masks that fit their one instance badly, and masks
+that are wrong in both shape and label. ``overlap`` is the gain of all corrections together minus the sum of their
+separate gains. A gain in AP is below 0 if a corrected mask is still too poor for the higher thresholds.
 """
 
 from __future__ import annotations
@@ -63,10 +62,10 @@ KINDS = ("merged", "split", "duplicate", "mislabelled", "background", "missed")
 
 @dataclass(frozen=True)
 class CorrectedCounts(Generic[C]):
-    """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors, or points, of each kind.
+    """A scene's counts unchanged, after each correction alone and after ``all``; ``n`` errors, or points, of each kind.
 
-    ``with_true_labels``: each mask named by the truth, nothing else changed; None without masks or where no label
-    counts. ``n_scored`` points in all, None where errors are of masks.
+    ``with_true_labels``: each mask labelled by ground truth, nothing else changed; None without masks or if labels are
+    not scored. ``n_scored`` is the total number of scored points, None if the errors are of masks.
     """
 
     as_is: C
@@ -80,9 +79,9 @@ class CorrectedCounts(Generic[C]):
 def correct_scene(
     truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules, overlaps: Overlaps | None = None
 ) -> CorrectedCounts[InstanceCounts]:
-    """The counts of one scene with its errors corrected; ``truth`` (N,) is label * 1000 + instance, 0 where void.
+    """The counts of one scene with its errors corrected; ``truth`` (N,) is label * 1000 + instance, 0 if void.
 
-    ``overlaps`` of the predictions with it, where they were measured before.
+    ``overlaps``: those of the predictions with ground truth, if already measured.
 
     >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.repeat([3001, 3002], 200)
@@ -109,7 +108,7 @@ def correct_scene(
 
 
 def with_true_labels(overlaps: Overlaps) -> LabelledMasks:
-    """The predictions, each with the class of the instance that it shares most points with, whatever the kind of error.
+    """The predictions, each with the class of the instance it shares most points with, regardless of the kind of error.
 
     A mask that shares no point with any keeps its class.
     """
@@ -122,7 +121,7 @@ def with_true_labels(overlaps: Overlaps) -> LabelledMasks:
 
 
 def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> InstanceCounts:
-    """The additive counts of one scene, as the evaluator has them."""
+    """The additive counts of one scene, as in the evaluator."""
     return scene_counts.per_scene(
         truth,
         predicted.masks.indptr,
@@ -138,9 +137,9 @@ def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules
 
 @dataclass(frozen=True)
 class MaskError:
-    """One error of a kind: the predicted ``masks`` that make it and the counted ``instances`` that suffer it.
+    """One error: the predicted ``masks`` that cause it and the counted ``instances`` that it affects.
 
-    The mask, or part, and the instance that it is told by come first. A background mask has no instance, a missed
+    The mask (or part) and the instance that identify it come first. A background mask has no instance, a missed
     instance no mask.
     """
 
@@ -150,22 +149,22 @@ class MaskError:
 
 
 class Repair:
-    """The predictions of a scene while errors are corrected in them."""
+    """The predictions of a scene while their errors are corrected."""
 
     def __init__(self, predicted: LabelledMasks) -> None:
         self._predicted = predicted
-        self.points: dict[int, Int32Array] = {}  # of the masks that have other points now
+        self.points: dict[int, Int32Array] = {}  # of the masks whose points have changed
         self.class_ids, self.scores = predicted.class_ids.copy(), predicted.scores.copy()
         self.is_kept = np.ones(len(predicted.masks), bool)
-        self.added: list[tuple[Int32Array, int, float]] = []  # points, class and confidence of masks behind the others
+        self.added: list[tuple[Int32Array, int, float]] = []  # points, class and confidence of additional masks
 
     def mask(self, k: int) -> Int32Array:
-        """The points of mask ``k`` as they are now."""
+        """The current points of mask ``k``."""
         return self.points[k] if k in self.points else self._predicted.masks.mask(k)
 
     @property
     def is_changed(self) -> BoolArray:
-        """Which of the masks (K,) count otherwise than before."""
+        """Which of the masks (K,) have changed."""
         touched: BoolArray = ~self.is_kept | (self.class_ids != self._predicted.class_ids)
         touched |= self.scores != self._predicted.scores
         touched[list(self.points)] = True
@@ -185,16 +184,15 @@ class Repair:
 
 
 def find_errors(overlaps: Overlaps) -> list[MaskError]:
-    """All errors of a scene, kind after kind."""
+    """All errors of a scene, ordered by kind."""
     return [error for find, _ in _KINDS.values() for error in find(overlaps)]
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Whose errors they are: ``of_mask`` (K,) and ``of_instance`` (G,) name the kind, empty for none.
+    """The kind of error per mask, ``of_mask`` (K,), and per instance, ``of_instance`` (G,); empty for none.
 
-    An error is that of a mask, but ``split`` and ``missed`` are those of an instance: there are as many of each kind as
-    ``Mended.n`` counts.
+    An error belongs to a mask, but ``split`` and ``missed`` belong to an instance, as in the counts ``n`` of errors.
     """
 
     of_mask: tuple[str, ...]
@@ -202,7 +200,7 @@ class Errors:
 
 
 def errors_of(overlaps: Overlaps) -> Errors:
-    """The kind of error of each mask and of each counted instance, before anything is corrected."""
+    """The kind of error of each mask and of each counted instance, before any correction."""
     of_mask, of_instance = [""] * len(overlaps.predicted.masks), [""] * overlaps.n_instances
     for error in find_errors(overlaps):
         if error.kind in ("split", "missed"):
@@ -213,7 +211,7 @@ def errors_of(overlaps: Overlaps) -> Errors:
 
 
 def repaired(overlaps: Overlaps, errors: Sequence[MaskError]) -> Repair:
-    """The predictions with those errors corrected, which are of one kind and in the order in which they are found."""
+    """The predictions with ``errors`` corrected; all are of one kind, in the order in which they were found."""
     repair = Repair(overlaps.predicted)
     for kind in dict.fromkeys(error.kind for error in errors):
         _KINDS[kind][1](overlaps, errors, repair)
@@ -319,7 +317,7 @@ def _correct_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Rep
         repair.added.append((overlaps.members[g], int(overlaps.class_of_instance[g]), best))
 
 
-# Of each kind what finds its errors, in the order in which they are corrected, and what mends some of them.
+# For each kind, in the order of correction: the functions that find its errors and correct some of them.
 _KINDS: dict[
     str,
     tuple[Callable[[Overlaps], list[MaskError]], Callable[[Overlaps, Sequence[MaskError], Repair], None]],
@@ -334,7 +332,7 @@ _KINDS: dict[
 
 
 CAUSES = ("geometry", "background", "association", "label")
-NEAR_M = 0.05  # the middle one of the radii at which coverage is reported
+NEAR_M = 0.05  # the middle radius at which coverage is reported
 RIGHT, NOT_SCORED = -1, -2
 
 
@@ -343,9 +341,9 @@ class LabelledPoints:
     """The evaluation points (N,) of a scene.
 
     ``true_class`` and ``predicted`` are class indices, -1 for none; ``is_scored`` marks the points that count;
-    ``object_id`` is one number an object of the truth; ``mask`` the mask that gave the class, -1 where none did;
+    ``object_id`` is one number per ground-truth object; ``mask`` the mask that gave the class, -1 for none;
     ``map_distance_m`` and ``mask_distance_m`` are to the nearest point of the map and of any mask, infinity for none;
-    of those to the map it only counts whether they are above ``NEAR_M``.
+    for the map it only matters whether they are above ``NEAR_M``.
     """
 
     true_class: Int64Array
@@ -360,7 +358,7 @@ class LabelledPoints:
 def causes_of(points: LabelledPoints, *, has_masks: bool = True) -> Int64Array:
     """Index into ``CAUSES`` (N,) of each wrong point, ``RIGHT`` or ``NOT_SCORED`` elsewhere.
 
-    Without masks, as with one feature a point, what is near and wrong is a wrong label.
+    Without masks, for example with one feature per point, a wrong point near the map is a label error.
 
     >>> truth, called, objects = np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([7, 8, 8])
     >>> mask, near = np.zeros(3, int), np.zeros(3)
@@ -382,13 +380,13 @@ def causes_of(points: LabelledPoints, *, has_masks: bool = True) -> Int64Array:
 
 
 def object_of_mask(points: LabelledPoints) -> Int64Array:
-    """The object that each mask belongs to, in the order of masks; -1 where no point took its class from it."""
+    """The object that each mask belongs to, in the order of masks; -1 if no point took its class from the mask."""
     taken = np.flatnonzero(points.is_scored & (points.mask >= 0) & (points.mask_distance_m <= NEAR_M))
     return _most_frequent(points.mask[taken], points.object_id[taken], int(points.mask.max(initial=-1)) + 1)
 
 
 def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Array:
-    """For each key from 0 the value that stands beside it most often, the lowest of equals; -1 where none does.
+    """For each key from 0 its most frequent value, the lowest on ties; -1 for a key without values.
 
     >>> _most_frequent(np.array([0, 0, 0, 2]), np.array([5, 4, 4, 9]), 3).tolist()
     [4, -1, 9]
@@ -397,7 +395,7 @@ def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Arra
     values = np.unique(value)
     pairs, n = np.unique(key * len(values) + np.searchsorted(values, value), return_counts=True)
     keys, places = np.divmod(pairs, max(1, len(values)))
-    order = np.lexsort((-places, n))  # the most frequent last, of equals the lowest value last
+    order = np.lexsort((-places, n))  # the most frequent last, on ties the lowest value last
     answer[keys[order]] = values[places[order]]
     return answer
 
@@ -405,7 +403,7 @@ def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Arra
 def correct_points(
     points: LabelledPoints, is_counted: BoolArray, *, has_masks: bool = True
 ) -> CorrectedCounts[SemanticCounts]:
-    """The counts of one scene with its errors corrected; ``is_counted`` (C,) marks the classes of the confusion matrix."""
+    """The counts of one scene with its errors corrected; ``is_counted`` (C,): the classes of the confusion matrix."""
     cause = causes_of(points, has_masks=has_masks)
 
     def count(predicted: Int64Array) -> SemanticCounts:
@@ -422,7 +420,7 @@ def correct_points(
 
 
 def _true_labels(points: LabelledPoints) -> Int64Array:
-    """The class of each point when its mask is called by the class that most of the scored points there have."""
+    """The class of each point if its mask gets the most frequent class of the scored points there."""
     taken = np.flatnonzero(points.is_scored & (points.mask >= 0) & (points.mask_distance_m <= NEAR_M))
     n_masks = int(points.mask.max(initial=-1)) + 1
     class_of_mask = _most_frequent(points.mask[taken], points.true_class[taken], n_masks)

@@ -1,4 +1,4 @@
-"""Who shares how much with whom: predicted masks and the instances of the truth, and of which masks each is made up."""
+"""Overlaps of predicted masks with ground-truth instances, and the masks that make up each instance."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 
-HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match one instance only
+HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match only one instance
 
 
 @dataclass(frozen=True)
 class LabelledMasks:
-    """K masks on the truth's points, with a class id (0 for none that is scored) and a confidence each."""
+    """K masks on the ground-truth points, each with a class id (0 for no scored class) and a confidence."""
 
     masks: Masks
     class_ids: Int64Array
@@ -27,8 +27,8 @@ class LabelledMasks:
 
 @dataclass(frozen=True)
 class ScoringRules:
-    """What the evaluator needs: the scored class ids, the minimum size in points, the IoU thresholds, and whether it
-    drops masks for being void."""
+    """The evaluator's settings: the scored class ids, the minimum size in points, the IoU thresholds, and whether it
+    drops void masks."""
 
     class_ids: tuple[int, ...]
     min_region_size: int = instance_ap.MIN_REGION_SIZE
@@ -38,7 +38,7 @@ class ScoringRules:
 
 @dataclass(frozen=True)
 class Parts:
-    """The masks that lie in one instance: those that make it up, the first the best, and those that repeat others."""
+    """The masks that lie in one instance: those that make it up, the best first, and those that repeat others."""
 
     parts: tuple[int, ...]
     duplicates: tuple[int, ...]
@@ -46,12 +46,12 @@ class Parts:
 
 @dataclass(frozen=True)
 class Overlaps:
-    """The masks of a scene against its counted instances: of scored classes and at least the minimum size.
+    """The masks of a scene compared with its counted instances: of scored classes and at least the minimum size.
 
     ``shared`` (K, G) points of mask k and instance g; ``inside`` is that as a share of the mask, ``cover`` as a share
     of the instance; ``members`` are the points of each instance. ``is_merged``: holds several instances under the label
-    of one. ``is_large``: has the minimum size; ``is_counted``: a scored class as well; ``is_ignored``: the evaluator
-    leaves the mask alone at every threshold, because it is void there.
+    of one. ``is_large``: has at least the minimum size; ``is_counted``: also has a scored class; ``is_ignored``: the
+    evaluator ignores the mask at every threshold, because it is void there.
     """
 
     predicted: LabelledMasks
@@ -80,18 +80,18 @@ class Overlaps:
 
     @cached_property
     def parts(self) -> tuple[Parts, ...]:
-        """Of each instance, the masks that make it up; merged ones are no part of anything."""
+        """For each instance, the masks that make it up; merged masks are never parts."""
         return tuple(self._parts_of(g) for g in range(self.n_instances))
 
     @cached_property
     def missed(self) -> Int64Array:
-        """The instances in which no mask of the minimum size lies, which none holds, and which are not split either."""
+        """The instances that are not split and that no mask of at least the minimum size lies in or holds."""
         touches = ((self.inside > HALF) | (self.cover > HALF)) & self.is_large[:, None]
         return np.setdiff1d(np.flatnonzero(~touches.any(axis=0)), self.split)
 
     @cached_property
     def split(self) -> Int64Array:
-        """The instances with several parts that together match them, under their class, which no merged mask finds."""
+        """The instances whose several parts together match them, with their class, and that no merged mask finds."""
         return np.array([g for g in range(self.n_instances) if self._is_split(g)], np.int64)
 
     def _is_split(self, g: int) -> bool:
@@ -139,9 +139,9 @@ class Overlaps:
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The truth of a scene as masks meet it: the segment of each point, and which segments are counted instances.
+    """The ground truth of a scene: the segment of each point, and which segments are counted instances.
 
-    ``size``, ``members`` and ``class_of_instance`` are of the counted ones alone, in the order of their values.
+    ``size``, ``members`` and ``class_of_instance`` cover only the counted ones, in the order of their values.
     """
 
     segment_of_point: Int64Array
@@ -152,7 +152,7 @@ class TrueInstances:
 
 
 def true_instances(truth: Int64Array, rules: ScoringRules) -> TrueInstances:
-    """The instances of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
+    """The instances of one scene; ``truth`` (N,) is label * 1000 + instance, 0 if void."""
     segment_of_point, values, sizes = scene_counts.segments_of(truth)
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
     order = np.argsort(segment_of_point, kind="stable").astype(np.int32)
@@ -167,7 +167,7 @@ def true_instances(truth: Int64Array, rules: ScoringRules) -> TrueInstances:
 
 
 def measure_overlaps(instances: TrueInstances, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
-    """The overlaps of the masks of one scene with the instances that are there."""
+    """The overlaps of the masks of one scene with its instances."""
     masks, size = predicted.masks, predicted.masks.sizes
     n_segments, every = len(instances.is_instance), np.arange(len(size))
     shared = scene_counts.intersections(instances.segment_of_point, n_segments, masks.indptr, masks.indices, every)

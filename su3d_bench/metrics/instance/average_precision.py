@@ -1,7 +1,7 @@
 """The ScanNet instance average precision, equal to the official evaluator in every bit.
 
 Source: BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py of ScanNet at commit 3830fce, with the one-line
-mend of its pull request 26 (a class whose predictions are all ignored scores 0 instead of raising IndexError).
+fix of its pull request 26 (a class whose predictions are all ignored scores 0 instead of raising IndexError).
 A scene gives a table of counted predictions (``scene_counts``), tables of scenes are concatenated, and only ``combine``
 forms ratios.
 """
@@ -21,13 +21,13 @@ from su3d_bench.metrics.metric import ROWS, Counts, axes
 from su3d_bench.numerics.statistics import row_means
 
 _SPLITTER = 134217729.0  # 2**27 + 1: Veltkamp's constant, cuts a double into two halves of 26 bits
-ROWS_AT_ONCE = 1 << 20  # of the curves that are formed side by side, which bounds the memory that they take
+ROWS_AT_ONCE = 1 << 20  # rows of curves computed together, which bounds their memory
 
 
 def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
-    """Area under the raw precision-recall polyline, one vertex a distinct score and the vertex (recall 0, precision 1).
+    """Area under the raw precision-recall polyline: one vertex per distinct score, and (recall 0, precision 1).
 
-    Rows are the counted predictions of one class; 0 where there is none (pull request 26).
+    Rows are the counted predictions of one class; 0 without rows (pull request 26).
 
     >>> average_precision(np.array([1.0, 1.0, 1.0]), np.array([True, True, False]), 2)  # recall (1 + precision) / 2
     0.41666666666666663
@@ -39,13 +39,13 @@ def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -
 def average_precisions(
     cell: Int64Array, score: Float64Array, is_true: BoolArray, n_missed: Int64Array, is_wanted: BoolArray
 ) -> Float64Array:
-    """``average_precision`` of the rows of each cell, NaN where it is not wanted.
+    """``average_precision`` of the rows of each cell, NaN for unwanted cells.
 
-    ``cell`` (E,), ``score`` (E,) and ``is_true`` (E,) are one row a counted prediction, ``n_missed`` and ``is_wanted``
-    one value a cell.
+    ``cell`` (E,), ``score`` (E,) and ``is_true`` (E,) have one row per counted prediction, ``n_missed`` and
+    ``is_wanted`` one value per cell.
     """
     rows = np.flatnonzero(is_wanted[cell])
-    order = rows[np.argsort(score[rows])]  # the order of equal scores moves no curve
+    order = rows[np.argsort(score[rows])]  # the order of equal scores does not change a curve
     order = order[np.argsort(cell[order].astype(np.min_scalar_type(len(n_missed))), kind="stable")]
     bounds = np.searchsorted(cell[order], np.arange(len(n_missed) + 1))
     score, is_true = score[order], is_true[order]
@@ -63,7 +63,7 @@ def average_precisions(
 
 
 def _areas(score: Float64Array, is_true: BoolArray, starts: Int64Array, n_missed: Int64Array) -> Float64Array:
-    """The area (C,) of each cell; its rows begin at ``starts`` (C,) and come with rising score, and it has some."""
+    """The area (C,) of each cell; its rows, at least one, begin at ``starts`` (C,) and have ascending scores."""
     n_rows = np.diff(starts, append=len(score))
     is_vertex = np.append(True, score[1:] != score[:-1])
     is_vertex[starts] = True
@@ -71,7 +71,7 @@ def _areas(score: Float64Array, is_true: BoolArray, starts: Int64Array, n_missed
     n_true_before = np.append(0, np.cumsum(is_true))
     n_true = n_true_before[starts + n_rows] - n_true_before[starts]
     hits = n_true_before[starts + n_rows][cell] - n_true_before[row]
-    # behind the vertices of each cell come the vertex (recall 0, precision 1) and a second recall of 0
+    # after the vertices of each cell come the vertex (recall 0, precision 1) and a second recall of 0
     n_vertices = np.bincount(cell)
     ends = np.cumsum(n_vertices + 2)
     at = np.arange(len(row)) + 2 * cell
@@ -88,14 +88,14 @@ def _areas(score: Float64Array, is_true: BoolArray, starts: Int64Array, n_missed
     return dots(precision, width, begins, n_vertices + 1)
 
 
-# numpy hands ``np.dot`` to the BLAS, whose order of additions differs between processors: the same curve ends in
-# another last bit on AVX2 than on AVX-512. The reference answers of the original evaluators come from OpenBLAS's
+# ``np.dot`` uses the BLAS, whose order of additions differs between processors: the last bit of the same curve is
+# different with AVX2 and AVX-512. The reference results of the original evaluators come from OpenBLAS's
 # AVX-512 kernel (kernel/x86_64/ddot_microk_skylakex-2.c, and the tail loop of ddot.c): we add in that order,
-# in plain double arithmetic, many curves side by side.
+# in plain double arithmetic, for many curves at once.
 def dots(left: Float64Array, right: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
-    """The sum of products of each stretch, added as OpenBLAS's AVX-512 kernel adds them with fused multiply-adds.
+    """The sum of products of each stretch, in the order of OpenBLAS's AVX-512 kernel with fused multiply-adds.
 
-    Values must be far from overflow and underflow, as precisions and recall steps are.
+    Values must be far from overflow and underflow, which holds for precisions and recall steps.
 
     >>> dots(np.array([1.0, 0.5, 0.25]), np.array([0.5, 0.25, 0.25]), np.array([0, 1]), np.array([3, 2])).tolist()
     [0.6875, 0.1875]
@@ -104,7 +104,7 @@ def dots(left: Float64Array, right: Float64Array, starts: Int64Array, lengths: I
     n_blocked = lengths - lengths % 16
     n_wide = n_blocked - n_blocked % 32
     wide = _chains(*products, starts, n_wide // 32, np.zeros((len(starts), 32)))
-    # the halves of each 512-bit register fold into one of 256 bits, which takes the last block of 16
+    # the halves of each 512-bit register are added into one of 256 bits, to which the last block of 16 is added
     halves = wide.reshape(-1, 4, 2, 4)
     lanes = (halves[:, :, 0] + halves[:, :, 1]).reshape(-1, 16)
     fours = _chains(*products, starts + n_wide, (n_blocked - n_wide) // 16, lanes).reshape(-1, 4, 4)
@@ -116,7 +116,7 @@ def dots(left: Float64Array, right: Float64Array, starts: Int64Array, lengths: I
 def _chains(
     product: Float64Array, error: Float64Array, starts: Int64Array, n_steps: Int64Array, totals: Float64Array
 ) -> Float64Array:
-    """``totals`` (C, lanes) plus, a step each, the next exact products of every lane, rounded once a step."""
+    """``totals`` (C, lanes) plus the next exact products of every lane, one per step, rounded once per step."""
     order = np.argsort(-n_steps, kind="stable")
     totals, lanes = totals[order], np.arange(totals.shape[1])
     n_left = np.searchsorted(-n_steps[order], -np.arange(n_steps.max(initial=0)), side="left")
@@ -129,10 +129,10 @@ def _chains(
 
 
 def _rounded_once(product: Float64Array, error: Float64Array, total: Float64Array) -> Float64Array:
-    """``product + error + total`` as a fused multiply-add gives it, where ``error`` is what rounding took.
+    """``product + error + total`` as in a fused multiply-add; ``error`` is the rounding error of ``product``.
 
-    The sum of what two exact additions leave over is rounded to odd, so that the last addition rounds right (Boldo and
-    Melquiond, Emulation of FMA and correctly rounded sums, IEEE Transactions on Computers 57, 2008).
+    The sum of the remainders of two exact additions is rounded to odd, so that the last addition rounds correctly
+    (Boldo and Melquiond, Emulation of FMA and correctly rounded sums, IEEE Transactions on Computers 57, 2008).
     """
     high, low = _exact_sums(total, error)
     high, middle = _exact_sums(product, high)
@@ -144,14 +144,14 @@ def _rounded_once(product: Float64Array, error: Float64Array, total: Float64Arra
 
 
 def _exact_sums(left: Float64Array, right: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Knuth's sum: rounded sums and what rounding took from them; the two add up to the exact sums."""
+    """Knuth's sum: rounded sums and their rounding errors; the two add up to the exact sums."""
     total = left + right
     part = total - left
     return total, (left - (total - part)) + (right - part)
 
 
 def _exact_products(left: Float64Array, right: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Dekker's product: rounded products and what rounding took from them; the two add up to the exact products."""
+    """Dekker's product: rounded products and their rounding errors; the two add up to the exact products."""
     product = left * right
     left_high, left_low = _halves(left)
     right_high, right_low = _halves(right)
@@ -175,12 +175,12 @@ INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
 
 @dataclass(frozen=True)
 class InstanceCounts(Counts):
-    """What one scene, or several, adds to AP: one row for each counted prediction, class and threshold.
+    """The AP counts of one scene or several: one row per counted prediction, class and threshold.
 
-    ``class_index`` (E,) int32 and ``threshold_index`` (E,) int32 say where row e counts, ``score`` (E,) float64 its
+    ``class_index`` (E,) int32 and ``threshold_index`` (E,) int32 state where row e counts, ``score`` (E,) float64 its
     confidence, ``is_true`` (E,) whether it is a true positive; ``n_missed`` (C, T) int64 counts the ground-truth
-    instances that nothing matched, ``n_truth`` (C,) those that take part, ``n_small_truth`` (C,) those below the
-    minimum size, ``n_predictions`` (C,) the predictions of at least that size, ignored ones included.
+    instances without a match, ``n_truth`` (C,) those that are scored, ``n_small_truth`` (C,) those below the minimum
+    size, ``n_predictions`` (C,) the predictions of at least that size, including ignored ones.
     """
 
     stored_as = "instance"
@@ -195,7 +195,7 @@ class InstanceCounts(Counts):
     n_predictions: Int64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
-        """Rows beyond the classes or thresholds, scores without an order, other instances than met and missed ones."""
+        """Rows beyond the classes or thresholds, non-finite scores, or instances neither matched nor missed."""
         for name, axis in (("class_index", "classes"), ("threshold_index", "thresholds")):
             if getattr(self, name).max(initial=-1) >= self.sizes[axis]:
                 return f"'{name}' counts beyond the {self.sizes[axis]} {axis}"
@@ -207,14 +207,14 @@ class InstanceCounts(Counts):
         if not len(wrong):
             return None
         row, column = wrong[0]
-        return f"'n_truth' of class {row} is {self.n_truth[row]}, met and missed are {known[row, column]}"
+        return f"'n_truth' of class {row} is {self.n_truth[row]}, matched and missed are {known[row, column]}"
 
 
 @dataclass(frozen=True)
 class InstanceAP:
-    """Average precision: ``table`` (C, T) for each class and threshold, NaN where a class has no ground truth.
+    """Average precision: ``table`` (C, T) for each class and threshold, NaN for classes without ground truth.
 
-    ``ap`` averages over all thresholds but 0.25.
+    ``ap`` averages over all thresholds except 0.25.
     """
 
     thresholds: tuple[float, ...]
@@ -231,7 +231,7 @@ class InstanceAP:
 
 
 def ap_columns(thresholds: Sequence[float]) -> Int64Array:
-    """Where the thresholds stand over which AP is averaged: all but 0.25.
+    """The indices of the thresholds over which AP is averaged: all except 0.25.
 
     >>> ap_columns((0.5, 0.75, 0.25)).tolist()
     [0, 1]
@@ -240,14 +240,14 @@ def ap_columns(thresholds: Sequence[float]) -> Int64Array:
 
 
 def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
-    """One value a point, label * 1000 + instance, and 0 (unannotated) where either is 0.
+    """One value per point, label * 1000 + instance, or 0 (unannotated) if either is 0.
 
     >>> encode_ground_truth(np.array([5, 5, 0, 7]), np.array([1, 2, 3, 0])).tolist()
     [5001, 5002, 0, 0]
     """
     if len(instance) and (instance.min() < 0 or semantic.min() < 0):
         worst = min(int(instance.min()), int(semantic.min()))
-        raise DataError(f"ground truth: holds the id {worst}; ids are 0 for none, else positive")
+        raise DataError(f"ground truth: contains the id {worst}; ids are positive, or 0 for none")
     if len(instance) and instance.max() >= INSTANCES_PER_CLASS:
         raise DataError(
             f"ground truth: instance id {int(instance.max())} would spill into the next class; "
@@ -259,10 +259,10 @@ def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
 
 
 def values_of_numbers(numbers: IntArray) -> Int64Array:
-    """One value a point, 1000 + the number of its object, and 0 for none, of numbers of objects without classes.
+    """One value per point, 1000 + its object number, or 0 for none, from object numbers without classes.
 
-    As in the OpenSUN3D challenge's script n and 1000 + n are one object, 1000 is one too, and from 2000 on none is
-    (load_ids and get_instances in eval_utils/util_3d.py of OpenSun3D/cvpr24-challenge at 59db30f).
+    As in the OpenSUN3D challenge's script, n and 1000 + n are the same object, 1000 is an object too, and values from
+    2000 are none (load_ids and get_instances in eval_utils/util_3d.py of OpenSun3D/cvpr24-challenge at 59db30f).
 
     >>> values_of_numbers(np.array([0, 1, 7, 1007, 1000, 2000])).tolist()
     [0, 1001, 1007, 1007, 1000, 0]
@@ -273,7 +273,7 @@ def values_of_numbers(numbers: IntArray) -> Int64Array:
 
 
 def last_line_of_each_mask_file(files: Sequence[str]) -> list[tuple[int, int]]:
-    """Pairs (line of first occurrence, line of last occurrence), one a distinct mask file, in order of the first.
+    """Pairs (line of first occurrence, line of last occurrence), one per distinct mask file, in order of the first.
 
     The official reader keys predictions by file path: a file named twice stays at its first position with the label and
     confidence of its last line.
@@ -290,13 +290,13 @@ def last_line_of_each_mask_file(files: Sequence[str]) -> list[tuple[int, int]]:
 
 
 def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
-    """The counts of classes one after another."""
+    """The counts of classes, concatenated."""
     names = InstanceCounts.arrays()
     return InstanceCounts(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def only(counts: InstanceCounts, index: int) -> InstanceCounts:
-    """The counts of one class alone."""
+    """The counts of one class."""
     rows = np.flatnonzero(counts.class_index == index)
     own = {
         name: getattr(counts, name)[rows if names == (ROWS,) else [index]]
@@ -306,9 +306,9 @@ def only(counts: InstanceCounts, index: int) -> InstanceCounts:
 
 
 def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> InstanceAP:
-    """AP of the scenes together: their predictions share one curve a class, and classes are averaged.
+    """AP over all scenes: their predictions share one curve per class, and classes are averaged.
 
-    Classes without a ground-truth instance are NaN and leave the mean; with no class left the means are NaN.
+    Classes without a ground-truth instance are NaN and excluded from the mean; without any class the means are NaN.
 
     >>> from su3d_bench.metrics.instance.scene_counts import per_scene
     >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
@@ -320,7 +320,7 @@ def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRE
 
 
 def combine_each(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> list[InstanceAP]:
-    """AP of each scene alone, or of each group of scenes whose counts are one."""
+    """AP of each scene, or of each group of scenes whose counts are joined."""
     n_classes, n_thresholds = counts[0].n_missed.shape
     n_cells = n_classes * n_thresholds
     cell = [
@@ -343,7 +343,7 @@ def of_table(table: Float64Array, thresholds: Sequence[float]) -> InstanceAP:
     return InstanceAP(
         thresholds=tuple(thresholds),
         table=table,
-        # the order in which numpy sums follows the layout that this mixed indexing yields; so does the last bit
+        # the order in which numpy sums, and so the last bit, depends on the layout that this mixed indexing gives
         ap=_nanmean(table[None][np.zeros((1, 1), int), :, columns[None, :]]),
         ap50=_nanmean(table[:, at_50]),
         ap25=_nanmean(table[:, at_25]),
@@ -351,7 +351,7 @@ def of_table(table: Float64Array, thresholds: Sequence[float]) -> InstanceAP:
 
 
 def _nanmean(values: Float64Array) -> float:
-    """``np.nanmean``, which takes its time, in every bit; NaN where there is no number."""
+    """A faster ``np.nanmean``, equal in every bit; NaN without any number."""
     is_nan = np.isnan(values)
     n = values.size - np.count_nonzero(is_nan)
     filled = values.copy(order="K")
@@ -359,8 +359,8 @@ def _nanmean(values: Float64Array) -> float:
     return float(filled.sum() / n) if n else float("nan")
 
 
-MANY_ROWS = 20_000  # from there on compiled loops win back the time that they take to load
-AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
+MANY_ROWS = 20_000  # from here on compiled loops are faster, including the time to load them
+AT_ONCE = 64  # resamples processed together: their counts stay in the L1 cache
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
 
 
@@ -396,7 +396,7 @@ def resampled_ap(
 
 @dataclass(frozen=True)
 class _Rows:
-    """The counted predictions of one class and threshold after another, with falling score in each."""
+    """The counted predictions ordered by class and threshold, with descending scores in each."""
 
     scene: Int64Array
     score: Float64Array
@@ -417,7 +417,7 @@ def _drawn_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: 
 
 
 def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
-    """``_drawn_areas`` of many rows, up to rounding, by compiled loops on all cores."""
+    """``_drawn_areas`` for many rows, up to rounding, with compiled loops on all cores."""
     from su3d_bench.metrics.instance.kernels import resampled_areas
 
     areas = np.zeros((len(bounds) - 1, len(weights)))
@@ -435,16 +435,16 @@ def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weight
         areas[:, own] = areas_of_block
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(fill, range(0, len(weights), AT_ONCE)))  # raises what a thread raised
-    return np.ascontiguousarray(areas.T)  # the order of later sums follows the layout; so does the last bit
+        list(threads.map(fill, range(0, len(weights), AT_ONCE)))  # raises an exception of a thread
+    return np.ascontiguousarray(areas.T)  # the order of later sums, and so the last bit, depends on the layout
 
 
 def _weighted_areas(
     score: Float64Array, is_true: BoolArray, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
 ) -> Float64Array:
-    """Area under each resample's precision-recall polyline; rows come with falling score.
+    """Area under each resample's precision-recall polyline; rows have descending scores.
 
-    A vertex without weight repeats its neighbour and adds no area, so all resamples share the vertices of the whole.
+    A vertex without weight repeats its neighbour and adds no area, so all resamples share the same vertices.
     """
     if not len(score):
         return np.zeros(len(weights))

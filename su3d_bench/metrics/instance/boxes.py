@@ -1,4 +1,4 @@
-"""What two boxes have in common, exactly, however they are turned."""
+"""The exact intersection of two boxes of any rotation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from su3d_bench.metrics.metric import ROWS, Counts, Metric, Pooled, SceneScore, 
 from su3d_bench.metrics.protocols.model import BOX_AXES
 from su3d_bench.numerics.statistics import ratio, row_means
 
-# A cube of half sides 1 in six tetrahedra (6, 4, 3): one for each order in which its axes lead from corner to corner.
+# A cube of half sides 1 in six tetrahedra (6, 4, 3): one for each order of the axes on the way from corner to corner.
 _TETRAHEDRA: Float64Array = np.array(
     [[[1.0 if axis in order[:n] else -1.0 for axis in range(3)] for n in range(4)] for order in permutations(range(3))]
 )
@@ -31,7 +31,7 @@ def smallest_box(points: Float64Array, rotation: Float64Array) -> OrientedBox:
     >>> smallest_box(np.array([[0.0, 0, 0], [2, 1, 0]]), np.eye(3)).sizes.tolist()
     [2.0, 1.0, 0.0]
     """
-    along_axes = rotation.T @ points.T  # (3, N): each axis in one piece, which takes a fraction of the time of (N, 3)
+    along_axes = rotation.T @ points.T  # (3, N): each axis is contiguous, which is much faster than (N, 3)
     low, high = along_axes.min(axis=1), along_axes.max(axis=1)
     return OrientedBox(rotation @ ((low + high) / 2), high - low, rotation)
 
@@ -43,7 +43,7 @@ def box_around(points: Points) -> Float64Array:
 
 
 def box_iou(first: OrientedBox, second: OrientedBox) -> float:
-    """The volume in both boxes as a share of that in either, 0 where neither has a volume.
+    """The intersection over union of two boxes, 0 if neither has a volume.
 
     >>> unit = OrientedBox(np.zeros(3), np.ones(3), np.eye(3))
     >>> round(box_iou(unit, OrientedBox(np.array([0.5, 0.0, 0.0]), np.ones(3), np.eye(3))), 12)
@@ -55,7 +55,7 @@ def box_iou(first: OrientedBox, second: OrientedBox) -> float:
 
 
 def shared_volume(first: OrientedBox, second: OrientedBox) -> float:
-    """The volume in m3 of what is in both boxes."""
+    """The volume in m3 of the intersection of two boxes."""
     if not first.sizes.all() or not second.sizes.all():
         return 0.0
     middle, half = second.rotation.T @ (first.centre - second.centre), second.sizes / 2
@@ -72,7 +72,7 @@ def shared_volume(first: OrientedBox, second: OrientedBox) -> float:
 
 
 def _cut(parts: Float64Array, inside: Float64Array) -> Float64Array:
-    """What is left of tetrahedra (T, 4, 3) where ``inside`` (T, 4), linear over space, is above 0; as tetrahedra."""
+    """The parts of tetrahedra (T, 4, 3) in which ``inside`` (T, 4), linear over space, is above 0, as tetrahedra."""
     order = np.argsort(-inside, axis=1, kind="stable")
     inside = np.take_along_axis(inside, order, axis=1)
     parts = np.take_along_axis(parts, order[:, :, None], axis=1)
@@ -80,7 +80,7 @@ def _cut(parts: Float64Array, inside: Float64Array) -> Float64Array:
     left = [parts[n_inside == 4]]
 
     def crossing(rows: np.ndarray, near: int, far: int) -> Float64Array:
-        """Where the edges from the corners ``near`` to the corners ``far`` leave."""
+        """The points at which the edges from the corners ``near`` to the corners ``far`` leave."""
         share = inside[rows, near] / (inside[rows, near] - inside[rows, far])
         return np.asarray(parts[rows, near] + share[:, None] * (parts[rows, far] - parts[rows, near]))
 
@@ -95,25 +95,25 @@ def _cut(parts: Float64Array, inside: Float64Array) -> Float64Array:
 
 
 def _wedge(first: list[Float64Array], second: list[Float64Array]) -> list[Float64Array]:
-    """Wedges between triangles of three corners (T, 3) each as three lots of tetrahedra (T, 4, 3)."""
+    """Wedges between triangles of three corners (T, 3) each, as three arrays of tetrahedra (T, 4, 3)."""
     a, b, c = first
     x, y, z = second
     return [np.stack(corners, axis=1) for corners in ((a, b, c, z), (a, b, y, z), (a, x, y, z))]
 
 
 THRESHOLDS = (0.25, 0.5)
-PLACES = tuple(f"{100 * threshold:.0f}" for threshold in THRESHOLDS)  # as names of values end
+PLACES = tuple(f"{100 * threshold:.0f}" for threshold in THRESHOLDS)  # suffixes of value names
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
 
 
 @dataclass(frozen=True)
 class BoxCounts(Counts):
-    """What one scene, or several, adds: one row for each instance of a scored class.
+    """The counts of one scene or several: one row per instance of a scored class.
 
     ``class_index`` (E,) int32 and ``score`` (E,) float64 are its class and confidence, ``is_true`` (E, T) whether it is
-    the one that finds a true box at each of the thresholds. Of the true boxes of each class, (C,) int64: ``n_truth``
-    how many there are, ``n_centred`` how many hold the centroid of an instance of their class, ``n_located`` how many
-    are found at the first threshold by an instance of any class, ``n_named`` how many of these by one of their own.
+    the one that finds a true box at each threshold. Numbers of true boxes per class, (C,) int64: ``n_truth`` of all,
+    ``n_centred`` of those that contain the centroid of an instance of their class, ``n_located`` of those found at the
+    first threshold by an instance of any class, ``n_named`` of these with an instance of their own class.
     """
 
     stored_as = "boxes"
@@ -127,7 +127,7 @@ class BoxCounts(Counts):
     n_named: Int64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
-        """Rows beyond the classes, scores without an order, more boxes found or named than there are or can be."""
+        """Rows beyond the classes, non-finite scores, or more boxes found or named than possible."""
         n_classes = len(self.n_truth)
         if self.class_index.max(initial=-1) >= n_classes:
             return f"'class_index' counts beyond the {n_classes} classes"
@@ -149,7 +149,7 @@ class BoxCounts(Counts):
             wrong = np.flatnonzero(few > many)
             if len(wrong):
                 row = wrong[0]
-                return f"'{name}' of class {row} counts {few[row]} boxes where at most {many[row]} can be"
+                return f"'{name}' of class {row} counts {few[row]} boxes, but at most {many[row]} are possible"
         return None
 
     def _n_hits(self, threshold: int) -> Int64Array:
@@ -166,8 +166,8 @@ def count_boxes(
 ) -> BoxCounts:
     """The counts of a scene of K instances and G true boxes from their ``iou`` (K, G).
 
-    ``holds_centroid`` (K, G): of which instance each box holds the centroid; ``true_class`` (G,) and ``called`` (K,)
-    are indices of classes, -1 for an instance of none of them; such a one can locate a box, and no more.
+    ``holds_centroid`` (K, G): whether each box contains the centroid of each instance; ``true_class`` (G,) and
+    ``called`` (K,) are class indices, -1 for an instance of none of them, which can only locate a box.
 
     >>> iou = np.array([[0.6, 0.0], [0.4, 0.0], [0.0, 0.3]])
     >>> counts = count_boxes(iou, iou > 0.2, np.array([0, 1]), np.array([0, 0, 0]), np.array([0.5, 0.9, 0.7]), 2)
@@ -197,9 +197,9 @@ def count_boxes(
 
 
 def _located(iou: Float64Array, scores: Float64Array, is_same: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Which boxes (G,) instances of any class find, and of which the best of these has the right class.
+    """Which boxes (G,) are found by instances of any class, and for which the best of these has the right class.
 
-    The best by confidence, of equals by IoU, of equals one of the right class, so that their order is nothing.
+    The best by confidence, then by IoU, then one of the right class, so that the order of instances does not matter.
     """
     located, named = np.zeros(iou.shape[1], bool), np.zeros(iou.shape[1], bool)
     if not iou.size:
@@ -209,7 +209,7 @@ def _located(iou: Float64Array, scores: Float64Array, is_same: BoolArray) -> tup
     is_right = is_same[found, best[found]]
     order = found[np.lexsort((is_right, best_iou[found], scores[found]))]
     located[best[order]] = True
-    for row in order:  # the last of each box stays
+    for row in order:  # the last one of each box remains
         named[best[row]] = is_same[row, best[row]]
     return located, named
 
@@ -217,7 +217,7 @@ def _located(iou: Float64Array, scores: Float64Array, is_same: BoolArray) -> tup
 def class_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, Float64Array]:
     """AP and recall at each threshold (R, C) of the scenes drawn ``weights`` (R, S) times; NaN without a true box.
 
-    Instances of one confidence enter the curve together; of other confidences the area is VoteNet's.
+    Instances of equal confidence enter the curve together; for distinct confidences the area is VoteNet's.
 
     >>> found = BoxCounts(np.zeros(1, np.int32), np.ones(1), np.array([[True, False]]), *np.array([[2], [1], [1], [1]]))
     >>> {name: value.tolist() for name, value in class_values([found], np.array([[1]])).items()}
@@ -242,7 +242,7 @@ def class_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, 
 def _curves(
     score: Float64Array, is_true: BoolArray, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
 ) -> tuple[Float64Array, Float64Array]:
-    """Area (R,) and recall (R,) of one class, whose rows come by falling score; NaN where a draw has no true box."""
+    """Area (R,) and recall (R,) of one class, whose rows have descending scores; NaN if a draw has no true box."""
     area, recall = np.zeros(len(weights)), np.zeros(len(weights))
     if len(score):
         is_last = np.append(np.diff(score) != 0, True)
@@ -275,11 +275,11 @@ def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, 
     return shares
 
 
-_REACH = 3**0.5  # a box around points within r of a place, along whatever axes, is within this many r of it
+_REACH = 3**0.5  # a box, of any rotation, around points within r of a position is within this many r of it
 
 
 class BoxMetric(Metric[BoxCounts]):
-    """Are objects found as boxes, with the right class?"""
+    """Whether objects are found as boxes with the right class."""
 
     truth = GroundTruth
     counts = BoxCounts
@@ -292,7 +292,7 @@ class BoxMetric(Metric[BoxCounts]):
         rules = self.rules
         assert rules.min_region_size is not None
         if truth.boxes is None:
-            raise DataError(f"{rules.name}: the truth '{truth.variant}' has no boxes")
+            raise DataError(f"{rules.name}: ground truth '{truth.variant}' has no boxes")
         boxes = list(truth.boxes.boxes.values())
         ids = np.array([truth.boxes.class_of_instance[instance] for instance in truth.boxes.boxes], np.int64)
         known = labelling.class_index_of_ids(rules, ids)
@@ -307,7 +307,7 @@ class BoxMetric(Metric[BoxCounts]):
         iou, holds_centroid = _meet(shapes, [boxes[g] for g in wanted], rules.box_axes)
         counts = count_boxes(iou, holds_centroid, place[known[wanted]], called[kept], scores[kept], len(rules.scored))
         warnings = [labelling.encoder_warning(rules, prediction, encoder), _constant_warning(scores[kept])]
-        # the sides of a box are no surface that a map should have: there is no coverage
+        # the sides of a box are not a surface that a map should contain: there is no coverage
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def pooled(self, counts: Sequence[BoxCounts]) -> Pooled:
@@ -330,7 +330,7 @@ class BoxMetric(Metric[BoxCounts]):
         return self.class_columns({name: tables[name] for name in self.rules.headline}, has_truth)
 
     def _of_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, Float64Array]:
-        """Each value (R, C) of each class alone; NaN where a draw has no true box of it."""
+        """Each value (R, C) per class; NaN if a draw has no true box of it."""
         shares = share_values(counts, weights)
         has_truth = shares["centroid"][1] > 0
         tables = class_values(counts, weights)
@@ -362,7 +362,7 @@ class _Shape:
 def _meet(
     shapes: Sequence[_Shape], boxes: Sequence[OrientedBox], axes: BOX_AXES | None
 ) -> tuple[Float64Array, BoolArray]:
-    """The IoU (K, G) of the box of each shape with each true box, and of which each holds the centroid (K, G)."""
+    """The IoU (K, G) of the box of each shape with each true box, and whether each contains its centroid (K, G)."""
     iou = np.zeros((len(shapes), len(boxes)))
     centroids = np.array([shape.centroid for shape in shapes]).reshape(-1, 3)
     middles = np.array([shape.middle for shape in shapes]).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Compiled loops over the counted predictions of many scenes; imported only there, for numba takes its time to load."""
+"""Compiled loops over the counted predictions of many scenes; imported on demand, because numba is slow to load."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from su3d_bench.core.compiled import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, drawn, area_of_cell):  # type: ignore[no-untyped-def]
-    """Writes the area (cells, R) of each resample; rows of a cell come with falling score.
+    """Writes the area (cells, R) of each resample; rows of a cell have descending scores.
 
     ``is_last`` marks the last row of a score, ``n_truth`` (C, R) counts the instances of the drawn scenes, ``drawn``
-    (S, R) says how often each scene was drawn. Resamples go side by side, so that the inner loops are vectors. The
-    curve rises only where a true positive was drawn, so nothing is added elsewhere.
+    (S, R) how often each scene was drawn. Resamples are processed together, so that the inner loops vectorize. The
+    curve rises only at drawn true positives, so nothing is added elsewhere.
     """
     n_resamples = drawn.shape[1]
     n_counted, n_hit = np.empty(n_resamples, np.int32), np.empty(n_resamples, np.int32)

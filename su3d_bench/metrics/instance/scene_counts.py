@@ -1,6 +1,6 @@
-"""The masks of a scene held against its truth, as the ScanNet evaluator does it: who meets whom, and what counts.
+"""Matching of a scene's masks with its ground truth, as in the ScanNet evaluator, and the resulting counts.
 
-Source: as of ``average_precision``, which forms the ratios.
+Source: that of ``average_precision``, which computes the ratios.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ def per_scene(
 ) -> instance_ap.InstanceCounts:
     """The additive counts of one scene.
 
-    ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
+    ``ground_truth`` (N,) has label * 1000 + instance per point, 0 if unannotated; prediction k covers the points
     ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their
-    order counts for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
-    Without ``labels`` every mask is listed once under each class. Unless it ``forgives_void``, a mask that meets no
-    instance is a false positive however much of it is void or in small instances.
+    order matters for AP25 only, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
+    Without ``labels`` every mask is listed once under each class. Unless it ``forgives_void``, a mask without a match
+    is a false positive no matter how much of it is void or in small instances.
 
     >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.array([3001] * 200 + [0] * 50)
@@ -59,10 +59,10 @@ def per_scene(
 
 @dataclass(frozen=True)
 class ClassOverlaps:
-    """One class of a scene: its ``predictions`` (R,) of the minimum size, by their place in line, and its instances.
+    """One class of a scene: the indices of its ``predictions`` (R,) of at least the minimum size, and its instances.
 
-    ``values`` (G,) are those of the instances, ascending; ``iou`` (R, G); ``takes_part`` (G,) marks those of the
-    minimum size; ``ignored_share`` (R,) of a prediction is void or in smaller instances.
+    ``values`` (G,) are those of the instances, ascending; ``iou`` (R, G); ``takes_part`` (G,) marks those of at least
+    the minimum size; ``ignored_share`` (R,): the share of a prediction that is void or in smaller instances.
     """
 
     predictions: Int64Array
@@ -74,7 +74,7 @@ class ClassOverlaps:
     def counts(
         self, class_index: int, scores: Float64Array, thresholds: Sequence[float], *, forgives_void: bool
     ) -> instance_ap.InstanceCounts:
-        """The counts of the class; ``scores`` (K,) are those of all masks in line."""
+        """The counts of the class; ``scores`` (K,) are those of all masks, in order."""
         return count_class(
             class_index,
             iou=self.iou,
@@ -123,7 +123,7 @@ def overlaps_of_class(
 ) -> ClassOverlaps:
     """The ``predictions`` (R,) of one class; ``intersection`` (R, S) with all segments, by ascending value."""
     segment_label = segment_value // instance_ap.INSTANCES_PER_CLASS
-    columns = np.flatnonzero(segment_label == class_id)  # ascending value, as the original walks them
+    columns = np.flatnonzero(segment_label == class_id)  # ascending value, as in the original's loop
     n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
     shared, is_small = intersection[:, columns], segment_size[columns] < min_region_size
     return ClassOverlaps(
@@ -143,9 +143,9 @@ def count_class(
     ignored_share: Float64Array,
     thresholds: Sequence[float],
 ) -> instance_ap.InstanceCounts:
-    """The counts of one class: ``iou`` (R, G) of its predictions, in line order, with its instances, ascending."""
+    """The counts of one class: ``iou`` (R, G) of its predictions, in order, with its instances, ascending."""
     limits, n_objects = np.array(thresholds, np.float64)[:, None], int(takes_part.sum())
-    # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
+    # a prediction that overlaps any instance of its class, even a small or a matched one, is no false positive here
     is_unmet = ignored_share <= limits
     n_missed = [n_objects] * len(limits)
     rows: list[tuple[int, float, bool]] = []
@@ -157,7 +157,7 @@ def count_class(
             rows += [(t, score, True) for score in hits] + [(t, score, False) for score in duplicates]
     at, unmet = np.nonzero(is_unmet)
     score, is_true = scores[unmet], np.zeros(len(unmet), bool)
-    if rows:  # before those of their threshold that met nothing
+    if rows:  # before those of the same threshold without a match
         at = np.concatenate([np.array([t for t, _, _ in rows]), at])
         order = np.argsort(at, kind="stable")
         at, score = at[order], np.concatenate([np.array([score for _, score, _ in rows]), score])[order]
@@ -175,7 +175,7 @@ def count_class(
 
 
 def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tuple[list[float], list[float], int]:
-    """Scores of the true positives and of their duplicates, and how many instances nothing met: greedy, in order."""
+    """Scores of the true positives and of their duplicates, and the number of unmatched instances: greedy, in order."""
     hits: list[float] = []
     duplicates: list[float] = []
     n_met = 0
@@ -188,9 +188,9 @@ def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tupl
 
 
 def met_instances(over: BoolArray, takes_part: BoolArray) -> Iterator[tuple[int, Int64Array]]:
-    """The instances that are met, and by which predictions; ``over`` (R, G) says who is above the threshold with whom.
+    """The matched instances and their predictions; ``over`` (R, G) marks the pairs above the threshold.
 
-    Only the first in line is used up by an instance; the best score of all stays with the true positive.
+    An instance uses up only its first prediction; the true positive gets the best score of all.
     """
     visited = np.zeros(len(over), bool)
     for column in np.flatnonzero(takes_part & over.any(axis=0)).tolist():
@@ -203,10 +203,10 @@ def met_instances(over: BoolArray, takes_part: BoolArray) -> Iterator[tuple[int,
 def _check_predictions(
     n_points: int, indptr: IntArray, indices: IntArray, n_predictions: int, scores: Float64Array
 ) -> None:
-    """A ``PredictionError`` for masks that no reader and no ``Instances.of`` gives.
+    """``PredictionError`` for masks that no reader and no ``Instances.of`` can produce.
 
-    The original ranks a confidence of infinity above all numbers; here it is taken for an overflow, in which order was
-    lost (README.md).
+    The original ranks a confidence of infinity above all numbers; here it is treated as an overflow that lost the
+    order (README.md).
     """
     if len(indptr) != n_predictions + 1 or len(scores) != n_predictions or not np.isfinite(scores).all():
         raise PredictionError(f"{n_predictions} masks: need as many labels, and confidences that are finite numbers")
@@ -218,12 +218,12 @@ def _check_predictions(
 
 
 def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
+    """Each point's row in the ascending list of distinct values, that list, and the number of points of each."""
     if not len(ground_truth):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
     if ground_truth.min() < 0 or ground_truth.max() > _MAX_VALUE:
         worst = int(ground_truth.min() if ground_truth.min() < 0 else ground_truth.max())
-        raise DataError(f"ground truth: holds the value {worst}; values are label * 1000 + instance")
+        raise DataError(f"ground truth: contains the value {worst}; values are label * 1000 + instance")
     n_points_of_value = np.bincount(ground_truth)
     values = np.flatnonzero(n_points_of_value)
     row_of_value = np.zeros(len(n_points_of_value), np.int64)
@@ -250,10 +250,10 @@ def intersections(
 
 @dataclass(frozen=True)
 class Hits:
-    """At one threshold: ``is_hit`` (K,) masks that are true positives, the ``values`` of the instances that are met.
+    """At one threshold: ``is_hit`` (K,) marks the true positives, ``values`` are those of the matched instances.
 
-    A true positive is the mask whose confidence the instance takes, the first of equals. Below IoU 0.5 a mask may be
-    that of two instances.
+    A true positive is the mask whose confidence the instance takes, the first on ties. Below IoU 0.5 a mask may match
+    two instances.
     """
 
     is_hit: BoolArray

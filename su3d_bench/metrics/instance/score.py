@@ -1,4 +1,4 @@
-"""Protocols whose numbers are average precision; those of kind ``instance``, from masks on the truth's points."""
+"""Protocols based on average precision; those of kind ``instance``, from masks on the ground-truth points."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
 CONSTANT_CONFIDENCE = "all confidences are"
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
-OBJECT = 1  # the one label that all have where the protocol has no classes
+OBJECT = 1  # the label of all masks if the protocol has no classes
 NO_OBJECT = 0
 AP_COLUMNS = {name: name for name in AP_NAMES}
 
 
 class CurveMetric(Metric[InstanceCounts]):
-    """What the kinds share whose counts are rows of precision-recall curves."""
+    """The common part of kinds whose counts are rows of precision-recall curves."""
 
     counts = InstanceCounts
 
@@ -77,7 +77,7 @@ def _ap_values(curve: InstanceAP) -> Values:
 
 
 class InstanceMetric(CurveMetric):
-    """Masks on the truth's points, each with a label unless class-agnostic."""
+    """Masks on the ground-truth points, each with a label unless class-agnostic."""
 
     truth = GroundTruth
 
@@ -85,7 +85,7 @@ class InstanceMetric(CurveMetric):
         rules = self.rules
         assert rules.min_region_size is not None
         if truth.evaluation_points is not None:
-            raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
+            raise DataError(f"{rules.name}: ground truth '{truth.variant}' has no instances on its evaluation points")
         scored = masks_on_truth(rules, truth, prediction, encoder)
         counts = scene_counts.per_scene(
             scored.values,
@@ -106,9 +106,9 @@ class InstanceMetric(CurveMetric):
 
 @dataclass(frozen=True)
 class ScoredMasks:
-    """What the evaluator sees: the truth ``values`` (N,) as label * 1000 + instance and the labels that are scored.
+    """The evaluator's input: ground-truth ``values`` (N,) as label * 1000 + instance, and the scored labels.
 
-    ``masks`` are K masks on the truth's points with ``labels`` (K,) and ``scores`` (K,), the confidences that count.
+    ``masks`` are K masks on the ground-truth points with ``labels`` (K,) and ``scores`` (K,), the used confidences.
     """
 
     values: Int64Array
@@ -135,9 +135,9 @@ def masks_on_truth(
 def without_labels(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition
 ) -> tuple[Int64Array, Masks, Float64Array]:
-    """The truth (N,) as label * 1000 + instance, the masks on its points, and the prediction's own confidences (K,).
+    """Ground truth (N,) as label * 1000 + instance, the masks on its points, and the prediction's confidences (K,).
 
-    Points that the truth leaves out (class -1) are void and in no mask.
+    Points excluded from the ground truth (class -1) are void and in no mask.
     """
     masks, scores = masks_and_scores(prediction)
     cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
@@ -146,7 +146,7 @@ def without_labels(
     if not is_left_out.any():
         return encode_truth(rules, truth.semantic, truth.instance), moved, scores
     values = encode_truth(rules, np.maximum(truth.semantic, 0), np.where(is_left_out, 0, truth.instance))
-    values[is_left_out] = 0  # where whatever nobody annotated is an object, these are no part of it
+    values[is_left_out] = 0  # if unannotated points form an object, these are not part of it
     is_kept = ~is_left_out[moved.indices]
     before = np.append(0, np.cumsum(is_kept))
     return values, Masks(before[moved.indptr], moved.indices[is_kept]), scores
@@ -161,7 +161,7 @@ def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64A
 
 
 def encode_truth(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
-    """One value a point, label * 1000 + instance, and 0 where it is void."""
+    """One value per point, label * 1000 + instance, or 0 if void."""
     if rules.class_agnostic is not None:
         return encode_without_classes(rules, semantic, instance)
     return instance_ap.encode_ground_truth(semantic, instance)
@@ -170,7 +170,7 @@ def encode_truth(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -
 def named_classes(
     rules: ProtocolRules, semantic: IntArray, prediction: Instances | Partition, encoder: Encoder | None
 ) -> Int64Array:
-    """The class id (K,) that each mask is called in a scene with the class ids ``semantic`` (N,), 0 for none."""
+    """The class id (K,) assigned to each mask in a scene with the class ids ``semantic`` (N,), 0 for none."""
     is_present = present(labelling.class_index_of_ids(rules, semantic), len(rules.classes))
     classes = labelling.classes_of_prediction(rules, prediction, encoder, is_present)
     ids = np.array([entry.id for entry in rules.classes], np.int64)
@@ -178,13 +178,13 @@ def named_classes(
 
 
 def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
-    """One value a point, 1000 + the number of its object, and 0 where it is void, by the rule ``class_agnostic``.
+    """One value per point, 1000 + its object number, or 0 if void, by the rule ``class_agnostic``.
 
-    ``scored``: what has no scored class is void. ``annotated``: only points without an instance are. Both number the
-    objects from 1, class after class and in each by instance number, in the order in which the originals match them;
-    equal instance numbers of two classes are two objects. ``numbered``: equal instance numbers are one object, and
-    objects come by their number. ``everything``: the same, for the original takes values modulo 1000, and nothing is
-    void, for points without an instance are one more, of the value 1000.
+    ``scored``: points without a scored class are void. ``annotated``: only points without an instance are. Both number
+    the objects from 1 by class and then by instance number, the order in which the originals match them; equal instance
+    numbers of two classes are two objects. ``numbered``: equal instance numbers are one object, and objects are ordered
+    by number. ``everything``: the same, because the original takes values modulo 1000, and nothing is void, because
+    points without an instance are one more object, of the value 1000.
 
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> semantic, instance = np.array([0, 1, 5, 2, 5]), np.array([0, 1, 1, 3, 2])  # 1 is the wall
@@ -220,7 +220,7 @@ def score_of_masks(
     wanted: BoolArray,
     warnings: Sequence[str | None],
 ) -> SceneScore:
-    """The score, with how far the ``wanted`` (P,) of ``targets`` (P, 3) are from the nearest point of any mask."""
+    """The score, with the distances of the ``wanted`` (P,) of ``targets`` (P, 3) to the nearest point of any mask."""
     covered = np.full(len(prediction.points), -1, np.int64)
     covered[transfer.masks_of(prediction).indices] = 0
     reach = max(transfer.COVERAGE_RADII_M)
@@ -246,9 +246,9 @@ def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks
 
 @dataclass(frozen=True)
 class CoveredObjects:
-    """``n_shared`` (K, O): truth vertices of object ``object_ids`` (O,) that instance k covers.
+    """``n_shared`` (K, O): ground-truth vertices of object ``object_ids`` (O,) that instance k covers.
 
-    A vertex is covered by the instances that own the map point nearest to it, where that is within the cap.
+    A vertex is covered by the instances that contain the map point nearest to it, if that is within the cap.
     """
 
     object_ids: Int64Array
@@ -256,7 +256,7 @@ class CoveredObjects:
 
     @property
     def main_object(self) -> Int64Array:
-        """The object (K,) that each instance covers most vertices of, the lowest id of equals, 0 where it covers none.
+        """The object (K,) of which each instance covers most vertices, the lowest id on ties, 0 if it covers none.
 
         >>> Covered(np.array([3, 7]), np.array([[0, 1], [4, 4], [0, 0]])).main_object.tolist()
         [7, 3, 0]
@@ -268,7 +268,7 @@ class CoveredObjects:
 
 
 def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instances | Partition) -> CoveredObjects:
-    """What each instance, or row of features, covers of the truth's objects."""
+    """The coverage of the true objects by each instance or row of features."""
     masks = transfer.masks_of(prediction)
     moved = transfer.transfer_masks(prediction.points, masks, truth.points, rules.cap_m, rules.evaluation_voxel_m)
     ids, column = np.unique(np.maximum(truth.instance, 0), return_inverse=True)

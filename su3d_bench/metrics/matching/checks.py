@@ -1,4 +1,4 @@
-"""What is wrong or doubtful in a prediction, found before it is scored; each line says where and how much."""
+"""Checks of a prediction before scoring; each message states where and how much is wrong or doubtful."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, 
 
 
 def _candidates(masks: Masks, n_points: int, iou: float) -> tuple[list[int], list[int]]:
-    """The pairs, in order, that may have such an IoU: of masks whose first points are shared already.
+    """The candidate pairs, in order, for such an IoU: masks that share some of their first points.
 
-    Two masks with an IoU above t share more than t of each. So of the points of one, by their number, all but (1 - t)
-    are the other's; and among the first 2 (1 - t) + 1 of each must be as many common ones as are left when those that
-    may be foreign are taken away. All other pairs are passed over, and their points are never looked at.
+    Two masks with an IoU above t share more than t of each. So at most a share (1 - t) of the points of one is not in
+    the other, and the first 2 (1 - t) + 1 points of each, by index, must contain as many common ones as remain after
+    removing the possibly foreign ones. All other pairs are skipped without reading their points.
     """
     size = masks.sizes
-    n_foreign = np.minimum(size, ((1.0 - iou) * size).astype(np.int64) + 1)  # at most; 1 more, for that is rounded
+    n_foreign = np.minimum(size, ((1.0 - iou) * size).astype(np.int64) + 1)  # at most; 1 more because of rounding
     n_first = np.minimum(size, 2 * n_foreign + 1)
     n_common = np.maximum(n_first - n_foreign, 1)
     owner = np.repeat(np.arange(len(size)), n_first)
@@ -68,20 +68,20 @@ def _candidates(masks: Masks, n_points: int, iou: float) -> tuple[list[int], lis
     return first[is_candidate].tolist(), second[is_candidate].tolist()
 
 
-NEAR_IOU = 0.9  # pairs above it are the same object twice
-MAX_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million
+NEAR_IOU = 0.9  # pairs above it are duplicates of one object
+MAX_SHARED = 300_000_000  # products in the search for pairs; 600 masks of a large scene need about ten million
 UNITS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
-LARGEST_RATIO = 20.0  # of what two clouds of one scene span
-NEAR_M = 0.1  # outside of the scene's box that a point still counts as inside
+LARGEST_RATIO = 20.0  # of the extents of two clouds of one scene
+NEAR_M = 0.1  # margin around the scene's box in which a point still counts as inside
 MIN_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
 
 
 @dataclass(frozen=True)
 class MaskFacts:
-    """What a reader must know of the masks of a scene.
+    """Facts about the masks of a scene that warnings are based on.
 
-    ``near`` and ``identical`` are pairs of masks whose IoU is above 0.9 or 1, ``near`` None where there are too many
-    overlaps to look; of ``n_covered`` points in masks, ``n_contested`` are in several.
+    ``near`` and ``identical`` are pairs of masks whose IoU is above 0.9 or is 1, ``near`` None if there are too many
+    overlaps to search; of ``n_covered`` points in masks, ``n_contested`` are in several.
     """
 
     n_masks: int
@@ -113,7 +113,7 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
 
 
 def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[str]) -> list[str]:
-    """A sentence on empty masks, with their number and the first of them."""
+    """A warning on empty masks, with their number and the first of them."""
     if not facts.n_empty:
         return []
     first = int(np.flatnonzero(masks.sizes == 0)[0])
@@ -121,7 +121,7 @@ def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[st
 
 
 def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
-    """Sentences on masks that are there twice, with the number of pairs and the first of them."""
+    """Warnings on duplicate masks, with the number of pairs and the first of them."""
     lines = []
     identical = set(facts.identical)
     only_near = tuple(pair for pair in facts.near or () if pair not in identical)
@@ -131,7 +131,7 @@ def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> lis
             names = f"{first}{_key(keys, first)} and {other}{_key(keys, other)}"
             lines.append(f"{scene}: {counted(len(pairs), 'pair')} of {what}, the first is {names}; they can move AP")
     if facts.near is None:
-        lines.append(f"{scene}: the masks overlap so much that duplicates were not looked for")
+        lines.append(f"{scene}: the masks overlap too much to search for duplicates")
     return lines
 
 
@@ -141,9 +141,9 @@ def _key(keys: Sequence[str], k: int) -> str:
 
 
 def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None, ids: Int64Array) -> list[str]:
-    """A sentence on masks whose class the protocol does not score; ``ids`` (K,) are class ids, 0 for none.
+    """A warning on masks whose class the protocol does not score; ``ids`` (K,) are class ids, 0 for none.
 
-    ``numbers`` (K,) are the classes as the file has them.
+    ``numbers`` (K,) are the classes as in the file.
     """
     if numbers is None or rules.class_agnostic is not None:
         return []
@@ -166,7 +166,7 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None,
 
 
 def label_warnings(scene: str, rules: ProtocolRules, class_ids: Int64Array) -> list[str]:
-    """A sentence on points whose predicted class is none of the protocol's."""
+    """A warning on points whose predicted class is not in the protocol."""
     is_unknown = ~np.isin(class_ids, [entry.id for entry in rules.classes])
     if not is_unknown.any():
         return []
@@ -175,23 +175,23 @@ def label_warnings(scene: str, rules: ProtocolRules, class_ids: Int64Array) -> l
     return [
         f"{scene}: {int(is_unknown.sum())} of {len(class_ids)} points are predicted as none of the "
         f"{len(rules.classes)} classes (most often {worst}, first at point {int(np.argmax(is_unknown))}), which is "
-        "wrong wherever they count"
+        "wrong wherever they are scored"
     ]
 
 
 def check_cloud(scene: str, points: Float32Array, truth: Float32Array) -> list[str]:
-    """Sentences on how a prediction's cloud lies over the truth's; ``PredictionError`` where that makes no sense."""
+    """Warnings on the alignment of a predicted cloud with ground truth; ``PredictionError`` if it is impossible."""
     if not len(points) or not len(truth):
         return []
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise PredictionError(f"{scene}: point {bad} is at {points[bad].tolist()}; coordinates are finite metres")
+        raise PredictionError(f"{scene}: point {bad} is at {points[bad].tolist()}; coordinates must be finite")
     low, high = truth.min(axis=0).astype(np.float64), truth.max(axis=0).astype(np.float64)
     span, true_span = float((points.max(axis=0) - points.min(axis=0)).max()), float((high - low).max())
     ratio = span / true_span if true_span > 0 else 1.0
     if ratio > LARGEST_RATIO or 0 < ratio < 1 / LARGEST_RATIO:
         unit = next((name for factor, name in UNITS.items() if factor / 4 < ratio < factor * 4), None)
-        guess = f": {unit}?" if unit else "; is it of this scene?"
+        guess = f": {unit}?" if unit else "; wrong scene?"
         raise PredictionError(
             f"{scene}: the cloud spans {span:.4g}, the scene {true_span:.4g} m{guess} coordinates must be metres in "
             "the frame of the ground truth"
@@ -200,12 +200,12 @@ def check_cloud(scene: str, points: Float32Array, truth: Float32Array) -> list[s
     share = float(is_inside.mean())
     if share == 0:
         raise PredictionError(
-            f"{scene}: no point of the cloud lies in the box of the scene; is it of another scene or in another frame "
+            f"{scene}: no point of the cloud is in the box of the scene; is it from another scene or in another frame "
             "of reference?"
         )
     if share < MIN_INSIDE:
         return [
-            f"{scene}: only {100 * share:.0f} % of the cloud lies in the box of the scene (the first outside is point "
+            f"{scene}: only {100 * share:.0f} % of the cloud is in the box of the scene (the first outside is point "
             f"{int(np.argmin(is_inside))}); is the frame of reference right?"
         ]
     return []

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 CPU = "cpu"
-# Sums of 4096 products of unit vectors differ between two orders by less than 1e-12; 1e-9 leaves room.
+# Sums of 4096 products of unit vectors differ between two orders by less than 1e-12; 1e-9 leaves a margin.
 CERTAIN_GAP = 1e-9
-_BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
+_BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, independent of the size of the map
 
 
 def scored_classes(rules: ProtocolRules) -> BoolArray:
@@ -33,13 +33,13 @@ def scored_classes(rules: ProtocolRules) -> BoolArray:
 
 
 def places_among_scored(rules: ProtocolRules) -> Int64Array:
-    """The place (C + 1,) of each class among the scored ones, -1 for others; the last is for no class."""
+    """The index (C + 1,) of each class among the scored ones, -1 for others; the last entry is for no class."""
     is_scored = scored_classes(rules)
     return np.append(np.where(is_scored, np.cumsum(is_scored) - 1, -1), -1)
 
 
 def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array:
-    """Indices of the classes among which the classifier may choose in a scene that contains ``is_present`` (C,)."""
+    """Indices of the classes that the classifier can choose from in a scene that contains ``is_present`` (C,)."""
     if rules.vocabulary == "all":
         return np.arange(len(rules.classes))
     is_scored = scored_classes(rules)
@@ -49,10 +49,10 @@ def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array
 def classes_of_prediction(
     rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray
 ) -> Int64Array:
-    """A class index for each instance, row of features or point; -1 where it is none of the protocol's classes.
+    """A class index for each instance, row of features or point; -1 if not one of the protocol's classes.
 
-    Labels that the method itself decided are taken as they are; otherwise features are classified among the candidates
-    of a scene that contains ``is_present`` (C,).
+    Labels of the method itself are used unchanged; otherwise features are classified among the candidates of a scene
+    that contains ``is_present`` (C,).
     """
     candidates = candidate_classes(rules, is_present)
     labels = getattr(prediction, "labels", None)
@@ -69,10 +69,10 @@ def classes_of_prediction(
 def ranked_classes(
     rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray, k: int
 ) -> Int64Array:
-    """The ``k`` likeliest classes (K, k) of each instance, row of features or point, the best first, -1 for no more.
+    """The ``k`` most likely classes (K, k) of each instance, row of features or point, best first, padded with -1.
 
-    The labels of the method itself, in its order; otherwise the candidates of highest similarity of a scene that
-    contains ``is_present`` (C,).
+    The labels of the method itself, in its order; otherwise the most similar candidates of a scene that contains
+    ``is_present`` (C,).
     """
     candidates = candidate_classes(rules, is_present)
     ranked = np.full((n_predictions(prediction), k), -1, np.int64)
@@ -95,7 +95,7 @@ def ranked_classes(
 
 
 def has_every_label(prediction: object) -> bool:
-    """Whether the method itself decided all labels."""
+    """Whether the method itself assigned all labels."""
     labels = getattr(prediction, "labels", None)
     return labels is not None and all(labels)
 
@@ -115,16 +115,16 @@ def _classes_of_features(
 def text_features(
     rules: ProtocolRules, names: Sequence[str], features: NDArray[Any], encoder: Encoder
 ) -> Float32Array | Float64Array:
-    """The feature (C, D) of each name: of its prompt, or the mean of the normalised features of its prompts.
+    """The feature (C, D) of each name: that of its prompt, or the mean of the normalised features of its prompts.
 
-    Raises ``PredictionError`` where ``features`` (K, D) come from an encoder of other dimensions.
+    Raises ``PredictionError`` if ``features`` (K, D) come from an encoder with another number of dimensions.
     """
     texts = [rules.texts_of(name) for name in names]
     encoded = _encoded(encoder, [text for of_name in texts for text in of_name])
     if encoded.shape[1] != features.shape[1]:
         raise PredictionError(
             f"{rules.name}: features have {features.shape[1]} dimensions, the encoder '{encoder.name}' has "
-            f"{encoded.shape[1]}; name them with the encoder that made them"
+            f"{encoded.shape[1]}; use the encoder that made them"
         )
     n_prompts = len(texts[0])
     if n_prompts == 1:
@@ -141,9 +141,9 @@ def _encoded(encoder: Encoder, texts: list[str]) -> Float32Array:
 def needed_features(
     rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None
 ) -> tuple[Float32Array | NDArray[np.float16], Encoder]:
-    """The features of a prediction and the encoder; ``PredictionError`` where one of them is missing."""
+    """The features of a prediction and the encoder; ``PredictionError`` if one of them is missing."""
     if prediction.features is None or encoder is None:
-        raise PredictionError(f"{rules.name}: needs features and an encoder, or labels where it has classes")
+        raise PredictionError(f"{rules.name}: needs features and an encoder, or labels if it has classes")
     return prediction.features, encoder
 
 
@@ -154,18 +154,18 @@ def similarities(
     encoder: Encoder | None,
     rows: Int64Array | slice = slice(None),
 ) -> Float64Array:
-    """The cosine (K, Q) of the features of a prediction, all or some ``rows``, with those of texts."""
+    """The cosine similarity (K, Q) of a prediction's features, all or some ``rows``, with those of texts."""
     features, encoder = needed_features(rules, prediction, encoder)
     return cosines(features[rows], text_features(rules, texts, features, encoder), device_of(encoder))
 
 
 def device_of(encoder: Encoder) -> str:
-    """Where ``encoder`` runs, and with it the comparison of its features: ``cpu`` or a device of torch."""
+    """The device of ``encoder``, on which its features are also compared: ``cpu`` or a torch device."""
     return str(getattr(encoder, "device", CPU))
 
 
 def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Float64Array:
-    """The cosine (K, C) of each row of ``features`` with each row of ``text``, 0 where either has no direction.
+    """The cosine (K, C) of each row of ``features`` with each row of ``text``, 0 if either has no direction.
 
     On a device other than ``cpu`` a cosine differs from that of the CPU by less than 1e-12.
 
@@ -175,7 +175,7 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
     if device != CPU:
         there, text_there = (_directions_on(device, rows) for rows in (features, text))
         return np.asarray((there @ text_there.T).cpu().numpy(), np.float64)
-    # one thread: the last bit of a cosine may not depend on the machine's number of cores
+    # one thread: the last bit of a cosine must not depend on the machine's number of cores
     with threadpool_limits(1, user_api="blas"):
         product: Float64Array = (
             _normalised(np.asarray(features, np.float64)) @ _normalised(np.asarray(text, np.float64)).T
@@ -185,10 +185,10 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
 
 @remembered
 def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> Int64Array:
-    """For each row of ``features`` (K, D) the row of ``text`` (C, D) of highest cosine, the first of equals.
+    """For each row of ``features`` (K, D) the row of ``text`` (C, D) of highest cosine, the first on ties.
 
-    A row of zeros, or of anything that is no number, has no direction: all its cosines count 0, so it gets row 0.
-    On a device other than ``cpu`` the answer is the same; blocks where a choice is close are computed on the CPU.
+    A row of zeros, or with non-finite values, has no direction: all its cosines are 0, so it gets row 0.
+    On a device other than ``cpu`` the result is the same; blocks with a close choice are computed on the CPU.
 
     >>> most_similar(np.array([[0.0, 2.0], [3.0, 1.0], [0.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 1.0]])).tolist()
     [1, 0, 0]
@@ -196,7 +196,7 @@ def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> I
     directions = _normalised(np.asarray(text, np.float64))
     there = None if device == CPU else _directions_on(device, text)
     best = np.empty(len(features), np.int64)
-    # one thread and blocks of one size: the last bit of a cosine may not depend on the machine's number of cores
+    # one thread and blocks of one size: the last bit of a cosine must not depend on the machine's number of cores
     with threadpool_limits(1, user_api="blas"):
         for rows, block in row_blocks(features, _BLOCK_ROWS):
             chosen = None if there is None else _sure_most_similar(_directions_on(device, block), there)
@@ -209,7 +209,7 @@ def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> I
 def most_similar_each(features: np.ndarray, text: np.ndarray, k: int) -> Int64Array:
     """For each row of ``features`` (K, D) the ``k`` rows of ``text`` (C, D) of highest cosine (K, min(k, C)).
 
-    The best comes first, the first of equals, as ``most_similar`` has it.
+    The best comes first, and the first on ties, as in ``most_similar``.
 
     >>> most_similar_each(np.array([[0.0, 2.0], [3.0, 1.0], [0.0, 0.0]]), np.eye(3, 2), 2).tolist()
     [[1, 0], [0, 1], [0, 1]]
@@ -225,7 +225,7 @@ def most_similar_each(features: np.ndarray, text: np.ndarray, k: int) -> Int64Ar
 
 
 def _directions_on(device: str, rows: NDArray[Any]) -> Tensor:
-    """``rows`` (N, D) at length 1 on ``device``; those of no direction, or that hold what is no number, are 0."""
+    """``rows`` (N, D) at length 1 on ``device``; rows without a direction, or with non-finite values, are 0."""
     import torch
 
     there = torch.from_numpy(np.require(rows, requirements=["C", "W"])).to(device).double()
@@ -235,9 +235,9 @@ def _directions_on(device: str, rows: NDArray[Any]) -> Tensor:
 
 
 def _sure_most_similar(features: Tensor, text: Tensor) -> Int64Array | None:
-    """For each direction of ``features`` (K, D) that of ``text`` (C, D) of highest cosine; row 0 where it is 0.
+    """For each direction of ``features`` (K, D) that of ``text`` (C, D) of highest cosine; row 0 for a zero row.
 
-    None where the two highest of a row are so near that another order of the sums might choose the other.
+    None if the two highest of a row are so close that another order of summation could choose the other.
     """
     import torch
 
@@ -256,17 +256,17 @@ def _normalised(rows: Float64Array) -> Float64Array:
 
 
 def encoder_warning(rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None) -> str | None:
-    """A sentence where another encoder than the protocol's named the features."""
+    """A warning if the features were classified with another encoder than the protocol's."""
     if has_every_label(prediction) or encoder is None or rules.encoder in (None, encoder.name):
         return None
     return f"labels come from the encoder '{encoder.name}', the protocol's is '{rules.encoder}'"
 
 
 def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) -> Int64Array:
-    """The class index of each class id, -1 for ids that are none of the protocol's classes."""
+    """The class index of each class id, -1 for ids that are not in the protocol."""
     values = np.asarray(ids, np.int64)
     low, high = int(values.min(initial=0)), int(values.max(initial=0))
-    if high - low < len(values):  # a table of all ids between them is smaller than the answer
+    if high - low < len(values):  # a table of all ids in between is smaller than the result
         index_of = np.full(high - low + 1, -1, np.int64)
         for index, entry in enumerate(rules.classes):
             if low <= entry.id <= high:

@@ -1,4 +1,4 @@
-"""From the points of a prediction to the points of the truth: nearest neighbours, the lowest index of equals."""
+"""From predicted points to ground-truth points: nearest neighbours, the lowest index on ties."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Ar
 P = ParamSpec("P")
 R = TypeVar("R")
 Key = tuple[Any, ...]
-_MAX_BYTES = 512 << 20  # of all answers together: the oldest go
+_MAX_BYTES = 512 << 20  # of all cached results together: the oldest are dropped
 
 
 class _Memory:
     def __init__(self) -> None:
         self._answers: dict[Key, Any] = {}
         self._n_bytes = 0
-        self._met: dict[int, object] = {}  # kept, so that no other object gets the number of one in a key
+        self._met: dict[int, object] = {}  # kept alive, so that no other object gets the id of one in a key
 
     def answer(self, key: Key, ask: Callable[[], R]) -> R:
         if key not in self._answers:
@@ -39,7 +39,7 @@ class _Memory:
         return found
 
     def key_of(self, value: object) -> object:
-        """What tells ``value`` from any other: its content, or for what has none that is known, itself."""
+        """The identity of ``value`` in a cache key: its content, or if that is unknown the object itself."""
         if isinstance(value, np.ndarray):
             content = hashlib.blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
             return value.dtype.str, value.shape, content
@@ -66,7 +66,7 @@ _memory: ContextVar[_Memory | None] = ContextVar("memory", default=None)
 
 @contextmanager
 def remembering() -> Iterator[None]:
-    """Within it ``remembered`` functions give the same answer, the same object, to equal arguments.
+    """A context in which ``remembered`` functions return the same object for equal arguments.
 
     >>> @remembered
     ... def twice(values):
@@ -84,12 +84,12 @@ def remembering() -> Iterator[None]:
 
 
 def is_remembering() -> bool:
-    """Whether answers are kept, so that more than is asked may be worth working out."""
+    """Whether results are cached, so that computing more than requested may pay off."""
     return _memory.get() is not None
 
 
 def remembered(function: Callable[P, R]) -> Callable[P, R]:
-    """``function``, whose answers are kept where somebody is ``remembering``; nobody may write into them."""
+    """``function`` with its results cached inside ``remembering``; they must not be modified."""
     name = f"{function.__module__}.{function.__qualname__}"
 
     @wraps(function)
@@ -109,12 +109,12 @@ def _key(memory: _Memory, arguments: tuple[Any, ...], named: Mapping[str, Any]) 
 Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
-_MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
-MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting takes longer than it saves
+_MAX_NEIGHBOURS = 4_000_000  # candidates in memory at once while ties are broken
+MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting costs more time than it saves
 
 
 class Candidates:
-    """Points (N, 3) m, arranged once so that what is nearest can be asked of them again and again."""
+    """Points (N, 3) m with a search structure for repeated nearest-neighbour queries."""
 
     def __init__(self, points: Points) -> None:
         self._n = len(points)
@@ -135,15 +135,15 @@ class Candidates:
         return self._n
 
     def nearest(self, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
-        """``nearest`` of these points."""
+        """``nearest`` among these points."""
         if not self._n or not len(queries):
             return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
         asking_order = self._along_curve(queries)
         ordered_queries = np.asarray(queries, np.float64)[asking_order]
-        # the tree takes only neighbours nearer than its bound; the cap itself still counts
+        # the tree returns only neighbours nearer than its bound; a distance equal to the cap still counts
         bound = np.nextafter(cap_m, np.inf)
         distances, indices = self._tree.query(ordered_queries, k=2, distance_upper_bound=bound, workers=1)
-        # the tree says n, and infinity, where it found none
+        # the tree returns n and infinity if it found none
         nearest_index = self._order.take(indices[:, 0], mode="clip")
         tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
         nearest_index[tied] = _lowest_of_equals(self._tree, self._held, ordered_queries[tied], self._order)
@@ -154,9 +154,9 @@ class Candidates:
         return distance, index
 
     def _along_curve(self, points: Points) -> Int64Array:
-        """An order in which points that are near in space are near in memory, so that a search finds them in the cache.
+        """An order in which points that are near in space are near in memory, for faster searches.
 
-        It follows a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few are left as they are.
+        It follows a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few are not reordered.
         """
         if not self._is_ordered:
             return np.arange(len(points))
@@ -169,10 +169,10 @@ class Candidates:
 
 
 def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
-    """Distance in metres and index of each query's nearest candidate; infinity and -1 where none is within ``cap_m``.
+    """Distance in metres and index of each query's nearest candidate; infinity and -1 if none is within ``cap_m``.
 
-    Exact in float64; among candidates at the same squared distance the lowest index wins, so the answer depends on
-    neither the tree nor the number of threads.
+    Exact in float64; among candidates at the same squared distance the lowest index wins, so the result depends neither
+    on the tree nor on the number of threads.
 
     >>> distance, index = nearest(np.array([[0.0, 0, 0], [2, 0, 0], [2, 0, 0]]), np.array([[1.0, 0, 0], [2, 0, 1]]))
     >>> distance.tolist(), index.tolist()
@@ -197,7 +197,7 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
             squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
             is_nearest = squared == squared.min(axis=1, keepdims=True)
             answer[rows] = np.where(is_nearest, order[neighbours], len(candidates)).min(axis=1)
-            # more equals may lie beyond the last neighbour that was asked for
+            # there may be more ties beyond the last requested neighbour
             unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
         open_rows = np.concatenate(unfinished)
         k *= 8
@@ -205,12 +205,12 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
 
 
 def are_same_points(left: Points, right: Points) -> bool:
-    """Whether two clouds are one and the same list of points."""
+    """Whether two clouds are the same list of points."""
     return left is right or (left.shape == right.shape and bool(np.array_equal(left, right)))
 
 
 def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array:
-    """Indices, ascending, of the points that stay when each mask, and the background, keeps its first point a voxel."""
+    """Ascending indices of the points that remain if each mask, and the background, keeps its first point per voxel."""
     voxel = voxel_coordinates(points, voxel_m)
     background = np.ones(len(points), bool)
     background[masks.indices] = False
@@ -221,7 +221,7 @@ def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array
 
 
 def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
-    """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique.
+    """One number, from 0, per distinct row, without the slow comparison of whole rows in numpy's unique.
 
     >>> row_ids(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
     [1, 0, 1, 2]
@@ -236,7 +236,7 @@ def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
 
 
 def rows_of(ids: IntArray, values: IntArray) -> Int64Array:
-    """The row in ``ids``, ascending, of each of ``values`` (N,), -1 where it is none of them.
+    """The row in ascending ``ids`` of each of ``values`` (N,), -1 if it is not among them.
 
     >>> rows_of(np.array([3, 7]), np.array([7, 0, 3, 9])).tolist()
     [1, -1, 0, -1]
@@ -247,7 +247,7 @@ def rows_of(ids: IntArray, values: IntArray) -> Int64Array:
 
 
 def _packed(rows: Int64Array | Float64Array) -> Int64Array | None:
-    """One number a row of whole numbers, ordered as the rows from their last column on; None where 63 bits are few."""
+    """One number per row of integers, in the order of the rows from the last column; None if 63 bits are too few."""
     if not len(rows) or rows.dtype.kind not in "iu":
         return None
     lows = [int(column.min()) for column in rows.T]  # column by column: numpy is slow along short rows
@@ -272,7 +272,7 @@ def first_rows(rows: Int64Array) -> Int64Array:
     n_bits = len(keys).bit_length()
     if int(keys.max(initial=0)).bit_length() + n_bits > 63:
         return np.unique(keys, return_index=True)[1]
-    # a key and its place in one number: plain numbers are sorted in half the time of an order
+    # a key and its index in one number: sorting plain numbers takes half the time of an argsort
     held = np.sort((keys << n_bits) | np.arange(len(keys)))
     is_first = np.ones(len(held), bool)
     np.not_equal(held[1:] >> n_bits, held[:-1] >> n_bits, out=is_first[1:])
@@ -283,10 +283,10 @@ def first_rows(rows: Int64Array) -> Int64Array:
 def transfer_masks(
     points: Points, masks: Masks, targets: Points, cap_m: float | None = None, voxel_m: float = 0.0
 ) -> Masks:
-    """The masks on ``targets``: a target belongs to mask k where the nearest of all ``points`` within the cap does.
+    """The masks on ``targets``: a target belongs to mask k if the nearest of all ``points`` within the cap does.
 
-    Masks that overlap stay overlapping; a target whose nearest point is in no mask is in none. On ``points`` themselves
-    the masks stay as they are.
+    Masks that overlap still overlap; a target whose nearest point is in no mask is in none. On ``points`` themselves
+    the masks do not change.
 
     >>> masks = Masks(np.array([0, 1, 3]), np.array([0, 0, 1]))
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
@@ -304,12 +304,12 @@ def transfer_masks(
     of_point = csr_array(
         (np.ones(len(masks.indices), np.int8), masks.indices, masks.indptr), shape=(len(masks), len(points))
     ).tocsc()
-    moved = of_point[:, kept[nearest_index[reached]]].tocsr()  # column after column, so each row is ascending
+    moved = of_point[:, kept[nearest_index[reached]]].tocsr()  # column by column, so each row is ascending
     return Masks(moved.indptr.astype(np.int64), reached[moved.indices].astype(np.int32))
 
 
 def first_owner(masks: Masks, n_points: int) -> Int64Array:
-    """For each point the first mask that holds it, -1 where none does.
+    """For each point the first mask that contains it, -1 if none does.
 
     >>> first_owner(Masks(np.array([0, 2, 4]), np.array([0, 1, 1, 2])), 4).tolist()
     [0, 0, 1, -1]
@@ -322,10 +322,10 @@ def first_owner(masks: Masks, n_points: int) -> Int64Array:
 def transfer_values(
     points: Points, values: Int64Array, rank: Int64Array, targets: Points, wanted: BoolArray, cap_m: float = np.inf
 ) -> tuple[Int64Array, Float64Array]:
-    """Value and distance in metres of the nearest point with a rank, for each wanted target; -1 and infinity elsewhere.
+    """Value and distance in metres of the nearest point with a rank, for each wanted target; otherwise -1 and infinity.
 
-    Points of rank -1 take no part, nor do those farther than ``cap_m``. At equal distance the lower ``rank`` wins, then
-    the lower index. On ``points`` themselves a point with a rank keeps its own value, whatever shares its place.
+    Points of rank -1 and those farther than ``cap_m`` are ignored. At equal distance the lower ``rank`` wins, then the
+    lower index. On ``points`` themselves a point with a rank keeps its own value, even if others share its position.
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
     >>> values, distance = transfer_values(
@@ -353,7 +353,7 @@ def transfer_values(
 
 
 class _Asked:
-    """The nearest of some points for the targets of a scene, each of which is searched for once."""
+    """The nearest of some points for the targets of a scene, each searched only once."""
 
     def __init__(self, points: Points, targets: Points, cap_m: float) -> None:
         self._candidates, self._targets, self._cap_m = Candidates(points), targets, cap_m
@@ -375,7 +375,7 @@ def _asked(points: Points, targets: Points, cap_m: float) -> _Asked:
 
 
 def n_farther(distance: Float64Array) -> Int64Array:
-    """How many distances are above each coverage radius.
+    """The number of distances above each coverage radius.
 
     >>> n_farther(np.array([0.0, 0.03, 0.2])).tolist()
     [2, 1, 1]
@@ -393,21 +393,21 @@ def select(masks: Masks, keep: IntArray) -> Masks:
 
 
 def masks_of(prediction: Instances | Partition) -> Masks:
-    """The masks of a map on its own points, one a row of features of a partition."""
+    """The masks of a map on its own points, one per row of features for a partition."""
     if isinstance(prediction, Instances):
         return prediction
     return masks_of_partition(prediction.instance, len(prediction.features))
 
 
 def masks_of_partition(instance: IntArray, n_instances: int) -> Masks:
-    """The masks of one instance id a point, -1 for none.
+    """The masks from one instance id per point, -1 for none.
 
     >>> masks = masks_of_partition(np.array([1, -1, 0, 1]), 2)
     >>> masks.indptr.tolist(), masks.indices.tolist()
     ([0, 1, 3], [2, 0, 3])
     """
     order = np.flatnonzero(instance >= 0)
-    # numbers of two bytes are sorted in one walk
+    # two-byte integers are sorted in one pass
     order = order[np.argsort(instance[order].astype(np.min_scalar_type(instance.max(initial=0))), kind="stable")]
     sizes = np.bincount(instance[order], minlength=n_instances)
     return Masks(starts_of(sizes), order.astype(np.int32))

@@ -1,7 +1,7 @@
-"""From the points of a prediction to the points of the truth by more than the one nearest point.
+"""From predicted points to ground-truth points with more than the nearest point.
 
-Votes of the nearest points, as HOV-SG and OVO take them, and masks that reach every point near one of their own, as
-OpenLex3D's queries have it.
+Votes of the nearest points, as in HOV-SG and OVO, and masks that include every point near one of their own, as in
+OpenLex3D's queries.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids
 
-_MAX_CELLS = 4_000_000  # neighbours held at once
-_MAX_KEPT = 12_000_000  # neighbours kept, of 16 bytes each, where they may be asked for again
+_MAX_CELLS = 4_000_000  # neighbours in memory at once
+_MAX_KEPT = 12_000_000  # cached neighbours, of 16 bytes each, if they may be needed again
 
 
 def transfer_votes(
     points: Points, values: Int64Array, targets: Points, wanted: BoolArray, neighbours: int, cap_m: float = np.inf
 ) -> tuple[Int64Array, Float64Array]:
-    """What most of the ``neighbours`` nearest points say, and the distance of the nearest, for each wanted target.
+    """The majority value of the ``neighbours`` nearest points, and the distance of the nearest, for each wanted target.
 
-    Each of ``points`` (V, 3) has one vote, ``values`` (V,) from 0; of points at the same distance the lower indices
-    vote, of values with as many votes the smallest wins. -1 and infinity where no point is within ``cap_m`` or the
+    Each of ``points`` (V, 3) has one vote, ``values`` (V,) from 0; among points at the same distance the lower indices
+    vote, among values with equal votes the smallest wins. -1 and infinity if no point is within ``cap_m`` or the
     target is not wanted.
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
@@ -37,7 +37,7 @@ def transfer_votes(
     if not len(points) or not len(wanted_rows):
         return value, distance
     if is_remembering() and len(targets) * neighbours <= _MAX_KEPT:
-        # another rule wants others of the targets, and other values of the points
+        # another protocol needs other targets, and other values of the points
         place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours)
         place = place_of_all[wanted_rows]
         votes = np.where(all_distances <= cap_m, values[all_indices], -1)
@@ -60,7 +60,7 @@ def transfer_votes(
 
 @remembered
 def _neighbours_of_all(points: Points, targets: Points, neighbours: int) -> tuple[Int64Array, Float64Array, Int64Array]:
-    """The row of every target's place, and of each place the distances and indices of its nearest points."""
+    """The row of every target's position, and for each position the distances and indices of its nearest points."""
     places, place_of_target = _distinct_places(targets)
     search = _Search(points, neighbours)
     step = max(1, _MAX_CELLS // (neighbours + 1))
@@ -70,7 +70,7 @@ def _neighbours_of_all(points: Points, targets: Points, neighbours: int) -> tupl
 
 
 def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:
-    """Each place once, and the row of every point's place: the corners of faces share theirs with several others."""
+    """The distinct positions, and the row of every point's position: corners of several faces share one."""
     rows = np.asarray(points, np.float64)
     ids = row_ids(rows)
     _, first = np.unique(ids, return_index=True)
@@ -78,7 +78,7 @@ def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:
 
 
 def _most_votes(votes: Int64Array) -> Int64Array:
-    """The value of most votes in each row (R, K), the smallest of equals; votes of -1 are none.
+    """The value with most votes in each row (R, K), the smallest on ties; votes of -1 do not count.
 
     >>> _most_votes(np.array([[3, 1, 3, 1], [2, -1, -1, -1], [-1, -1, -1, -1]])).tolist()
     [1, 2, -1]
@@ -90,7 +90,7 @@ def _most_votes(votes: Int64Array) -> Int64Array:
 
 
 class _Search:
-    """The ``k`` nearest of a list of points, exact in float64; the lower indices of equals."""
+    """The ``k`` nearest of a list of points, exact in float64; the lower indices on ties."""
 
     def __init__(self, points: Points, k: int) -> None:
         from scipy.spatial import cKDTree
@@ -100,7 +100,7 @@ class _Search:
         self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
-        """Distances in metres and indices (Q, k), in no set order."""
+        """Distances in metres and indices (Q, k), in no particular order."""
         k, n = self.k, len(self.points)
         distances, indices = self.tree.query(queries, k=min(k + 1, n), workers=1)
         distances, indices = distances.reshape(len(queries), -1), indices.reshape(len(queries), -1).astype(np.int64)
@@ -111,7 +111,7 @@ class _Search:
         return distances[:, :k], indices
 
     def _lowest_of_equals(self, queries: Float64Array) -> Int64Array:
-        """Indices (Q, k) where the k-th neighbour has equals beyond it; their distances are those of the tree."""
+        """Indices (Q, k) if there are ties beyond the k-th neighbour; the distances are those of the tree."""
         answer = np.empty((len(queries), self.k), np.int64)
         open_rows = np.arange(len(queries))
         n_asked = self.k
@@ -134,7 +134,7 @@ class _Search:
 
 
 def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: float) -> Masks:
-    """The masks on ``targets``: a target is in every mask that has a point nearer than ``cap_m``.
+    """The masks on ``targets``: a target is in every mask with a point nearer than ``cap_m``.
 
     >>> masks = Masks(np.array([0, 1, 2]), np.array([0, 1]))
     >>> moved = transfer_each_mask(np.array([[0.0, 0, 0], [1, 0, 0]]), masks, np.array([[0.4, 0, 0], [0.6, 0, 0]]), 0.5)
@@ -159,7 +159,7 @@ def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: flo
 
 
 def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Float64Array, cap_m: float) -> Int64Array:
-    """The places nearer than ``cap_m`` to one of the points ``own``, ascending; only those in its box are looked at."""
+    """The positions nearer than ``cap_m`` to one of the points ``own``, ascending; searched only in their box."""
     from scipy.spatial import cKDTree
 
     low, high = own.min(axis=0) - cap_m, own.max(axis=0) + cap_m

@@ -1,7 +1,7 @@
-"""OpenLex3D's two measures of labels: how often each category is reached, and how well the right labels are ranked.
+"""OpenLex3D's two measures of labels: category frequencies and the ranking of the right labels.
 
 Source: openlex3d at commit 3dbad2b. Its per-point loops compare every point with all others; here points are counted
-by pair of object and predicted unit (an instance, or a point of a dense map), and all else is worked out a pair.
+per pair of object and predicted unit (an instance, or a point of a dense map), and the rest is computed per pair.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from su3d_bench.numerics.statistics import ratio
 
 SPACE = "openlex3d"
 _SYNONYMS, _DEPICTIONS, _VIS_SIM, _CLUTTER, _MISSING, _INCORRECT = range(len(CATEGORIES))
-_EPS = 1e-8  # of the left side of the box, as the original has it
+_EPS = 1e-8  # for the left side of the box, as in the original
 
 
-ROUNDING = 1e-6  # by how much a sum of shares may leave what it is a sum over
+ROUNDING = 1e-6  # tolerance for sums of shares
 
 
 @dataclass(frozen=True)
 class ObjectCounts(Counts):
-    """What one scene, or several, adds: a row for each object that has scored points.
+    """The counts of one scene or several: one row per object with scored points.
 
-    ``n_points`` (O,) int64; ``totals`` (O, V) float64, V values summed over the points, NaN where the object has none.
+    ``n_points`` (O,) int64; ``totals`` (O, V) float64, V values summed over the points, NaN if the object has none.
     """
 
     stored_as = "objects"
@@ -38,7 +38,7 @@ class ObjectCounts(Counts):
     totals: Float64Array = field(metadata=axes(ROWS, "values"))
 
     def contradiction(self) -> str | None:
-        """An object without points, or a total of shares that is more than its points."""
+        """An object without points, or a total of shares above its number of points."""
         if not (self.n_points > 0).all():
             return "'n_points' has an object without points"
         most = self.n_points[:, None] * (1 + ROUNDING)
@@ -50,7 +50,7 @@ class ObjectCounts(Counts):
 
 
 def combine(counts: Sequence[ObjectCounts]) -> Float64Array:
-    """The mean (V,) over the objects of the mean over each one's points; NaN rows are left out.
+    """The mean (V,) over objects of the mean over their points, without NaN rows.
 
     >>> combine([ObjectCounts(np.array([4, 1]), np.array([[2.0, np.nan], [1.0, 0.25]]))]).tolist()
     [0.75, 0.25]
@@ -59,7 +59,7 @@ def combine(counts: Sequence[ObjectCounts]) -> Float64Array:
 
 
 def _sums(counts: ObjectCounts) -> tuple[Float64Array, Int64Array]:
-    """The sum (V,) of the objects' means and the number (V,) of objects that have one."""
+    """The sum (V,) of the objects' means and the number (V,) of objects with one."""
     of_object = counts.totals / counts.n_points[:, None]
     has_value = ~np.isnan(of_object)
     return np.where(has_value, of_object, 0.0).sum(axis=0), has_value.sum(axis=0)
@@ -79,7 +79,7 @@ def resampled(counts: Sequence[ObjectCounts], weights: Int64Array) -> Float64Arr
 
 @dataclass(frozen=True)
 class ObjectLabels:
-    """The labels of one object, nearest in meaning first; ``clutter`` holds ids of objects that stand close to it."""
+    """The labels of one object, nearest in meaning first; ``clutter`` has the ids of objects close to it."""
 
     synonyms: tuple[str, ...]
     depictions: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ class ObjectLabels:
 class OpenLexTruth:
     """Labelled objects of a scene: ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none.
 
-    ``objects`` maps an object's id to its labels, ``prompts`` are all labels among which a method may choose.
+    ``objects`` maps an object's id to its labels, ``prompts`` are all labels that a method can choose from.
     """
 
     points: Float32Array
@@ -113,7 +113,7 @@ class OpenLexTruth:
             raise DataError(f"ground truth '{self.variant}': has no prompts; give the list of all labels")
 
     def by_first_synonym(self) -> GroundTruth:
-        """The objects that have a synonym, each an instance of the class of its first one."""
+        """The objects with a synonym, each an instance of the class of its first synonym."""
         first = {object_id: labels.synonyms[0] for object_id, labels in self.objects.items() if labels.synonyms}
         names = tuple(dict.fromkeys(first.values()))
         ids, row = np.unique(self.object_of_point, return_inverse=True)
@@ -130,7 +130,7 @@ class OpenLexTruth:
 
 
 def bare(label: str) -> str:
-    """A label without its spaces: labels are equal where these are, upper and lower case apart.
+    """A label without spaces and in lower case, for comparisons.
 
     >>> bare("tv stand")
     'tvstand'
@@ -143,7 +143,7 @@ def _bare_set(labels: Sequence[str]) -> set[str]:
 
 
 def scored_objects(objects: Mapping[int, ObjectLabels], excluded: Sequence[str]) -> list[int]:
-    """Ids, ascending, of the objects whose points have a category: with synonyms, none of them ``excluded``."""
+    """Ascending ids of the objects whose points have a category: those with synonyms, none of them ``excluded``."""
     without = _bare_set(excluded)
     return sorted(
         object_id
@@ -166,7 +166,7 @@ def category_table(
     for row, object_id in enumerate(object_ids):
         labels = objects[object_id]
         near = [objects[other] for other in labels.clutter if other in objects]
-        # the nearest category last: it overwrites the others
+        # the closest category last, so that it overwrites the others
         for category, known in (
             (_CLUTTER, [word for other in near for word in (*other.synonyms, *other.depictions, *other.vis_sim)]),
             (_VIS_SIM, labels.vis_sim),
@@ -179,11 +179,10 @@ def category_table(
 
 
 def point_categories(object_row: Int64Array, unit: Int64Array, top: Int64Array, table: Int64Array) -> Int64Array:
-    """The category of each point as an index of ``CATEGORIES``, -1 where its object has none.
+    """The category of each point as an index of ``CATEGORIES``, -1 if its object has none.
 
-    ``object_row`` (N,) is a row of ``table``, -1 for none; ``unit`` (N,) a row of ``top``, -1 where nothing is
-    predicted; ``top`` (U, n) holds the n labels of each unit as columns of ``table``. The best of a point's labels
-    counts.
+    ``object_row`` (N,) is a row of ``table``, -1 for none; ``unit`` (N,) a row of ``top``, -1 without a prediction;
+    ``top`` (U, n) has the n labels of each unit as columns of ``table``. The best of a point's labels counts.
 
     >>> table = np.array([[0, 5]])
     >>> point_categories(np.array([0, 0, 0, -1]), np.array([0, 1, -1, 0]), np.array([[1, 0], [1, 1]]), table).tolist()
@@ -200,7 +199,7 @@ def point_categories(object_row: Int64Array, unit: Int64Array, top: Int64Array, 
 
 
 def count_categories(object_row: Int64Array, category: Int64Array, n_objects: int) -> ObjectCounts:
-    """How many points of each object are in each category; objects without points are left out.
+    """The number of points of each object in each category, without objects that have no points.
 
     >>> counts = count_categories(np.array([0, 0, 2]), np.array([0, 4, 5]), 3)
     >>> counts.n_points.tolist(), counts.totals.tolist()
@@ -216,10 +215,10 @@ def count_categories(object_row: Int64Array, category: Int64Array, n_objects: in
 def rank_scores(
     ranks: Int64Array, first: int, last: int, n_others: int
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """How near each rank, from 0, is to the box ``first``..``last`` of ranks; 1 inside. Also its left and right part.
+    """The score of each rank, from 0, for the box ``first``..``last`` of ranks, 1 inside; and its left and right part.
 
-    ``n_others`` is the highest rank there is. Equations of compute_set_ranking_score; where the box ends at the highest
-    rank nothing can lie to its right, and the original divides by zero.
+    ``n_others`` is the highest rank. Equations of compute_set_ranking_score; if the box ends at the highest rank,
+    nothing can be to its right, and the original divides by zero.
 
     >>> [part.round(3).tolist() for part in rank_scores(np.array([0, 4, 8]), 3, 5, 11)]
     [[0.0, 1.0, 0.5], [0.0, 1.0, 1.0], [1.0, 1.0, 0.5]]
@@ -237,7 +236,7 @@ class RankedLabels:
     secondary: Int64Array
 
     def scores(self, rank_of_prompt: Int64Array) -> Float64Array:
-        """Overall, synonyms, secondary (U, 3) of units that rank the prompts (U, P) so; NaN where there is no label."""
+        """Overall, synonyms, secondary (U, 3) of units with these ranks of the prompts (U, P); NaN without a label."""
         n_synonyms, n = len(self.synonyms), len(self.synonyms) + len(self.secondary)
         highest = rank_of_prompt.shape[1] - 1
         of_synonyms, _, _ = rank_scores(rank_of_prompt[:, self.synonyms], 0, n_synonyms - 1, highest)
@@ -251,7 +250,7 @@ def _row_mean(values: Float64Array) -> Float64Array:
 
 
 def ranked_labels(labels: ObjectLabels, prompts: Sequence[str]) -> RankedLabels:
-    """The object's labels that the prompt list holds, a prompt that stands there twice at its first place.
+    """The indices of the object's labels in the prompt list, of the first occurrence if a prompt is repeated.
 
     >>> found = ranked_labels(ObjectLabels(("chair", "seat"), ("flower",), ("stool",)), ["stool", "x", "chair"])
     >>> found.synonyms.tolist(), found.secondary.tolist()
@@ -268,20 +267,20 @@ def ranked_labels(labels: ObjectLabels, prompts: Sequence[str]) -> RankedLabels:
 
 
 def top_labels(similarity: Float64Array, n: int) -> Int64Array:
-    """The ``n`` most similar labels of each row (U, P), best first, the first in the list of equals.
+    """The ``n`` most similar labels of each row (U, P), best first, on ties the first in the list.
 
     >>> top_labels(np.array([[0.1, 0.9, 0.1]]), 2).tolist()
     [[1, 0]]
     """
     left, top = similarity.copy(), np.empty((len(similarity), n), np.int64)
-    for place in range(n):  # a full sort of thousands of labels for a few of them takes ten times as long
+    for place in range(n):  # a full sort of thousands of labels would take ten times as long
         top[:, place] = left.argmax(axis=1)
         left[np.arange(len(left)), top[:, place]] = -np.inf
     return top
 
 
 def rank_of_labels(similarity: Float64Array) -> Int64Array:
-    """The rank (U, P) of each label, from 0 for the most similar one, the first in the list of equals.
+    """The rank (U, P) of each label, from 0 for the most similar one, on ties the first in the list.
 
     >>> rank_of_labels(np.array([[0.1, 0.9, 0.1]])).tolist()
     [[1, 0, 2]]
@@ -293,7 +292,7 @@ def rank_of_labels(similarity: Float64Array) -> Int64Array:
 
 
 def count_ranks(object_row: Int64Array, unit: Int64Array, scores: Float64Array, n_objects: int) -> ObjectCounts:
-    """The scores of each object summed over its points.
+    """The scores of each object, summed over its points.
 
     ``scores`` (R, 3) belong to the R distinct pairs of ``object_row`` and ``unit`` in ascending order, as
     ``distinct_pairs`` lists them.
@@ -307,7 +306,7 @@ def count_ranks(object_row: Int64Array, unit: Int64Array, scores: Float64Array, 
 
 
 def distinct_pairs(object_row: Int64Array, unit: Int64Array) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Object row, unit and number of points of each pair that occurs, ascending; points without either are left out.
+    """Object row, unit and number of points of each existing pair, ascending, ignoring points without either.
 
     >>> [part.tolist() for part in distinct_pairs(np.array([1, 0, 1, -1]), np.array([5, 5, 5, 5]))]
     [[0, 1], [5, 5], [1, 2]]

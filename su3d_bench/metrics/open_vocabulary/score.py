@@ -27,15 +27,15 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 
 SPACE = "queries"
-_SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched
+_SMALLEST_RANGE = 1e-8  # openlex3d's lower bound of the range that similarities are rescaled by
 
 
 @dataclass(frozen=True)
 class TextQuery:
-    """A text and the ids of the objects that it speaks of.
+    """A text and the ids of the objects that it refers to.
 
-    ``groups``: those in which it is scored apart from others, such as ``unique``; ``name``: what the file calls the
-    object, '' where it does not.
+    ``groups``: those in which it is also scored separately, such as ``unique``; ``name``: the object's name in the
+    file, '' if it has none.
     """
 
     text: str
@@ -45,15 +45,15 @@ class TextQuery:
 
     def __post_init__(self) -> None:
         if len(set(self.object_ids)) != len(self.object_ids):
-            raise DataError(f"query '{self.text[:60]}': an object stands there twice; name each once")
+            raise DataError(f"query '{self.text[:60]}': an object is listed twice; list each once")
 
 
 @dataclass(frozen=True)
 class QueryTruth:
     """Objects of a scene and the texts that ask for them.
 
-    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none. ``alignment`` (4, 4): the rigid motion
-    into the frame whose axes are the walls, where the dataset has one that its points were not moved by.
+    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none. ``alignment`` (4, 4): the rigid transform
+    to the frame aligned with the walls, if the dataset has one that is not applied to its points.
     """
 
     points: Float32Array
@@ -66,9 +66,9 @@ class QueryTruth:
 
 
 def confidences(similarity: Float64Array, rule: Literal["similarity", "similarity-min-max"]) -> Float64Array:
-    """The confidence (K, Q) of each mask for each query: its cosine, or that stretched to 0..1 over the masks.
+    """The confidence (K, Q) of each mask for each query: its cosine, or the cosine rescaled to 0..1 over the masks.
 
-    Under ``similarity-min-max`` the best mask of every query has confidence 1, however little it resembles the text.
+    With ``similarity-min-max`` the best mask of every query has confidence 1, however low its similarity.
 
     >>> confidences(np.array([[0.5, 0.1], [0.0, 0.1], [-0.5, 0.1]]), "similarity-min-max").tolist()
     [[1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]
@@ -93,9 +93,9 @@ def per_scene(
 ) -> InstanceCounts:
     """The additive counts of one scene: ``masks`` over its points with ``confidence`` (K, Q) for each query.
 
-    The ``top_k`` masks of each query count, the first of equals, and of these those of the minimum size. Objects below
-    it are no instances; a query that is left without one still has its false positives. An object is matched with the
-    masks by falling confidence or, as ScanNet's script and those made from it do, in their own order.
+    The ``top_k`` masks of each query count, the first on ties, and of these those of at least the minimum size. Smaller
+    objects are not instances; a query without any instance still has its false positives. An object is matched with the
+    masks by descending confidence or, as in ScanNet's script and its derivatives, in their own order.
 
     >>> masks = Masks(np.array([0, 2, 4]), np.array([0, 1, 2, 3]))
     >>> found = TextQuery("seat", (7,)), TextQuery("lamp", (8,))
@@ -131,13 +131,13 @@ def per_scene(
     return InstanceCounts.joined(parts)
 
 
-_NOT_KNOWN = "what the truth itself would score is not known"
+_NOT_KNOWN = "the ground-truth ceiling is unknown"
 NO_CEILING = (
-    f"{_NOT_KNOWN}: masks grow by the threshold, over their neighbours too, and each query's best mask has "
-    "confidence 1, so that perfect masks with perfect features need not reach 1"
+    f"{_NOT_KNOWN}: masks grow by the threshold, also over their neighbours, and each query's best mask has "
+    "confidence 1, so perfect masks with perfect features may score below 1"
 )
-NO_QUERY_CEILING = f"{_NOT_KNOWN}: how well perfect masks are ranked is up to the encoder"
-NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
+NO_QUERY_CEILING = f"{_NOT_KNOWN}: the ranking of perfect masks depends on the encoder"
+NEEDS_FEATURES = "needs features to compare with texts, the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
 
 
@@ -161,7 +161,7 @@ class CategoriesMetric(Metric[ObjectCounts]):
         unit[scored] = np.append(unit_of_point, -1)[nearest]
         if cap_m is not None:
             unit[distance > cap_m] = -1
-        # the units that some point has, ascending, and each point's place among them, -1 for none
+        # the units with points, ascending, and each point's index among them, -1 for none
         used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
         counts = count(rules, truth, prediction, encoder, ids, object_row, used, transfer.rows_of(used, unit))
@@ -181,9 +181,9 @@ class CategoriesMetric(Metric[ObjectCounts]):
 
 
 def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64Array]:
-    """The points (M, 3) that belong to a unit, an instance or a point of a dense map, and that unit (M,).
+    """The points (M, 3) that belong to a unit (an instance or a point of a dense map), and the unit (M,) of each.
 
-    Reduced to the mean of those in a voxel with the unit of the nearest of all.
+    Downsampled to the mean of the points in each voxel, with the unit of the point nearest to it.
     """
     if isinstance(prediction, DenseFeatures):
         unit = np.where(has_feature(prediction), np.arange(len(prediction.points)), -1)
@@ -200,10 +200,10 @@ def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64A
 
 
 def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
-    """The mean of the points in each voxel of a grid at the world's origin, as Open3D's tensor clouds are reduced.
+    """The mean of the points in each voxel of a grid at the world's origin, as in Open3D's tensor point clouds.
 
-    Cells, sums and means are float32, to the last bit those of Open3D 0.19: of two points in a voxel it is this
-    rounding alone that says which one the mean is nearer to.
+    Cells, sums and means are float32, equal to those of Open3D 0.19 in every bit: with two points in a voxel, only
+    this rounding decides which one the mean is nearer to.
 
     >>> voxel_means(np.array([[0.01, 0, 0], [0.03, 0, 0], [0.06, 0, 0]], np.float32), 0.05)[:, 0].tolist()
     [0.019999999552965164, 0.05999999865889549]
@@ -253,7 +253,7 @@ def _count_ranks(
 ) -> ObjectCounts:
     labels = [openlex3d.ranked_labels(truth.objects[object_id], truth.prompts) for object_id in ids]
     rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
-    if len(units) == 0 and (object_row >= 0).any():  # nothing is predicted: no label has a rank, each counts 0
+    if len(units) == 0 and (object_row >= 0).any():  # no prediction: no label has a rank, each counts 0
         n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
         has = np.array([(len(ranked.synonyms) > 0, len(ranked.secondary) > 0) for ranked in labels])
         totals = np.where(np.column_stack([has.any(axis=1), has]), 0.0, np.nan)
@@ -273,7 +273,7 @@ def _count_ranks(
 def _similarity_blocks(
     rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None, used: Int64Array
 ) -> Iterator[Float64Array]:
-    """The cosines (B, P) of the units ``used`` with the prompts, a block of units after another."""
+    """The cosines (B, P) of the units ``used`` with the prompts, in blocks of units."""
     features, known = labelling.needed_features(rules, prediction, encoder)
     text = labelling.text_features(rules, truth.prompts, features, known)
     for start in range(0, len(used), _BLOCK_UNITS):

@@ -1,1 +1,1 @@
-"""Protocols: their files, the rules that these hold, and how rules are found by name."""
+"""Protocols: their files, the rules in them, and lookup by name."""

@@ -1,4 +1,4 @@
-"""The kinds of evaluation: what each needs of a protocol's rules, which numbers it has, what it takes of a map."""
+"""The kinds of evaluation: the rules that each needs, its values, and what it takes from a map."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from su3d_bench.metrics.protocols.model import CURVE_FIELDS, Kind, ProtocolRules
 Allowed = Mapping[str, tuple[object, ...]]
 GENERATED: Allowed = {"questions": ("generated",)}
 AP_NAMES = ("AP", "AP50", "AP25")
-GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # what boxes tell, as numerics.relations has it
+GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # follow from boxes, see numerics.relations
 OBJECT_RANKS = (5, 10, 25, 100, 250, 500)  # config/eval_graph.yaml of hovsg/HOV-SG at 71a8069
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
 
 
 class SemanticRules(ProtocolRules):
-    """A class a point."""
+    """One class per point."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
         ("conceptgraphs", "scannet", "hovsg", "ovo"), ("mAcc", "mIoU", "F-mIoU")
@@ -30,7 +30,7 @@ class SemanticRules(ProtocolRules):
 
 
 class TopKRules(ProtocolRules):
-    """The likeliest classes of a point, against one label or several."""
+    """The most likely classes of a point, compared with one label or several."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannetpp": ("mIoU", "mAcc")}
     candidates = ("object-points",)
@@ -57,12 +57,12 @@ class InstanceRules(ProtocolRules):
         if self.class_agnostic is None:
             return ("classes", "vocabulary", *CURVE_FIELDS)
         if self.labels is not None:
-            raise ValueError("labels: where no label counts, neither one nor several do")
+            raise ValueError("labels: not allowed if labels are not scored")
         return ("classes", *CURVE_FIELDS) if self.class_agnostic == "scored" else CURVE_FIELDS
 
 
 class PanopticRules(ProtocolRules):
-    """Every point in one segment of a thing or of stuff."""
+    """Every point in one segment of a thing or stuff."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
         ("panopticapi", "semantic-kitti"),
@@ -92,7 +92,7 @@ class BoxRules(ProtocolRules):
 
 
 class QueryRules(ProtocolRules):
-    """Masks ranked for each text, of a file of queries or, with ``questions``, of a scene's own."""
+    """Masks ranked for each text, from a query file or, with ``questions``, from the scene itself."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(("query-ap", "opensun3d"), AP_NAMES)
     candidates = ("each-mask", "map-points")
@@ -109,7 +109,7 @@ class QueryRules(ProtocolRules):
 
 
 class CategoryRules(ProtocolRules):
-    """How near a point's label comes to those of its object."""
+    """How close a point's label is to those of its object."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "openlex3d-topn": CATEGORIES,
@@ -157,10 +157,10 @@ class RelationRules(ProtocolRules):
     def _check_metric(self) -> None:
         super()._check_metric()
         if len(set(self.predicates)) != len(self.predicates):
-            raise ValueError("predicates: each may stand there once")
+            raise ValueError("predicates: must not repeat")
         strange = [name for name in self.predicates if name not in GEOMETRIC]
         if self.relations == "geometric" and strange:
-            raise ValueError(f"predicates: boxes do not tell '{strange[0]}', but {', '.join(GEOMETRIC)}")
+            raise ValueError(f"predicates: '{strange[0]}' needs more than boxes; use {', '.join(GEOMETRIC)}")
 
 
 class _GraphRules(ProtocolRules):
@@ -171,7 +171,7 @@ class _GraphRules(ProtocolRules):
 
 
 class ObjectRules(_GraphRules):
-    """Objects, and where the true category stands among all."""
+    """Objects, and the rank of the true category among all."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "hovsg-objects": (
@@ -184,7 +184,7 @@ class ObjectRules(_GraphRules):
 
     @property
     def n_labels(self) -> int | None:
-        """All that there are: the whole ranking counts."""
+        """All ranks: the whole ranking counts."""
         return None
 
 
@@ -204,7 +204,7 @@ class PlaceRules(_GraphRules):
 
 
 class _JudgedRules(ProtocolRules):
-    """What people are asked otherwise."""
+    """Questions that annotators answer in the originals."""
 
     is_judged = True
     needs_own_points = True
@@ -242,7 +242,7 @@ class ObjectChainRules(_JudgedRules):
 
 
 class PresenceQuestionRules(ProtocolRules):
-    """Is there such a thing at all?"""
+    """Whether such an object exists in the scene."""
 
     is_judged = True
     needs_own_points = True
@@ -273,7 +273,7 @@ class AnnotationRules(_JudgedRules):
 
 
 class ReasoningRules(_JudgedRules):
-    """Questions that boxes settle."""
+    """Questions that boxes can answer."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"reasoning": ("answer", "objects")}
     uses_names = True

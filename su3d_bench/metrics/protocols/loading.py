@@ -1,7 +1,7 @@
-"""Named, versioned evaluations, as the files of ``rules/`` and files of one's own say them.
+"""Named, versioned evaluations from the files of ``rules/`` and from user-defined files.
 
-A protocol is chosen by name, or by the path of a TOML file of the same form. Unknown keys and wrong values are errors
-of one line that name the file and the key.
+A protocol is chosen by name, or by the path of a TOML file of the same form. Unknown keys and wrong values are
+one-line errors that name the file and the key.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _OF_CODE = ("code", "commit", "files", "licence", "compared")
 class Original(BaseModel):
     """The table ``[original]`` of a protocol's file.
 
-    ``code`` is a repository of GitHub, as owner/name, whose ``files`` at ``commit`` evaluate; ``licence`` is that of
-    the code and ``data`` the terms of what is scored, "none stated" where nobody says. ``compared`` says which numbers
-    of both were held against each other, or why none were; ``problems``: how many made ones both answered, no number of
-    them farther apart than ``largest_difference``; ``cases``: where some lie with the original's answers, as paths from
-    the repository's root or patterns of such. ``none`` says why there is no original, in place of all but ``data``.
+    ``code`` is a GitHub repository, as owner/name, whose ``files`` at ``commit`` evaluate; ``licence`` is that of the
+    code and ``data`` the terms of the scored data, "none stated" if unknown. ``compared`` states which values of both
+    were compared, or why none were; ``problems``: the number of generated problems that both scored, with no value
+    differing by more than ``largest_difference``; ``cases``: files with results of the original, as paths or patterns
+    from the repository's root. ``none`` states why there is no original, instead of everything except ``data``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
@@ -52,19 +52,19 @@ class Original(BaseModel):
         there = [field for field in _OF_CODE if getattr(self, field)]
         expected = [*_OF_CODE] if self.none is None else []
         if there != expected or (self.none is not None and (self.problems or self.cases)):
-            raise ValueError(f"give {', '.join(_OF_CODE)}, or none = why there is no original with data alone")
+            raise ValueError(f"give {', '.join(_OF_CODE)}, or only data and none = why there is no original")
         if (self.largest_difference is not None) != (self.problems > 0):
-            raise ValueError("largest_difference: belongs to problems that both answered, and these need it")
+            raise ValueError("largest_difference: give it if, and only if, there are problems")
         return self
 
     @property
     def place(self) -> str | None:
-        """Where the code can be read; None where there is no original."""
+        """The address of the code; None without an original."""
         return None if self.code is None else f"https://github.com/{self.code}/tree/{self.commit}"
 
     @property
     def comparison_summary(self) -> str:
-        """What was compared, how many problems both answered, by how much they differ and where cases lie.
+        """What was compared, the number of problems, the largest difference and the files with cases.
 
         >>> Original(none="ours", data="made by the program").comparison_summary
         ''
@@ -73,14 +73,14 @@ class Original(BaseModel):
             return ""
         parts = [self.compared]
         if self.largest_difference is not None:
-            parts.append(f"{self.problems:,} made problems, largest difference {self.largest_difference:g}")
+            parts.append(f"{self.problems:,} generated problems, largest difference {self.largest_difference:g}")
         if self.cases:
             parts.append(f"cases in {', '.join(self.cases)}")
         return "; ".join(parts)
 
     @property
     def facts(self) -> dict[str, str]:
-        """Everything by what it is called where it is shown, in order, without what is not said."""
+        """All entries by their displayed names, in order, without empty ones."""
         said = {
             "original": f"{self.code} at {self.commit}" if self.none is None else f"none: {self.none}",
             "its files": ", ".join(self.files),
@@ -93,22 +93,22 @@ class Original(BaseModel):
 
 @dataclass(frozen=True)
 class ResolvedOriginal:
-    """The original that a protocol's file states, or takes over from the protocol called ``base`` that it extends."""
+    """The original in a protocol's file, or inherited from the protocol called ``base`` that it extends."""
 
     original: Original
     base: str | None
 
     @property
     def facts(self) -> dict[str, str]:
-        """As those of the original; a protocol that takes it over has rules of its own on top."""
+        """Those of the original; a protocol that inherits it has additional rules."""
         told = self.original.facts
         return told if self.base is None else {"original of": f"{self.base}, which these rules extend", **told}
 
 
 def original_of(name: str) -> ResolvedOriginal | None:
-    """What the protocol called ``name``, or a file, says of its original; None where a file of one's own says nothing.
+    """The original of the protocol or file ``name``; None for a user-defined file that does not state one.
 
-    A ``ConfigError`` for a table that is not whole, and for a built-in protocol without one.
+    ``ConfigError`` for an incomplete table, and for a built-in protocol without one.
 
     >>> original_of("scannet-instance").original.code
     'ScanNet/ScanNet'
@@ -118,7 +118,7 @@ def original_of(name: str) -> ResolvedOriginal | None:
     if content.original is None:
         if RULES in file.parents:
             raise ConfigError(
-                f"{file}: the table [original] is missing; it says whose evaluation this is, or none = why"
+                f"{file}: the table [original] is missing; it states the source of the evaluation, or none = why"
             )
         return None
     where, table = content.original
@@ -126,16 +126,16 @@ def original_of(name: str) -> ResolvedOriginal | None:
 
 
 def read_original(file: Path, table: Mapping[str, Any]) -> Original:
-    """The table ``[original]`` of a file, as TOML has it; a ``ConfigError`` of one line where it is none."""
+    """The table ``[original]`` of a file; a one-line ``ConfigError`` if it is invalid."""
     try:
         return Original.model_validate(_with_tuples(table))
     except ValidationError as error:
         raise ConfigError(_first_line([file], error, "original")) from error
 
 
-RULES = Path(__file__).parents[1] / "rules"  # a folder for the protocols of each dataset
+RULES = Path(__file__).parents[1] / "rules"  # one folder per dataset
 CLASS_TABLES = RULES / "classes"  # no protocols
-HEADING = ""  # stands for the comments above the first rule of a file
+HEADING = ""  # key of the comments above the first rule of a file
 _KEY = re.compile(r"(\w+)\s*=")
 _SECTION = re.compile(r"\[(\w+)\]")
 _COMMENT = re.compile(r"""(?:[^"'#]|"[^"]*"|'[^']*')*#\s*(.*)""")
@@ -154,13 +154,13 @@ def _places() -> dict[str, Path]:
 
 @cache
 def class_names() -> tuple[str, ...]:
-    """Every name of the class tables, each once, those of the smaller tables first."""
+    """All names of the class tables, without repeats, those of smaller tables first."""
     tables = [_class_rows(path) for path in sorted(CLASS_TABLES.glob("*.toml"))]
     return tuple(dict.fromkeys(str(row[1]) for table in sorted(tables, key=len) for row in table))
 
 
 def rules_files(name: str) -> tuple[Path, ...]:
-    """Where the rules called ``name`` are read from: their own file, then the one that it extends, and so on."""
+    """The files of the rules called ``name``: their own file, then the one that it extends, and so on."""
     return read_content(rules_file(name)).files
 
 
@@ -171,7 +171,7 @@ def rules_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class Content:
-    """All rules that a file sets or extends, as ``values``; ``files``: the file itself, the one that it extends, ...
+    """All rules that a file sets or inherits, as ``values``; ``files``: the file itself, the one that it extends, ...
 
     ``original``: the first of them with a table of that name, and the table.
     """
@@ -182,10 +182,10 @@ class Content:
 
 
 def read_content(path: Path) -> Content:
-    """What a TOML file holds, where ``classes`` names a class table or lists rows [id, name] or [id, name, group].
+    """The content of a TOML file; ``classes`` names a class table or lists rows [id, name] or [id, name, group].
 
-    A file that ``extends`` another, by a protocol's name or by a path from its own folder, has all its rules but those
-    that it sets itself; sections are joined key by key, but for ``[original]``, which is no rule.
+    A file that ``extends`` another, by a protocol's name or by a path relative to its own folder, inherits all rules
+    that it does not set itself; sections are merged key by key, except ``[original]``, which is not a rule.
     """
     chain = _chain(path)
     files = tuple(file for file, _ in chain)
@@ -212,7 +212,7 @@ def read_content(path: Path) -> Content:
 
 
 def _class_rows(path: Path) -> list[Any]:
-    """The rows of a class table: those of the one that it ``extends``, then its own.
+    """The rows of a class table: those of the table that it ``extends``, then its own.
 
     With ``groups`` of ``thirds`` the first third of all rows, rounded down, is head, the second common, the next tail.
     """
@@ -228,7 +228,7 @@ def _class_rows(path: Path) -> list[Any]:
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """A protocol's file and what it holds, the file that it extends, and so on."""
+    """A protocol's file with its content, the file that it extends, and so on."""
     chain: list[tuple[Path, dict[str, Any]]] = []
     while True:
         content = _read_toml(path)
@@ -258,12 +258,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return parse_toml(file_text(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits, nested thousands deep
-        raise ConfigError(f"{path}: is no valid TOML: {error}") from error
+    except (ValueError, RecursionError) as error:  # invalid TOML or UTF-8, thousands of digits, nested thousands deep
+        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
 
 
 def line_of(files: Sequence[Path], key: str) -> str:
-    """``path:line`` of the first line that sets ``key``, or the first file alone."""
+    """``path:line`` of the first line that sets ``key``, or only the first file."""
     for path in files:
         for number, line in enumerate(file_text(path).splitlines(), start=1):
             if re.match(rf"\s*{re.escape(key)}\s*=", line):
@@ -272,7 +272,7 @@ def line_of(files: Sequence[Path], key: str) -> str:
 
 
 def remarks_of(files: Sequence[Path]) -> dict[str, list[str]]:
-    """The comments of a protocol's file and of those that it extends; one that sets a rule alone speaks of it."""
+    """The comments of a protocol's file and of those that it extends, each rule with those of the file that sets it."""
     each = [read_remarks(file) for file in files]
     remarks = {key: lines for own in reversed(each) for key, lines in own.items()}
     remarks[HEADING] = list(each[0].get(HEADING, []))
@@ -282,9 +282,9 @@ def remarks_of(files: Sequence[Path]) -> dict[str, list[str]]:
 
 
 def read_remarks(file: Path) -> dict[str, list[str]]:
-    """The comments of a protocol's file by the rule that they stand at or above, the first ones as its heading.
+    """The comments of a protocol's file by the rule that they are at or above, the first ones as its heading.
 
-    A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
+    A comment ``no cap_m ...`` belongs to the rule that it names; comments without a following rule belong to their
     section.
     """
     remarks: dict[str, list[str]] = {}
@@ -309,13 +309,13 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
 
 
 def protocols_for(dataset: str) -> list[str]:
-    """The protocols under which a dataset is scored unless others are named."""
+    """The default protocols of a dataset."""
     known = map(load_protocol, protocol_names())
     return [rules.name for rules in known if rules.by_default and dataset in rules.datasets]
 
 
 def not_comparable_with(rules: ProtocolRules) -> list[str]:
-    """Protocols whose numbers must not stand beside those of ``rules``: it names them, or they name it."""
+    """Protocols whose values are not comparable with those of ``rules``: it names them, or they name it."""
     naming = [name for name in protocol_names() if rules.name in load_protocol(name).not_comparable_with]
     return sorted({*rules.not_comparable_with, *naming})
 
@@ -323,7 +323,7 @@ def not_comparable_with(rules: ProtocolRules) -> list[str]:
 def load_protocol(name: str) -> ProtocolRules:
     """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``.
 
-    A ``ConfigError`` where there is none of that name, or the file is none.
+    ``ConfigError`` if there is no such protocol, or the file is invalid.
 
     >>> import su3d_bench as su3d
     >>> rules = su3d.load_protocol("rooms-instance")
@@ -358,7 +358,7 @@ def read_protocol(path: Path) -> ProtocolRules:
 
 
 def read_rules(values: Mapping[str, Any], where: str) -> ProtocolRules:
-    """The rules that ``as_json`` of some gave; a ``ConfigError`` that begins with ``where`` if these are none."""
+    """The rules from their ``as_json``; a ``ConfigError`` that begins with ``where`` if invalid."""
     try:
         return _made(values)
     except (ValidationError, RecursionError) as error:
@@ -372,7 +372,7 @@ def _made(values: Mapping[str, Any]) -> ProtocolRules:
 
 
 def _with_tuples(value: Any) -> Any:
-    """TOML knows lists alone; the strict model wants its tuples."""
+    """Lists as tuples: TOML has only lists, the strict model needs tuples."""
     if isinstance(value, list):
         return tuple(_with_tuples(item) for item in value)
     if isinstance(value, dict):
@@ -381,8 +381,8 @@ def _with_tuples(value: Any) -> Any:
 
 
 def _first_line(files: Sequence[Path], error: ValidationError, *section: str) -> str:
-    """The first complaint as one line with the file, the line and, for an unknown key, the likely one."""
-    # a misspelt key is both unknown and, under its right name, missing: the first says more
+    """The first validation error as one line with the file, the line and, for an unknown key, a suggestion."""
+    # a misspelt key is both unknown and, under its right name, missing: the first is more helpful
     first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     path = [*section, *map(str, first["loc"])]
     key = ".".join(path)

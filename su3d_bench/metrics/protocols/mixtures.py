@@ -1,7 +1,7 @@
-"""In which rules two protocols differ, and the protocols between them: some rules of the one, the others of the other.
+"""The rules in which two protocols differ, and the protocols between them: some rules of each.
 
-Rules that depend on one another move together: those of which one alone makes no protocol, such as a class list and the
-names in ``ignore``.
+Rules that depend on each other are changed together: those for which one alone gives no valid protocol, such as a
+class list and the names in ``ignore``.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.compatibility import ID_LISTS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
-# What names a protocol, says where it is used or what of it is shown, and moves no number.
+# Fields that name a protocol, or state its use or display, and do not affect any value.
 NAMING = ("name", "version", "summary", "datasets", "by_default", "headline", "not_comparable_with")
-# Says whose features were named; that text tower is the run's own, whatever the rule.
+# The encoder of the features; the text tower is that of the run, whatever the rule.
 CONSTANT_RULES = ("encoder",)
 
 
 @dataclass(frozen=True)
 class RuleDifference:
-    """A rule, as ``transfer.cap_m``, and its plain value in either protocol."""
+    """A rule, such as ``transfer.cap_m``, and its plain value in each protocol."""
 
     rule: str
     first: Any
@@ -55,7 +55,7 @@ def differing(first: ProtocolRules, second: ProtocolRules) -> list[RuleDifferenc
 
 
 def plain(value: Any) -> Any:
-    """A rule as JSON has it."""
+    """The JSON value of a rule."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     return [plain(item) for item in value] if isinstance(value, tuple) else value
@@ -63,20 +63,20 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Mixtures:
-    """The protocols between two of one kind, whose common values can be compared; ``ConfigError`` for any others."""
+    """The protocols between two of the same kind with common values; ``ConfigError`` for any others."""
 
     first: ProtocolRules
     second: ProtocolRules
 
     def __post_init__(self) -> None:
-        differing(self.first, self.second)  # of one kind
+        differing(self.first, self.second)  # checks that both are of one kind
         if self.first.label_space != self.second.label_space:
             raise ConfigError(
                 f"{self.first.name} scores the labels of '{self.first.label_space}' and {self.second.name} those of "
-                f"'{self.second.label_space}': no truth has both"
+                f"'{self.second.label_space}': no ground truth has both"
             )
         if not self.values:
-            raise ConfigError(f"{self.first.name} and {self.second.name} have no value of one name")
+            raise ConfigError(f"{self.first.name} and {self.second.name} have no value with the same name")
 
     @property
     def values(self) -> tuple[str, ...]:
@@ -85,13 +85,13 @@ class Mixtures:
 
     @cached_property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """The rules that differ and can move a number, those together that go together.
+        """The rules that differ and can affect a value, grouped if they depend on each other.
 
-        Merged until every choice of groups makes a protocol.
+        Merged until every choice of groups gives a valid protocol.
         """
         rules = [one.rule for one in differing(self.first, self.second) if one.rule not in CONSTANT_RULES]
         groups: list[tuple[str, ...]] = [(rule,) for rule in rules]
-        # Ground truths whose class ids are of a list of their own take the classes with them.
+        # Ground truths with their own list of class ids are grouped with the classes.
         own_ids = [ID_LISTS.get(one.ground_truth) for one in (self.first, self.second)]
         if own_ids[0] != own_ids[1]:
             groups = _merged(groups, [group for group in groups if group[0] in ("classes", "ground_truth")])
@@ -100,7 +100,7 @@ class Mixtures:
         return tuple(groups)
 
     def of(self, groups: Collection[int]) -> ProtocolRules:
-        """The first protocol with these ``groups`` of rules, by their numbers, as the second has them."""
+        """The first protocol with these ``groups`` of rules, by index, from the second."""
         return self._with([rule for number in sorted(groups) for rule in self.groups[number]])
 
     def _with(self, moved: Sequence[str]) -> ProtocolRules:
@@ -114,7 +114,7 @@ class Mixtures:
         return type(self.first).model_validate(values)
 
     def _inseparable(self, groups: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]] | None:
-        """Two groups of which one alone makes no protocol; None where every choice makes one."""
+        """Two groups of which one alone gives no valid protocol; None if every choice is valid."""
         for chosen in (list(some) for n in range(1, len(groups)) for some in combinations(groups, n)):
             if self._is_protocol(chosen):
                 continue
@@ -136,7 +136,7 @@ class Mixtures:
 
 
 def _merged(groups: Sequence[tuple[str, ...]], together: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """``groups`` with those of ``together`` as one, where the first of them stood."""
+    """``groups`` with those of ``together`` merged at the position of the first."""
     if len(together) < 2:
         return list(groups)
     one = tuple(rule for group in groups if group in together for rule in group)

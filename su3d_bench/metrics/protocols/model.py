@@ -1,4 +1,4 @@
-"""Everything that moves a number of an evaluation."""
+"""The rules of an evaluation: everything that affects its values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.core.errors import suggest
 
-# Each list stands here alone: what goes by a kind or a metric has keys of this type, and mypy finds a misspelt one.
+# The only list of each: mappings by kind or metric have keys of this type, so that mypy finds a misspelt one.
 Kind = Literal[
     "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories", "grounding", "object-chains",
     "relations", "objects", "places", "retrieval", "presence", "annotation", "reasoning",
@@ -35,7 +35,7 @@ class _Strict(BaseModel):
 
 
 class ClassEntry(_Strict):
-    """A class of the label set: its id in the label space, its name, the group it is averaged in."""
+    """A class of the label set: its id in the label space, its name, and its group for averages."""
 
     id: Annotated[int, Field(ge=0)]
     name: str
@@ -43,17 +43,17 @@ class ClassEntry(_Strict):
 
 
 class TransferRules(_Strict):
-    """How a prediction on other points than the truth's reaches the scored points.
+    """How a prediction on other points than the ground truth's is transferred to the scored points.
 
     ``candidates``: ``object-points`` (only points that belong to an instance, as ConceptGraphs concatenates its object
-    clouds), ``map-points`` (all points of the map; the nearest being background means no instance) or ``each-mask`` (a
-    point is in every mask that has a point nearer than the cap). ``neighbours``: above 1 a point takes the class that
-    most of so many nearest object points have, or with ``votes`` of ``masks`` that of the object that most of them
-    belong to, the first of equals; objects that overlap vote each.
-    ``cap_m``: farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing.
-    Where ``evaluation_voxel_m`` is above 0, each mask is first reduced to one point a voxel; under kind ``categories``
-    the whole cloud is, to the mean of the points. With a single neighbour, and where masks are voted for, predictions
-    on the scored points themselves are taken as they are.
+    clouds), ``map-points`` (all points of the map; no instance if the nearest is background) or ``each-mask`` (a point
+    is in every mask that has a point nearer than the cap). ``neighbours``: above 1 a point takes the majority class of
+    that many nearest object points, or with ``votes`` of ``masks`` that of the object that most of them belong to, the
+    first on ties; overlapping objects vote separately.
+    ``cap_m``: farther neighbours do not count, no cap if absent; a point without a neighbour has no prediction.
+    If ``evaluation_voxel_m`` is above 0, each mask is first downsampled to one point per voxel; for kind ``categories``
+    the whole cloud is, to the mean of the points. With a single neighbour, and with votes of masks, predictions on the
+    scored points themselves are used unchanged.
     """
 
     candidates: Literal["object-points", "map-points", "each-mask"]
@@ -64,11 +64,11 @@ class TransferRules(_Strict):
 
 
 class MergeRules(_Strict):
-    """When a mask is faulty: over-merged or under-merged.
+    """When a mask counts as over-merged or under-merged.
 
-    ``over_merged_share``: of the object vertices that it covers, at least this share belongs to other objects than the
-    one that it covers most. ``under_merged_share``: of the vertices of that object that all instances which stand for
-    it cover, one after another, it covers less than this share; so one thing twice is under-merged too.
+    ``over_merged_share``: at least this share of the object vertices that it covers belongs to other objects than the
+    one that it covers most. ``under_merged_share``: it covers less than this share of the vertices of that object that
+    all instances assigned to it cover, counted per instance; so a duplicate is under-merged too.
     """
 
     over_merged_share: Annotated[float, Field(gt=0, le=1)]
@@ -76,19 +76,19 @@ class MergeRules(_Strict):
 
 
 class AnswerRules(_Strict):
-    """How far a distance may be off: ``distance_m`` or ``distance_share`` of the true one, whichever is more."""
+    """The tolerance of a distance: ``distance_m`` or ``distance_share`` of the true one, whichever is larger."""
 
     distance_m: Annotated[float, Field(ge=0)]
     distance_share: Annotated[float, Field(ge=0)]
 
 
 class PresenceRules(_Strict):
-    """When a text is said to have something in the map, and over which rooms it is counted what stands in rooms.
+    """When a text counts as present in the map, and over which rooms objects are counted.
 
-    The relevancy of an instance to a text is, of all ``canonical`` phrases, the least share that the text has in the
-    softmax of its cosine and that of the phrase, both times ``sharpness``; something is there where that of an instance
-    is above ``relevancy``. ``counted_over``: the rooms by which absent things are frequent ones, or ones that stand
-    with what is there.
+    The relevancy of an instance to a text is the minimum over all ``canonical`` phrases of the text's share in the
+    softmax of its cosine and that of the phrase, both times ``sharpness``; a text is present if that of an instance is
+    above ``relevancy``. ``counted_over``: the rooms over which frequent objects, and objects that occur together, are
+    counted to choose absent ones.
     """
 
     canonical: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -103,35 +103,35 @@ SECTIONS: dict[str, type[BaseModel]] = {
 
 
 class ProtocolRules(_Strict):
-    """One evaluation, complete: the same rules and the same prediction give the same number.
+    """One complete evaluation: the same rules and the same prediction give the same values.
 
-    ``kind``: ``semantic`` (a class a point), ``top-k`` (the likeliest classes of a point, which may have several
+    ``kind``: ``semantic`` (one class per point), ``top-k`` (the most likely classes of a point, which may have several
     labels), ``instance`` (masks with a class), ``panoptic`` (every point in a segment of a thing or of ``stuff``),
-    ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how near a point's label comes
+    ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how close a point's label is
     to those of its object), ``grounding`` (the box of the first mask of each text), ``object-chains`` (one object by
     each of its texts), ``relations`` (objects, predicates and triplets of a scene graph), ``objects`` (matched one to
-    one, with the rank of their category), ``places`` (floors and rooms), or what people are asked otherwise:
-    ``retrieval`` (the first mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and
-    shapes of masks), ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or
-    ``generated`` from the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of
-    classes. Protocols that are not ``by_default`` run where they are named. ``classes`` is the label set in the order
-    of the original; files of predictions number it by ``ids``, or by ``lines``, places in the list from 0
+    one, with the rank of their category), ``places`` (floors and rooms), or questions that annotators answer in the
+    originals: ``retrieval`` (the first mask of each text), ``presence`` (whether such an object exists), ``annotation``
+    (names and shapes of masks), ``reasoning`` (questions that boxes can answer). ``questions`` are those of the
+    ``dataset`` itself or ``generated`` from ground truth, at most ``per_kind`` per kind; ``synonyms`` names the table
+    of alternative class names. Protocols that are not ``by_default`` run only if named. ``classes`` is the label set in
+    the order of the original; prediction files number it by ``ids``, or by ``lines``, indices into the list from 0
     (``class_numbers``); ``ignore`` names classes that are known but not scored, and for ``categories`` labels whose
-    objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those scored
+    objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or the scored
     ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which ``prompt_names``
     may replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every mask, the
-    ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or that stretched to 0..1 over
-    the scene's masks for each query. ``top_k``: how many labels of a point, or masks of a query, count; all where
-    absent. ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the rest is
-    void), all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or
-    ``everything``, with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``;
-    where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
-    ``labels``: whether the same mask may stand there under several labels (``top-k``) or under ``one`` alone; where
-    absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
-    points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``, or of the
-    ``aligned`` world, which the dataset's own motion turned along the walls (the world where it has none).
-    ``unnamed``: the class as which objects and points count that have none; they have none where it is absent.
-    ``predicates`` are those of the relations asked for, which people ``annotated`` or boxes give (``geometric``).
+    ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or the cosine rescaled to 0..1
+    over the scene's masks for each query. ``top_k``: the number of labels of a point, or masks of a query, that count;
+    all if absent. ``class_agnostic`` drops the labels: the true instances are those of the ``scored`` classes (the rest
+    is void), all ``annotated`` ones, ``numbered``, where a number identifies an object, whatever its class, or
+    ``everything``, with the unannotated points as one more. ``void``: masks on it are ``false-positives``; if absent,
+    they are dropped at every threshold below their share of void, as in ScanNet's script. ``labels``: whether the same
+    mask may occur with several labels (``top-k``) or only with ``one``; if absent, both are scored, but not mixed in a
+    ranking. ``box_axes``: the box of an instance is the smallest around its points along the axes of the ``truth``'s
+    box that it is compared with, or along those of the ``world``, or of the ``aligned`` world, rotated along the walls
+    by the dataset's own transform (the world if it has none). ``unnamed``: the class of objects and points without
+    one; none if absent. ``predicates`` are those of the relations, which annotators gave (``annotated``) or boxes
+    determine (``geometric``).
     """
 
     name: str
@@ -176,42 +176,42 @@ class ProtocolRules(_Strict):
     not_comparable_with: tuple[str, ...] = ()
 
     # What the kinds differ in
-    values_of_metric: ClassVar[ValuesOfMetric] = {}  # of each metric, what its values are called
+    values_of_metric: ClassVar[ValuesOfMetric] = {}  # names of the values of each metric
     candidates: ClassVar[tuple[str, ...]] = ("map-points",)
-    confidences: ClassVar[tuple[str, ...]] = ()  # where there are precision-recall curves
-    allowed: ClassVar[Mapping[str, tuple[object, ...]]] = {}  # of those of OWN_FIELDS that take less than their type
-    takes_dense: ClassVar[bool] = False  # a map with one feature a point
-    uses_names: ClassVar[bool] = False  # of instances, without features
+    confidences: ClassVar[tuple[str, ...]] = ()  # if there are precision-recall curves
+    allowed: ClassVar[Mapping[str, tuple[object, ...]]] = {}  # for those of OWN_FIELDS that accept less than their type
+    takes_dense: ClassVar[bool] = False  # a map with one feature per point
+    uses_names: ClassVar[bool] = False  # names of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
-    needs_boxes: ClassVar[bool] = False  # in the truth
-    needs_places: ClassVar[bool] = False  # of floors and rooms, in the truth and in the prediction
-    is_judged: ClassVar[bool] = False  # its counts are how many were judged and how many are right
+    needs_boxes: ClassVar[bool] = False  # in the ground truth
+    needs_places: ClassVar[bool] = False  # floors and rooms, in ground truth and prediction
+    is_judged: ClassVar[bool] = False  # its counts are the numbers of judged and of right answers
     names_points: ClassVar[bool] = False  # a class for every point
-    needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
+    needs_instances: ClassVar[bool] = False  # in ground truth and prediction
     takes_votes: ClassVar[bool] = False  # of several neighbours
-    transfers: ClassVar[bool] = True  # masks or classes to the points of the truth
-    needs_cap: ClassVar[bool] = False  # how far that may be
-    takes_voxels: ClassVar[bool] = True  # of masks that are reduced to one point a voxel
-    text_metrics: ClassVar[tuple[str, ...]] = ()  # compare features with texts whatever labels there are
-    ignores_classes: ClassVar[bool] = True  # ``ignore`` and ``prompt_names`` speak of ``classes``
-    needs: ClassVar[tuple[str, ...]] = ()  # those of OWN_FIELDS that must be there
-    takes: ClassVar[tuple[str, ...]] = ()  # those that may be there
+    transfers: ClassVar[bool] = True  # masks or classes to the ground-truth points
+    needs_cap: ClassVar[bool] = False  # a maximum distance for that
+    takes_voxels: ClassVar[bool] = True  # of masks that are downsampled to one point per voxel
+    text_metrics: ClassVar[tuple[str, ...]] = ()  # compare features with texts regardless of labels
+    ignores_classes: ClassVar[bool] = True  # ``ignore`` and ``prompt_names`` refer to ``classes``
+    needs: ClassVar[tuple[str, ...]] = ()  # required ones of OWN_FIELDS
+    takes: ClassVar[tuple[str, ...]] = ()  # optional ones
 
     def _needed(self) -> tuple[str, ...]:
-        """Those of ``OWN_FIELDS`` that must be there beside what these rules say already."""
+        """The ones of ``OWN_FIELDS`` that these rules require."""
         return self.needs
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
         names = [entry.name for entry in self.classes]
         if len(set(names)) != len(names) or len({entry.id for entry in self.classes}) != len(names):
-            raise ValueError("classes: each id and each name may stand there once")
+            raise ValueError("classes: ids and names must not repeat")
         self._check_texts()
         needed = self._needed()
         for field in OWN_FIELDS:
             value = getattr(self, field)
             if value in (None, ()) and field in needed:
-                raise ValueError(f"{field}: is missing, and kind '{self.kind}' needs it with these rules")
+                raise ValueError(f"{field}: is missing; kind '{self.kind}' needs it with these rules")
             if value not in (None, ()) and field not in (*needed, *self.takes):
                 raise ValueError(f"{field}: kind '{self.kind}' does not take it with these rules")
             if value not in (None, (), *self.allowed.get(field, (value,))):
@@ -220,25 +220,25 @@ class ProtocolRules(_Strict):
         self._check_metric()
         self._check_transfer()
         if self.per_kind is not None and self.questions != "generated":
-            raise ValueError("per_kind: belongs to generated questions")
+            raise ValueError("per_kind: only for generated questions")
         return self
 
     def _check_classes(self, names: Sequence[str]) -> None:
         unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
         if unknown and self.ignores_classes:
-            raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
+            raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is not a class{suggest(unknown[0], names)}")
         if self.unnamed is not None and self.unnamed not in names:
-            raise ValueError(f"unnamed: '{self.unnamed}' is no class{suggest(self.unnamed, names)}")
+            raise ValueError(f"unnamed: '{self.unnamed}' is not a class{suggest(self.unnamed, names)}")
         scored = [entry.name for entry in self.scored]
         for name in self.stuff:
             if name not in scored:
-                raise ValueError(f"stuff: '{name}' is no scored class{suggest(name, scored)}")
+                raise ValueError(f"stuff: '{name}' is not a scored class{suggest(name, scored)}")
 
     def _check_texts(self) -> None:
         texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
         compares = self.names_masks or not (self.needs_instances or self.uses_names or self.needs_places)
         if not compares and (texts or self.encoder):
-            raise ValueError("prompt: these rules compare no features; they take no prompt and no encoder")
+            raise ValueError("prompt: these rules compare no features; remove prompt and encoder")
         if compares and (self.prompt is None) == (not self.prompts):
             raise ValueError("prompt: give either prompt or prompts")
         if without := [text for text in texts if "{}" not in text]:
@@ -260,22 +260,22 @@ class ProtocolRules(_Strict):
         if transfer.cap_m is None and (self.needs_cap or is_each):
             raise ValueError(f"transfer.cap_m: {kind} needs one, with {transfer.candidates}")
         if transfer.cap_m is not None and not self.transfers:
-            raise ValueError(f"transfer.cap_m: {kind} transfers nothing")
+            raise ValueError(f"transfer.cap_m: {kind} has no transfer; remove it")
         keeps_all = not self.transfers or not self.takes_voxels or is_each or transfer.neighbours > 1
         if transfer.evaluation_voxel_m > 0 and keeps_all:
-            raise ValueError(f"transfer.evaluation_voxel_m: {kind} leaves no point out here; set it to 0")
+            raise ValueError(f"transfer.evaluation_voxel_m: {kind} does not downsample here; set it to 0")
         if transfer.neighbours > 1 and not self.takes_votes:
-            raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
+            raise ValueError("transfer.neighbours: only for kind 'semantic'")
         if transfer.neighbours == 1 and transfer.votes == "masks":
-            raise ValueError("transfer.votes: a single neighbour holds no vote; give more neighbours")
+            raise ValueError("transfer.votes: needs more than one neighbour")
 
     @property
     def value_names(self) -> tuple[str, ...]:
-        """What the values of the metric are called that may stand in the headline."""
+        """The names of the metric's values that can be in the headline."""
         return self.values_of_metric[self.metric]
 
     def is_ignored(self, name: str) -> bool:
-        """Whether the class ``name`` is left out, by exact name or, under the substring rule, by a part of it."""
+        """Whether the class ``name`` is ignored, by exact name or, with the substring rule, by a part of it."""
         return name in self.ignore if self.ignore_rule == "exact" else any(part in name for part in self.ignore)
 
     @property
@@ -285,7 +285,7 @@ class ProtocolRules(_Strict):
 
     @property
     def curve_names(self) -> tuple[str, ...]:
-        """What the precision-recall curves are named after: the scored classes, or ``object`` where labels are none."""
+        """The names of the precision-recall curves: the scored classes, or ``object`` without labels."""
         return tuple(entry.name for entry in self.scored) if self.names_masks else ("object",)
 
     @property
@@ -295,30 +295,30 @@ class ProtocolRules(_Strict):
 
     @property
     def n_labels(self) -> int | None:
-        """How many labels of a mask or point count, if it has so many; None where its label is not asked for."""
+        """The maximum number of labels of a mask or point that count; None if labels are not scored."""
         return (self.top_k or 1) if self.vocabulary is not None and self.class_agnostic is None else None
 
     @property
     def compares_texts(self) -> bool:
-        """Whether features are compared with texts whatever labels there are."""
+        """Whether features are compared with texts regardless of labels."""
         return self.metric in self.text_metrics
 
     @property
     def asks(self) -> bool:
-        """Whether a scene's truth is questions about it, the dataset's or made, rather than its labelled points."""
+        """Whether a scene's ground truth is questions (the dataset's or generated), not its labelled points."""
         return self.is_judged or self.questions is not None
 
     def texts_of(self, name: str) -> tuple[str, ...]:
-        """The texts that stand for the class, label or query ``name``; their mean feature counts."""
+        """The texts for the class, label or query ``name``; their mean feature counts."""
         templates = self.prompts if self.prompt is None else (self.prompt,)
         return tuple(template.replace("{}", self.prompt_names.get(name, name)) for template in templates)
 
     @property
     def digest(self) -> str:
-        """A content key of all rules; a field that a later version adds leaves it alone where it has its default."""
+        """A content key of all rules; fields with their default value do not affect it."""
         return hashlib.sha256(self.model_dump_json(exclude_defaults=True).encode()).hexdigest()
 
     @property
     def as_json(self) -> dict[str, Any]:
-        """All that ``digest`` counts, as plain values; ``read_rules`` makes the rules of them again."""
+        """The content of ``digest`` as plain values; ``read_rules`` converts them back to rules."""
         return self.model_dump(mode="json", exclude_defaults=True)

@@ -1,4 +1,4 @@
-"""Protocols of kind ``grounding``: does the box of the instance ranked first meet the box of the object meant?
+"""Protocols of kind ``grounding``: whether the box of the first instance overlaps that of the described object.
 
 Sources: ``eval_ref_one_sample`` of lib/eval_helper.py, ``box3d_iou`` of utils/box_util.py and ``export`` of
 data/scannet/load_scannet_data.py (daveredrum/ScanRefer at 9d74830): boxes along the walls, right from an IoU of 0.25 or
@@ -26,14 +26,14 @@ from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.questions.score import ShareMetric, first_instances, share_counts
 
 THRESHOLDS = (0.25, 0.5)
-EVERY = "all"  # the group of every text that counts
+EVERY = "all"  # the group of all scored texts
 _SMALLEST_VOLUME = 1e-8  # the original adds it to the union
 
 
 class GroundingMetric(ShareMetric):
-    """Of the instance ranked first for each text, does its box overlap that of an object that the text means?
+    """Whether the box of the first instance for each text overlaps that of an object that the text describes.
 
-    Under metric ``referit3d`` the boxes of all objects are given: does it stand in the place of the right one?
+    With metric ``referit3d`` the boxes of all objects are given: whether it is at the right one.
     """
 
     truth = QueryTruth
@@ -62,7 +62,7 @@ class GroundingMetric(ShareMetric):
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
     def _share(self, name: str, truth: QueryTruth, judged: dict[str, BoolArray]) -> tuple[int, int]:
-        """How many texts a value such as ``unique Acc@0.25`` or ``easy`` is over, and how many are right."""
+        """The number of texts of a value such as ``unique Acc@0.25`` or ``easy``, and the number of right ones."""
         group, _, measure = name.rpartition(" ") if "" not in judged else (name, "", "")
         rows = in_group([query.groups for query in truth.queries], group or EVERY, self.rules.metric)
         return int(rows.sum()), int((rows & judged[measure]).sum())
@@ -76,7 +76,7 @@ class GroundingMetric(ShareMetric):
         given: Sequence[Float64Array],
         is_meant: BoolArray,
     ) -> BoolArray:
-        """Whether (Q,) the given object in whose place the first instance stands that meets any of them is meant."""
+        """Whether (Q,) the given object matched by the first instance that overlaps any of them is the right one."""
         iou = {row: np.array([box_iou(box, other) for other in given]) for row, box in boxes.items()}
         rows = np.array([row for row, values in iou.items() if values.any()], np.int64)
         if not len(rows) or not truth.queries:
@@ -88,14 +88,14 @@ class GroundingMetric(ShareMetric):
 
 
 def choose(scores: Float64Array) -> int:
-    """The object with the greatest of ``scores`` (G,), the first of equals."""
+    """The object with the greatest of ``scores`` (G,), the first on ties."""
     return int(scores.argmax())
 
 
 def in_group(groups: Sequence[Sequence[str]], group: str, metric: str) -> BoolArray:
-    """Which texts (Q,) with such groups a value of ``group`` is over; ``all`` and ``accuracy`` are every one's.
+    """Which texts (Q,) with these groups a value of ``group`` includes; ``all`` includes every text.
 
-    Of a choice among given objects every one is what is easy or hard: Nr3D leaves some out.
+    With ``referit3d``, ``accuracy`` includes the easy and the hard texts: Nr3D excludes the others.
 
     >>> in_group([("easy",), ("left out",)], "accuracy", "referit3d").tolist()
     [True, False]
@@ -107,7 +107,7 @@ def in_group(groups: Sequence[Sequence[str]], group: str, metric: str) -> BoolAr
 
 
 def aligned(points: transfer.Points, motion: Float64Array | None) -> transfer.Points:
-    """Points (N, 3) moved by a rigid motion (4, 4) and kept in float32, as the original keeps what it aligned."""
+    """Points (N, 3) after a rigid transform (4, 4), in float32 as in the original."""
     if motion is None:
         return points
     moved = np.column_stack([np.asarray(points, np.float64), np.ones(len(points))]) @ motion.T
@@ -121,7 +121,7 @@ def _best_iou(box: Float64Array | None, given: Sequence[Float64Array], is_meant:
 
 
 def box_iou(first: Float64Array, second: Float64Array) -> float:
-    """The volume in both boxes (2, 3) over that in either, as the original rounds it.
+    """The intersection over union of two boxes (2, 3), with the original's rounding.
 
     >>> unit = np.array([[0.0, 0, 0], [1, 1, 1]])
     >>> round(box_iou(unit, unit + [0.5, 0, 0]), 6), box_iou(unit, unit + 2.0)
@@ -141,7 +141,7 @@ COARSE_ONLY, FINE_ONLY, NEITHER = "coarse alone", "fine alone", "neither"
 
 @dataclass(frozen=True)
 class Place:
-    """Where a text stands: in which chain of which object, by their numbers in the scene; 0 is the finest text."""
+    """The position of a text: its object and chain, by their numbers in the scene; 0 is the finest text."""
 
     object: int
     chain: int
@@ -150,14 +150,14 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainedText(TextQuery):
-    """A text, by what it tells its objects (``tags``, those of ``TAGS``), and every place where it stands."""
+    """A text, the kinds of information that it uses (``tags``, from ``TAGS``), and all its positions."""
 
     tags: frozenset[str] = frozenset()
     places: tuple[Place, ...] = ()
 
 
 class ChainMetric(ShareMetric):
-    """Does the instance ranked first for each text stand for an object that the text means?"""
+    """Whether the first instance for each text is assigned to an object that the text describes."""
 
     truth = QueryTruth
 
@@ -182,20 +182,20 @@ class ChainMetric(ShareMetric):
 
 
 def chained(truth: QueryTruth) -> tuple[ChainedText, ...]:
-    """The texts of a truth with their places; a ``DataError`` for texts that stand in no chains."""
+    """The texts of a ground truth with their positions; ``DataError`` for texts without chains."""
     cases = tuple(query for query in truth.queries if isinstance(query, ChainedText))
     if len(cases) < len(truth.queries):
         raise DataError(
-            "object-chains: the queries stand in no chains of objects; give a metadata_*_grounding.json of Beacon3D"
+            "object-chains: the queries have no chains of objects; use a metadata_*_grounding.json of Beacon3D"
         )
     return cases
 
 
 def judge_chains(cases: Sequence[ChainedText], is_right: BoolArray) -> Mapping[str, BoolArray]:
-    """What is judged under each value of the metric and whether it is right; ``is_right`` (C,) for each of the cases.
+    """The judged cases of each value of the metric and whether they are right; ``is_right`` (C,) is per case.
 
-    An object is right where the finest text of each of its chains is; a chain where all its texts are. Every object
-    must have ``CHAINS_EACH`` chains.
+    An object is right if the finest text of each of its chains is; a chain if all its texts are. Every object must
+    have ``CHAINS_EACH`` chains.
 
     >>> fine = [ChainedText(f"the {k}", (1,), tags=frozenset(), places=(Place(0, k, 0),)) for k in range(3)]
     >>> rows = judge_chains(fine, np.array([True, True, False]))

@@ -1,4 +1,4 @@
-"""Protocols of kind ``presence``: is there such a thing at all? The map answers by what its best instance resembles."""
+"""Protocols of kind ``presence``: whether an object exists; the map answers by its most similar instance."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from su3d_bench.metrics.protocols.model import PresenceRules
 from su3d_bench.metrics.questions.score import PresenceQuery, PresenceTruth
 from su3d_bench.numerics.statistics import ratio
 
-SAMPLINGS = ("random", "popular", "adversarial")  # POPE's, of things that are not there
+SAMPLINGS = ("random", "popular", "adversarial")  # POPE's, for absent objects
 MEASURES = ("precision", "recall", "F1", "accuracy", "yes-rate", "AUROC")
 _MAX_CELLS = 4_000_000  # of a (resamples, questions) block: 32 MB of float64
 
 
 @dataclass(frozen=True)
 class PresenceCounts(Counts):
-    """What one scene, or several, adds: a row for each question.
+    """The counts of one scene or several: one row per question.
 
-    ``sampling`` (Q,) int64 is its place among ``SAMPLINGS``; ``is_there`` (Q,) and ``is_yes`` (Q,) are what is true
-    and what the map says; ``similarity`` (Q,) float64 is that of the best instance with the text, -1 in an empty map.
+    ``sampling`` (Q,) int64 is an index of ``SAMPLINGS``; ``is_there`` (Q,) is the true answer and ``is_yes`` (Q,)
+    that of the map; ``similarity`` (Q,) float64 is that of the best instance with the text, -1 in an empty map.
     """
 
     stored_as = "presence"
@@ -37,19 +37,18 @@ class PresenceCounts(Counts):
     similarity: Float64Array = field(metadata=axes(ROWS))
 
     def contradiction(self) -> str | None:
-        """Samplings that there are not, and similarities that no cosine has."""
+        """Unknown samplings, and similarities outside the range of a cosine."""
         if self.sampling.max(initial=-1) >= len(SAMPLINGS):
             return f"'sampling' counts beyond the {len(SAMPLINGS)} samplings"
         if not (np.abs(self.similarity) <= 1 + 1e-6).all():  # NaN too
-            return "'similarity' has values that are no cosines"
+            return "'similarity' has values outside -1 to 1"
         return None
 
 
 def measured(counts: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
-    """Each measure of each sampling (R,) over the scenes drawn ``weights`` (R, S) times, as ``F1 random``.
+    """Each measure of each sampling (R,), such as ``F1 random``, over the scenes drawn ``weights`` (R, S) times.
 
-    NaN where it is a share of nothing; where nothing that is there is said to be, F1 is 0, of which POPE's script makes
-    an error.
+    NaN for a share of nothing; F1 is 0 without true positives, for which POPE's script raises an error.
 
     >>> said = np.array([True, False, True, False])
     >>> mine = PresenceCounts(np.zeros(4, np.int64), np.array([True, True, False, False]), said, np.arange(4) / 4)
@@ -92,7 +91,7 @@ def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
     order = np.argsort(similarity, kind="stable")
     scene = np.repeat(np.arange(len(rows)), [len(row.similarity) for row in rows])[order]
     is_there = np.concatenate([row.is_there for row in rows])[order]
-    first = np.flatnonzero(np.append(True, np.diff(similarity[order]) > 0))  # of those that are equal
+    first = np.flatnonzero(np.append(True, np.diff(similarity[order]) > 0))  # of equal values
     areas = np.empty(len(weights))
     step = max(1, _MAX_CELLS // len(order))
     for start in range(0, len(weights), step):
@@ -106,13 +105,11 @@ def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
 
 
 EMPTY_MAP_SIMILARITY = -1.0  # the similarity of a text with the best instance of an empty map
-_NOT_KNOWN = (
-    "what the truth itself would score is not known: how well similarities tell what is there is up to the encoder"
-)
+_NOT_KNOWN = "the ground-truth ceiling is unknown: how well similarities indicate presence depends on the encoder"
 
 
 class PresenceMetric(Metric[PresenceCounts]):
-    """Yes where an instance is more like the text than like the canonical phrases, by as much as the rules say."""
+    """Yes if an instance is more similar to the text than to the canonical phrases, by the margin of the rules."""
 
     truth = PresenceTruth
     counts = PresenceCounts
@@ -128,13 +125,13 @@ class PresenceMetric(Metric[PresenceCounts]):
             similarity=similarity,
         )
         warnings = [encoder_warning(self.rules, prediction, encoder), truth.source]
-        # where in the scene an instance is does not count: there is no coverage
+        # the position of an instance does not matter: there is no coverage
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def _answers(
         self, asked: Sequence[PresenceQuery], prediction: Instances | Partition, encoder: Encoder | None
     ) -> tuple[Float64Array, Float64Array]:
-        """The greatest similarity and the greatest relevancy (Q,) that an instance has to each text."""
+        """The greatest similarity and the greatest relevancy (Q,) of any instance to each text."""
         rules = self.rules.presence
         assert rules is not None
         if not n_predictions(prediction) or not asked:
@@ -155,7 +152,7 @@ class PresenceMetric(Metric[PresenceCounts]):
         return {}
 
     def pooled(self, counts: Sequence[PresenceCounts]) -> Pooled:
-        """The measures of each sampling, and beside them how many things were asked for, ``n_<sampling>``."""
+        """The measures of each sampling, and the number of questions, ``n_<sampling>``."""
         sampling = np.concatenate([of_scene.sampling for of_scene in counts])
         n_asked: Values = {f"n_{name}": int((sampling == place).sum()) for place, name in enumerate(SAMPLINGS)}
         return Pooled(self.values_once(counts) | n_asked)
@@ -165,10 +162,10 @@ class PresenceMetric(Metric[PresenceCounts]):
 
 
 def relevancies(cosine: Float64Array, canonical: Float64Array, rules: PresenceRules) -> Float64Array:
-    """The relevancy (K, Q) of instances to texts from their cosines (K, Q) with these and (K, P) with the phrases.
+    """The relevancy (K, Q) of instances to texts from their cosines with the texts (K, Q) and the phrases (K, P).
 
     Source: ``get_relevancy`` of LERF (lerf/encoders/openclip_encoder.py, kerrj/lerf at db08d57). A relevancy above 0.5
-    says that the text is nearer than every phrase, whatever the sharpness.
+    means that the text is nearer than every phrase, whatever the sharpness.
 
     >>> rules = PresenceRules(canonical=("object",), sharpness=10.0, relevancy=0.5, counted_over="rooms")
     >>> relevancies(np.array([[0.3, 0.1]]), np.array([[0.2]]), rules).round(3).tolist()

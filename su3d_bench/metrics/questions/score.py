@@ -1,4 +1,4 @@
-"""Protocols of kind ``retrieval``, ``annotation`` and ``reasoning``: the map, judged by the truth."""
+"""Protocols of kind ``retrieval``, ``annotation`` and ``reasoning``: the map, judged by ground truth."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, 
 from su3d_bench.metrics.protocols.model import AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.numerics.statistics import ratio
 
-ROUNDING = 1e-6  # by how much a sum of shares may pass what it is a sum over
+ROUNDING = 1e-6  # tolerance for sums of shares
 
 
 @dataclass(frozen=True)
 class ShareCounts(Counts):
-    """What one scene adds: ``n_judged`` and ``n_right`` (V,) int64 for each of the protocol's V values.
+    """The counts of one scene: ``n_judged`` and ``n_right`` (V,) int64 for each of the protocol's V values.
 
-    ``by_chance`` (V,) float64: how many a guess gets right; ``by_name``: how many who knows each object's name and no
-    more; NaN where nobody can say.
+    ``by_chance`` (V,) float64: the number right by guessing; ``by_name``: the number right from the objects' names
+    only; NaN if unknown.
     """
 
     stored_as = "shares"
@@ -36,7 +36,7 @@ class ShareCounts(Counts):
     by_name: Float64Array = field(metadata=axes("values"))
 
     def contradiction(self) -> str | None:
-        """More that is right, or that a guess gets right, than was judged."""
+        """More right answers, or right by guessing, than judged ones."""
         for name in ("n_right", "by_chance", "by_name"):
             right = getattr(self, name)
             beyond = np.flatnonzero(~np.isnan(right) & ~((right >= 0) & (right <= self.n_judged + ROUNDING)))
@@ -51,7 +51,7 @@ def share_counts(
     by_chance: Sequence[float] | None = None,
     by_name: Sequence[float] | None = None,
 ) -> ShareCounts:
-    """The counts of a scene; what a guess gets right is not known where it is not given."""
+    """The counts of a scene; the numbers right by guessing are unknown if not given."""
     unknown = np.full(len(n_judged), np.nan)
     return ShareCounts(
         np.array(n_judged, np.int64),
@@ -62,7 +62,7 @@ def share_counts(
 
 
 def shares(counts: ShareCounts) -> Float64Array:
-    """The share (V,) that is right, NaN where nothing was judged.
+    """The share (V,) of right answers, NaN if nothing was judged.
 
     >>> shares(share_counts([4, 0], [3, 0])).tolist()
     [0.75, nan]
@@ -71,7 +71,7 @@ def shares(counts: ShareCounts) -> Float64Array:
 
 
 def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Array:
-    """The shares (R, V) over the scenes drawn ``weights`` (R, S) times, NaN where none of these was judged.
+    """The shares (R, V) over the scenes drawn ``weights`` (R, S) times, NaN if nothing in them was judged.
 
     >>> a, b = share_counts([2], [1]), share_counts([1], [1])
     >>> resampled([a, b], np.array([[2, 0], [0, 2]])).tolist()
@@ -82,9 +82,9 @@ def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Arra
 
 @dataclass(frozen=True)
 class TextTarget:
-    """A text of a kind such as ``property``, and the ids of every object that answers it.
+    """A text of a kind such as ``property``, and the ids of all objects that answer it.
 
-    ``by_chance``: how often an object drawn at random answers; ``by_name``: one drawn from those of the right name.
+    ``by_chance``: how often a random object answers; ``by_name``: how often a random one with the right name does.
     """
 
     kind: str
@@ -104,7 +104,7 @@ class RetrievalTruth:
 
 @dataclass(frozen=True)
 class PresenceQuery:
-    """What a map is asked for that the scene has or has not; ``sampling``: the way by which absent things are drawn."""
+    """A text that is present or absent in the scene; ``sampling``: the method that chose absent ones."""
 
     text: str
     sampling: str
@@ -113,8 +113,8 @@ class PresenceQuery:
 
 @dataclass(frozen=True)
 class PresenceTruth:
-    """The objects of a scene and things that it has or has not; ``source`` says over what it is counted which things
-    are frequent, and which stand together."""
+    """The objects of a scene and texts that are present or absent; ``source``: the rooms over which frequent objects,
+    and objects that occur together, are counted."""
 
     scene: GroundTruth
     asked: tuple[PresenceQuery, ...]
@@ -123,9 +123,9 @@ class PresenceTruth:
 
 @dataclass(frozen=True)
 class RefinedNames:
-    """Labels n' of a map, one an instance, and who chose them.
+    """Labels n' of a map, one per instance, and their source.
 
-    ``left_out``: why the filter that goes with these labels leaves an instance out, '' where it stays; empty: all stay.
+    ``left_out``: why the filter of these labels excludes an instance, '' if it is kept; empty if all are kept.
     """
 
     names: tuple[str, ...]
@@ -134,16 +134,16 @@ class RefinedNames:
 
     @property
     def is_kept(self) -> BoolArray:
-        """Whether (K,) an instance is one of the map under labels n'."""
+        """Whether (K,) an instance is kept with labels n'."""
         return np.array([not reason for reason in self.left_out or ("",) * len(self.names)], bool)
 
 
 @dataclass(frozen=True)
 class AnnotationTruth:
-    """The objects of a scene and how they may be called.
+    """The objects of a scene and their valid names.
 
-    ``object_ids``: those that are judged; ``is_called`` tells whether a label names the object of an id; ``refined``
-    gives labels n' of a map, None where it has none.
+    ``object_ids``: the judged ones; ``is_called`` states whether a label names the object of an id; ``refined`` returns
+    labels n' of a map, None if it has none.
     """
 
     scene: GroundTruth
@@ -154,9 +154,9 @@ class AnnotationTruth:
 
 @dataclass(frozen=True)
 class TrueAnswer:
-    """``value``: a count, metres or yes and no; None where the objects are the answer. ``object_ids`` are named.
+    """``value``: a count, metres, or yes or no; None if the objects are the answer. ``object_ids`` are named.
 
-    ``by_chance``: how often a guess is right; ``by_name``: that of who knows what each object is called and no more.
+    ``by_chance``: how often a guess is right; ``by_name``: how often an answer from the objects' names only is.
     """
 
     text: str
@@ -169,7 +169,7 @@ class TrueAnswer:
 
 @dataclass(frozen=True)
 class SolverAnswer:
-    """What a solver said of a map: ``rows`` are the instances that it names; nothing where it ``is_decided`` not."""
+    """A solver's answer from a map: ``rows`` are the instances that it names; empty if not ``is_decided``."""
 
     value: float | int | bool | None
     rows: Int64Array
@@ -178,7 +178,7 @@ class SolverAnswer:
 
 @dataclass(frozen=True)
 class ReasoningTruth:
-    """Questions with true answers, and how a map is asked; ``solver`` names who answers."""
+    """Questions with true answers, and how they are put to a map; ``solver`` is the name of the answerer."""
 
     scene: GroundTruth
     asked: tuple[TrueAnswer, ...]
@@ -186,27 +186,27 @@ class ReasoningTruth:
     solver: str
 
 
-BY_NAME = ("property by name", "relative by name")  # kinds of text to which the name alone is the answer
+BY_NAME = ("property by name", "relative by name")  # kinds of text that the name alone answers
 MERGES = WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
-REFINED_BY, ANSWERED_BY = "n': ", "answers by "  # so begin the remarks that name who did it
-RELATIVE = "relative: "  # so begins the remark on queries of that kind
+REFINED_BY, ANSWERED_BY = "n': ", "answers by "  # prefixes of the remarks that name the source
+RELATIVE = "relative: "  # prefix of the remark on queries of that kind
 
 
 class ShareMetric(Metric[ShareCounts]):
-    """What the kinds share whose numbers are shares of what was judged."""
+    """The common part of kinds whose values are shares of judged answers."""
 
     counts = ShareCounts
-    guessed: ClassVar[tuple[str, ...]] = ()  # values that a guess gets right now and then
+    guessed: ClassVar[tuple[str, ...]] = ()  # values that a guess can get right
 
     @property
     def sizes(self) -> dict[str, int]:
         return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ShareCounts]) -> Pooled:
-        """The share of right judgements under each value's name, and beside it how many there were and what is cheap.
+        """The share of right answers under each value's name, with their number and the baselines.
 
-        ``n_<name>``: their number; ``chance_<name>``: what a guess gets right; ``names-alone_<name>``: what who knows
-        each object's name and no more does, both of the values that one can guess.
+        ``n_<name>``: their number; ``chance_<name>``: the share right by guessing; ``names-alone_<name>``: the share
+        right from the objects' names only, both for values that a guess can get right.
         """
         whole, names = ShareCounts.joined(counts), self.rules.value_names
         values = dict(zip(names, shares(whole).tolist(), strict=True))
@@ -228,9 +228,9 @@ class ShareMetric(Metric[ShareCounts]):
         warnings: Sequence[str | None],
         cheap: Mapping[str, Float64Array] | None = None,
     ) -> SceneScore:
-        """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests.
+        """The score, with ``rows`` of what is right, and the coverage of the objects that it depends on.
 
-        ``cheap``: for some values the share (2, n) of each judgement that a guess and names alone get right.
+        ``cheap``: for some values, the share (2, n) of each judgement right by guessing and from names only.
         """
         names = self.rules.value_names
         judged = [rows[name] for name in names]
@@ -244,7 +244,7 @@ class ShareMetric(Metric[ShareCounts]):
 
 
 class RetrievalMetric(ShareMetric):
-    """Is the instance ranked first one that answers?"""
+    """Whether the first instance answers the query."""
 
     truth = RetrievalTruth
     guessed = ("instance", "affordance", "property", "relative", "all", "by name")
@@ -270,21 +270,21 @@ class RetrievalMetric(ShareMetric):
 
 
 def relative_remark(encoder: object) -> str | None:
-    """What must stand beside figures of relative queries; None where the encoder was not trained on such texts."""
+    """A warning on the values of relative queries; None if the encoder was not trained on such texts."""
     return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, TrainedOnRelativeTexts) else None
 
 
 def first_instances(
     rules: ProtocolRules, texts: Sequence[str], prediction: Instances | Partition, encoder: Encoder | None
 ) -> Int64Array:
-    """The instance (Q,) whose feature is nearest to each text, the first of equals; -1 in an empty map."""
+    """The instance (Q,) whose feature is nearest to each text, the first on ties; -1 in an empty map."""
     if not n_predictions(prediction) or not texts:
         return np.full(len(texts), -1, np.int64)
     return np.asarray(similarities(rules, list(texts), prediction, encoder).argmax(axis=0))
 
 
 def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[TextTarget]) -> BoolArray:
-    """Whether (Q,) the instance ``first`` (Q,) of each question stands for an object that answers it.
+    """Whether (Q,) the instance ``first`` (Q,) of each question is assigned to an object that answers it.
 
     >>> chair = TextTarget("instance", "chair", (4, 5))
     >>> judge_retrieval(np.array([5, 9]), np.array([0, 1, -1]), [chair, chair, chair]).tolist()
@@ -295,10 +295,10 @@ def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Seque
 
 
 class AnnotationMetric(ShareMetric):
-    """Are the names n and n' of instances right, and how were their masks merged?
+    """Whether the names n and n' of instances are right, and how their masks were merged.
 
-    Judged are instances whose main object is among ``truth.object_ids``; an empty name is a wrong one. Under n' the map
-    is without the instances that the filter of these labels leaves out, in ``label n'`` and ``well-merged n'`` alike.
+    Judged are instances whose main object is among ``truth.object_ids``; an empty name is wrong. With n' the instances
+    that the filter of these labels excludes are not in the map, for both ``label n'`` and ``well-merged n'``.
     """
 
     truth = AnnotationTruth
@@ -322,18 +322,18 @@ class AnnotationMetric(ShareMetric):
             **{f"{name} n'": after[still] == name for name in MERGES},
         }
         warnings = [
-            "no label n': the map keeps no names of views" if refined is None else f"{REFINED_BY}{refined.source}"
+            "no label n': the map has no names per view" if refined is None else f"{REFINED_BY}{refined.source}"
         ]
         if refined is not None and len(kept) < len(objects):
             reasons = ", ".join(dict.fromkeys(reason for reason in refined.left_out if reason))
-            warnings.append(f"n' leaves out {len(objects) - len(kept)} of {len(objects)} instances: {reasons}")
+            warnings.append(f"n' excludes {len(objects) - len(kept)} of {len(objects)} instances: {reasons}")
         if len(judged) < len(objects):
-            warnings.append("not judged: instances that stand for no object, a small one, or a wall, floor or ceiling")
+            warnings.append("not judged: instances assigned to no object, a small one, or a wall, floor or ceiling")
         return self._score(truth.scene, truth.object_ids, prediction, rows, warnings)
 
 
 def remarks_starting(warnings: Sequence[str], start: str) -> tuple[str, ...]:
-    """What the remarks say that begin with ``start`` behind the name of their scenes; each once.
+    """The rest of the remarks that begin with ``start`` after the name of their scenes, without repeats.
 
     >>> remarks_starting(["a/b: n': the vote", "every scene: answers by gpt", "c/d: n': the vote"], REFINED_BY)
     ('the vote',)
@@ -343,7 +343,7 @@ def remarks_starting(warnings: Sequence[str], start: str) -> tuple[str, ...]:
 
 
 def labels_n(instances: Instances) -> tuple[str, ...]:
-    """Label n of each instance: what the method itself decided, else the name that perception gave."""
+    """Label n of each instance: the method's own, otherwise the name from perception."""
     labels = instances.labels or ("",) * len(instances)
     return tuple(label or name for label, name in zip(labels, instances.names, strict=True))
 
@@ -353,7 +353,7 @@ def _are_called(truth: AnnotationTruth, names: Sequence[str], objects: Int64Arra
 
 
 def judge_merging(rules: MergeRules, covered: CoveredObjects) -> tuple[str, ...]:
-    """How each instance was merged; over-merged goes before under-merged, and what covers nothing is neither.
+    """How each instance was merged; over-merged has priority, and an instance that covers nothing is neither.
 
     >>> rules = MergeRules(over_merged_share=0.25, under_merged_share=0.5)
     >>> halves = Covered(np.array([1, 2]), np.array([[70, 0], [30, 0], [40, 60]]))
@@ -378,7 +378,7 @@ def judge_merging(rules: MergeRules, covered: CoveredObjects) -> tuple[str, ...]
 
 
 class ReasoningMetric(ShareMetric):
-    """Is the answer right, and are the objects that it names right?"""
+    """Whether the answer is right, and whether the objects that it names are."""
 
     truth = ReasoningTruth
     guessed = ("answer",)
@@ -396,14 +396,14 @@ class ReasoningMetric(ShareMetric):
         is_open = any(not given.is_decided for given in answers)
         warnings = [f"{ANSWERED_BY}{truth.solver}"]
         if is_open:
-            warnings.append("questions that the solver could not settle count as wrong")
+            warnings.append("questions that the solver could not answer count as wrong")
         named = [object_id for question in truth.asked for object_id in question.object_ids]
         cheap = {"answer": np.array([(q.by_chance, q.by_name) for q in truth.asked]).reshape(-1, 2).T}
         return self._score(truth.scene, named, prediction, rows, warnings, cheap)
 
 
 def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: SolverAnswer, main_object: Int64Array) -> bool:
-    """Whether counts and yes or no agree, a distance is near enough, or else the objects are right.
+    """Whether counts and yes or no agree, a distance is within the tolerance, or otherwise the objects are right.
 
     >>> rules = AnswerRules(distance_m=0.25, distance_share=0.1)
     >>> given = SolverAnswer(2.2, np.zeros(0, np.int64), True)
@@ -420,5 +420,5 @@ def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: SolverAnswer, m
 
 
 def are_objects_right(true: TrueAnswer, given: SolverAnswer, main_object: Int64Array) -> bool:
-    """Whether the instances named stand for exactly the objects that the true answer names."""
+    """Whether the named instances are assigned to exactly the objects that the true answer names."""
     return given.is_decided and {int(main_object[row]) for row in given.rows} == set(true.object_ids)

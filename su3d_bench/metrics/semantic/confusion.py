@@ -1,7 +1,7 @@
 """Semantic segmentation metrics from integer confusion matrices, as ConceptGraphs, ScanNet and HOV-SG compute them.
 
-Rows are the true class, columns the predicted one; a last extra column holds points whose prediction is none of the
-classes. Matrices of scenes add up; only the functions that give ``SemanticMetrics`` form ratios.
+Rows are the true class, columns the predicted one; a last extra column is for points predicted as none of the
+classes. Matrices of scenes are additive; only the functions that return ``SemanticMetrics`` compute ratios.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ IOU_LEVELS = (0.15, 0.25, 0.50, 0.75)  # conceptgraph/utils/eval.py counts the c
 
 @dataclass(frozen=True)
 class SemanticCounts(Counts):
-    """What one scene, or several, adds: ``confusion`` (C, C + 1) int64 and the classes that the scenes contain (C,)."""
+    """The counts of one scene or several: ``confusion`` (C, C + 1) int64 and the classes of the scenes (C,)."""
 
     stored_as = "semantic"
 
@@ -37,7 +37,7 @@ class SemanticCounts(Counts):
 
 @dataclass(frozen=True)
 class SemanticMetrics:
-    """Values for each class that counts, in the order of ``class_index``, and their means."""
+    """Values for each scored class, in the order of ``class_index``, and their means."""
 
     class_index: Int64Array
     recall: Float64Array
@@ -56,16 +56,16 @@ class SemanticMetrics:
 
 
 def per_scene(truth: IntArray, predicted: IntArray, is_present: BoolArray) -> SemanticCounts:
-    """The additive counts of one scene: class indices a point, -1 for a true class that is not scored.
+    """The additive counts of one scene from class indices per point, -1 for a true class that is not scored.
 
     ``is_present`` (C,) marks the scored classes of the scene, with or without points. Points whose true class is not
-    among them are left out, whatever is predicted there.
+    among them are excluded, whatever is predicted there.
 
     >>> counts = per_scene(np.array([0, 0, 1, -1]), np.array([0, 1, -1, 0]), np.array([True, True]))
     >>> counts.confusion.tolist()
     [[1, 1, 0], [0, 0, 1]]
     """
-    counts = is_present[truth]  # whatever it says of a negative truth, which the matrix skips
+    counts = is_present[truth]  # its value for a negative truth does not matter, the matrix skips it
     return SemanticCounts(confusion_matrix(truth[counts], predicted[counts], len(is_present)), is_present.copy())
 
 
@@ -86,14 +86,14 @@ def confusion_matrix(truth: IntArray, predicted: IntArray, n_classes: int) -> In
 def conceptgraphs_metrics(
     confusion: Int64Array | Float64Array, keep: IntArray, dtype: type[np.float32] | type[np.float64] = np.float64
 ) -> SemanticMetrics:
-    """mAcc, F-mIoU and their kin over the classes ``keep``, as conceptgraph/utils/eval.py (commit 5c4da70) has them.
+    """mAcc, F-mIoU and related metrics over the classes ``keep``, as in conceptgraph/utils/eval.py (commit 5c4da70).
 
-    ``confusion`` (C, C) or (C, C + 1). Rows and columns are sliced together, as in the original; what fell outside the
-    kept columns counts as missed only where it stands in the extra column. Denominators are at least 1, so a class
-    without points scores 0 and stays in the mean; F-mIoU of no point at all is NaN, as 0/0 is there. ``dtype`` float32
-    computes as the original does, to the last bit. No class: all NaN.
+    ``confusion`` (C, C) or (C, C + 1). Rows and columns are sliced together, as in the original; predictions outside
+    the kept columns count as missed only in the extra column. Denominators are at least 1, so a class without points
+    scores 0 and is included in the mean; F-mIoU without any point is NaN, 0/0 in the original. ``dtype`` float32
+    computes as the original does, to the last bit. Without classes all values are NaN.
 
-    ``f1_conceptgraphs`` is the original's F1, 2PR / max(1, P + R), which is no harmonic mean below P + R = 1.
+    ``f1_conceptgraphs`` is the original's F1, 2PR / max(1, P + R), which is not a harmonic mean below P + R = 1.
 
     >>> metrics = conceptgraphs_metrics(np.array([[8, 2, 0], [1, 9, 0], [0, 0, 0]]), np.array([0, 1]))
     >>> round(metrics.mean_accuracy, 4), round(metrics.frequency_weighted_iou, 4)
@@ -104,7 +104,7 @@ def conceptgraphs_metrics(
     has_none = confusion.shape[1] > confusion.shape[0]
     n_none: NDArray[Any] = confusion[kept, -1].astype(dtype) if has_none else np.zeros(len(kept), dtype)
     hit = np.diag(square)
-    # a sum beyond 2^24 rounds in float32 by its order: each row and each column by itself, as the original adds them
+    # float32 sums above 2^24 depend on the order: each row and each column separately, as in the original
     n_true: NDArray[Any] = np.array([row.sum() for row in square], dtype)
     n_true += n_none
     n_predicted = np.array([column.sum() for column in square.T], dtype)
@@ -120,7 +120,7 @@ def conceptgraphs_metrics(
     metrics = replace(metrics, n_classes_above=_n_above(iou_of_original.astype(np.float64)))
     n_points = square.sum() + n_none.sum()
     if dtype is np.float32 and n_points > 0:
-        # in this order, after which a perfect prediction may end in 0.9999999999999999
+        # in this order, with which a perfect prediction may score 0.9999999999999999
         return replace(metrics, frequency_weighted_iou=float((iou * n_true / n_points).sum()))
     return metrics
 
@@ -130,13 +130,13 @@ def _n_above(iou: Float64Array) -> tuple[int, ...]:
 
 
 def scannet_metrics(confusion: IntArray, *, counts_unseen: bool = False) -> SemanticMetrics:
-    """IoU of each class as evaluate_semantic_label.py of ScanNet (commit 3830fce), with the means that it leaves out.
+    """IoU of each class as in evaluate_semantic_label.py of ScanNet (commit 3830fce), and means that it lacks.
 
-    ``confusion`` (C, C + 1), the last column for predictions outside the classes. A class that was never true is 0
-    where it was predicted and NaN where it was not; NaN leaves the mean IoU. Recall is NaN for a class that was never
-    true; mean accuracy is over the others, as frequency-weighted IoU is. These means are ours, not the original's.
-    ``counts_unseen``: recall is 0 too for a class that was never true and was predicted, so that mean accuracy has it,
-    as iou_acc_from_confmat of ovo/utils/eval_utils.py of OVO (commit cf3b68e).
+    ``confusion`` (C, C + 1), the last column for predictions outside the classes. A class that is never true has IoU 0
+    if it was predicted and otherwise NaN, which is excluded from the mean IoU. Recall is NaN for a class that is never
+    true; mean accuracy and frequency-weighted IoU are over the others. These means are ours, not the original's.
+    ``counts_unseen``: recall is also 0 for a class that is never true but was predicted, so that mean accuracy includes
+    it, as in iou_acc_from_confmat of ovo/utils/eval_utils.py of OVO (commit cf3b68e).
 
     >>> metrics = scannet_metrics(np.array([[3, 1, 0], [0, 0, 0]]))
     >>> metrics.iou.tolist(), metrics.mean_iou, metrics.mean_accuracy
@@ -152,7 +152,7 @@ def scannet_metrics(confusion: IntArray, *, counts_unseen: bool = False) -> Sema
 
 
 def _points(confusion: IntArray) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Points (C,) of each class that are called rightly, are true, are predicted."""
+    """Points (C,) of each class: correct, true, and predicted."""
     square = confusion[:, : len(confusion)]
     return (
         np.diag(square).astype(np.float64),
@@ -164,9 +164,8 @@ def _points(confusion: IntArray) -> tuple[Float64Array, Float64Array, Float64Arr
 def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
     """The scores of application/eval/evaluate_sem_seg.py of HOV-SG (commit 71a8069), over scored classes that are true.
 
-    ``confusion`` (C, C + 1) holds all points, those of ignored classes too: what is predicted there is a false
-    positive. A class that is true and never predicted counts 0. Scores are of one scene; the original averages them
-    over scenes.
+    ``confusion`` (C, C + 1) has all points, including those of ignored classes: predictions there are false positives.
+    A class that is true but never predicted counts 0. Scores are of one scene; the original averages them over scenes.
 
     >>> confusion = np.array([[2, 0, 0], [1, 3, 0]])  # class 0 is ignored, and one point of class 1 is called so
     >>> metrics = hovsg_metrics(confusion, np.array([False, True]))
@@ -215,9 +214,9 @@ def resampled_semantic(
 ) -> dict[str, Float64Array]:
     """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
 
-    Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
-    mean IoU with 0, under ``ovo`` mAcc too. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,)
-    marks the others.
+    Classes that are true in any drawn scene count; with ``scannet`` those that are only predicted are included in the
+    mean IoU as 0, with ``ovo`` in mAcc too. If the confusion matrices contain ignored classes, ``is_scored`` (C,) marks
+    the others.
 
     >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
     >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([False, True]))
@@ -246,7 +245,7 @@ def resampled_semantic(
 def resampled_points(
     counts: Sequence[SemanticCounts], weights: Int64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Points (R, C) of each class that are called rightly, are true, are predicted, in the scenes that were drawn."""
+    """Points (R, C) of each class in the drawn scenes: correct, true, and predicted."""
     drawn = weights.astype(np.float64)
     hit, n_true, n_predicted = zip(*(_points(of_scene.confusion) for of_scene in counts), strict=True)
     return drawn @ np.stack(hit), drawn @ np.stack(n_true), drawn @ np.stack(n_predicted)
@@ -255,13 +254,13 @@ def resampled_points(
 def resampled_points_sliced_away(
     counts: Sequence[SemanticCounts], weights: Int64Array, n_true: Float64Array
 ) -> Float64Array:
-    """Points (R, C) of each true class that ConceptGraphs leaves out of the pooled rows, in the scenes that were drawn.
+    """Points (R, C) of each true class, in the drawn scenes, that ConceptGraphs excludes from the pooled rows.
 
-    They are called a class that a drawn scene has, of which ``n_true`` (R, C) counts no point in any.
+    Their predicted class is present in a drawn scene, but has no true point, ``n_true`` (R, C), in any.
     """
     is_sliced = (weights @ np.stack([c.is_present for c in counts]).astype(np.int64) > 0) & (n_true == 0)
     sliced_away = np.zeros_like(n_true)
-    for row in np.flatnonzero(is_sliced.any(axis=1)):  # of most runs none
+    for row in np.flatnonzero(is_sliced.any(axis=1)):  # none for most runs
         columns = np.flatnonzero(is_sliced[row])
         of_scenes = np.stack([c.confusion[:, columns].sum(axis=1) for c in counts])
         sliced_away[row] = weights[row] @ of_scenes

@@ -1,7 +1,7 @@
-"""Panoptic quality: segments of things and stuff held against each other, equal to the originals in every bit.
+"""Panoptic quality from matched segments of things and stuff, equal to the originals in every bit.
 
-Sources: ``panopticapi``: ``pq_compute`` of panopticapi/evaluation.py (cocodataset/panopticapi at 7bb4655), one image a
-scene and one process an image. ``semantic-kitti``: ``EvalPanoptic`` of
+Sources: ``panopticapi``: ``pq_compute`` of panopticapi/evaluation.py (cocodataset/panopticapi at 7bb4655), one image
+per scene and one process per image. ``semantic-kitti``: ``EvalPanoptic`` of
 mmdet3d/evaluation/functional/panoptic_seg_eval.py (open-mmlab/mmdetection3d at fe25f7a), which is the evaluator of
 SemanticKITTI and the one of OneFormer3D on ScanNet.
 """
@@ -27,16 +27,16 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import ratio
 
 Rule = Literal["panopticapi", "semantic-kitti"]
-MATCHED = 0.5  # an IoU must be above it; of segments that do not overlap, only one can then match
-IGNORED = 0.5  # a segment of which more is void, or a crowd of its class, is no false positive
+MATCHED = 0.5  # an IoU must be above it; then at most one of several disjoint segments can match
+IGNORED = 0.5  # a segment with a larger share of void, or of a crowd of its class, is no false positive
 QUALITIES = ("PQ", "SQ", "RQ")
 _EPS = 1e-15  # the smallest denominator of the original
 
 
 @dataclass(frozen=True)
 class PanopticCounts(Counts):
-    """What one scene adds, of each class (C,): how many segments are ``n_matched`` int64, how many predicted ones are
-    ``n_false`` and true ones ``n_missed``, and the sum of the IoUs of those that are matched, ``iou`` float64."""
+    """The counts of one scene per class (C,): ``n_matched`` segments int64, ``n_false`` predicted ones, ``n_missed``
+    true ones, and the sum of the IoUs of the matched ones, ``iou`` float64."""
 
     stored_as = "panoptic"
 
@@ -46,7 +46,7 @@ class PanopticCounts(Counts):
     iou: Float64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
-        """A sum of IoUs that so many matches cannot have."""
+        """A sum of IoUs that is impossible for the number of matches."""
         fits = (self.iou >= MATCHED * self.n_matched) & (self.iou <= self.n_matched * (1 + 1e-12))
         wrong = np.flatnonzero(~fits)
         if len(wrong):
@@ -56,8 +56,8 @@ class PanopticCounts(Counts):
 
 @dataclass(frozen=True)
 class Segments:
-    """What N points belong to: ``class_index`` (N,) int64, -1 for none, and ``number`` (N,) int64, which tells segments
-    of one class apart."""
+    """The segment of each of N points: ``class_index`` (N,) int64, -1 for none, and ``number`` (N,) int64 within the
+    class."""
 
     class_index: Int64Array
     number: Int64Array
@@ -65,8 +65,8 @@ class Segments:
 
 @dataclass(frozen=True)
 class _Listed:
-    """The segments of a scene, by class and number: ``row`` (N,) of each point's, -1 for none, and of each segment its
-    class, its number and its size in points."""
+    """The segments of a scene, by class and number: the ``row`` (N,) of each point's segment, -1 for none, and the
+    class, number and size in points of each segment."""
 
     row: Int64Array
     class_index: Int64Array
@@ -87,12 +87,12 @@ class _Listed:
 def per_scene(
     truth: Segments, predicted: Segments, is_thing: BoolArray, rule: Rule = "panopticapi", min_region_size: int = 1
 ) -> PanopticCounts:
-    """The additive counts of one scene; ``is_thing`` (C,) tells things from stuff.
+    """The additive counts of one scene; ``is_thing`` (C,) marks things, the others are stuff.
 
-    All points of a stuff class are one segment, whatever their numbers. Under ``panopticapi`` points of a thing without
-    a number (0) are a crowd, as COCO calls it: nobody told its things apart, it is not missed, and what is predicted
-    there is not wrong. Under ``semantic-kitti`` they are a segment like any other, points that are void in the truth do
-    not exist at all, and segments below ``min_region_size`` are neither missed nor wrong, though they may match.
+    All points of a stuff class are one segment, whatever their numbers. With ``panopticapi`` points of a thing without
+    a number (0) are a COCO crowd: its things are not separated, it is not missed, and predictions there are not wrong.
+    With ``semantic-kitti`` they are a segment like any other, void points of the ground truth are ignored entirely, and
+    segments below ``min_region_size`` are neither missed nor wrong, though they may match.
 
     >>> truth = Segments(np.array([0] * 6 + [1] * 4), np.array([1] * 3 + [2] * 3 + [0] * 4))
     >>> found = Segments(np.array([0] * 5 + [1] * 5), np.array([7] * 3 + [8] * 2 + [9] * 5))
@@ -139,17 +139,17 @@ def _with_one_of_stuff(segments: Segments, is_thing: BoolArray) -> Segments:
 
 
 def _sums(class_index: Int64Array, iou: Float64Array, n_classes: int, *, one_by_one: bool) -> Float64Array:
-    """The sum of the IoUs of each class, one after another or, as numpy sums an array, in pairs: the last bit tells."""
+    """The sum of the IoUs of each class, sequentially or, as numpy does, pairwise: they differ in the last bit."""
     if one_by_one:
         return np.bincount(class_index, weights=iou, minlength=n_classes).astype(np.float64)
     return np.array([np.sum(iou[class_index == index]) for index in range(n_classes)], np.float64)
 
 
 def class_qualities(sums: Mapping[str, NDArray[Any]], rule: Rule) -> dict[str, Float64Array]:
-    """PQ, SQ and RQ (R, C) of each class from sums of counts; NaN for what is neither in the truth nor predicted.
+    """PQ, SQ and RQ (R, C) of each class from sums of counts; NaN for a class neither true nor predicted.
 
-    A class without a match has SQ 0 in both originals, and under ``semantic-kitti`` one of which there is nothing at
-    all scores 0 as well.
+    A class without a match has SQ 0 in both originals, and with ``semantic-kitti`` a class neither true nor predicted
+    scores 0 as well.
     """
     matched, iou = sums["n_matched"].astype(np.float64), sums["iou"]
     halves = matched + 0.5 * sums["n_false"] + 0.5 * sums["n_missed"]
@@ -161,7 +161,7 @@ def class_qualities(sums: Mapping[str, NDArray[Any]], rule: Rule) -> dict[str, F
 
 
 def means(values: dict[str, Float64Array], is_thing: BoolArray, rule: Rule) -> dict[str, Float64Array]:
-    """The mean (R,) over all classes, over things and over stuff of values (R, C), without those that are NaN.
+    """The means (R,) over all classes, over things and over stuff of values (R, C), ignoring NaN.
 
     >>> table = {"PQ": np.array([[0.5, np.nan, 1.0]])}
     >>> {name: mean.tolist() for name, mean in means(table, np.arange(3) < 2, "panopticapi").items()}
@@ -175,7 +175,7 @@ def means(values: dict[str, Float64Array], is_thing: BoolArray, rule: Rule) -> d
 
 
 def _mean_of_rows(table: Float64Array, rule: Rule) -> Float64Array:
-    """The classes summed one after another, or as numpy sums: the last bit tells."""
+    """The sum over classes, sequentially or as numpy sums: they differ in the last bit."""
     is_number = ~np.isnan(table)
     filled = np.where(is_number, table, 0.0)
     total = filled.sum(axis=1) if rule == "semantic-kitti" else np.cumsum(filled, axis=1)[:, -1:].sum(axis=1)
@@ -183,7 +183,7 @@ def _mean_of_rows(table: Float64Array, rule: Rule) -> Float64Array:
 
 
 class PanopticMetric(Metric[PanopticCounts]):
-    """Things one by one and stuff as a whole, each with a class: how many are found, and how well they fit."""
+    """Recognition and segmentation quality of single things and of whole stuff classes."""
 
     truth = GroundTruth
     counts = PanopticCounts
@@ -191,7 +191,7 @@ class PanopticMetric(Metric[PanopticCounts]):
     def per_scene(self, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
         if truth.evaluation_points is not None:
-            raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
+            raise DataError(f"{rules.name}: ground truth '{truth.variant}' has no instances on its evaluation points")
         ids = named_classes(rules, truth.semantic, prediction, encoder)
         masks, scores = masks_and_scores(prediction)
         cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
@@ -214,7 +214,7 @@ class PanopticMetric(Metric[PanopticCounts]):
         return Pooled(values, classes, self.group_means(classes, {name: name for name in QUALITIES}))
 
     def _once(self, counts: Sequence[PanopticCounts]) -> dict[str, Float64Array]:
-        """The qualities (1, C) of all scenes, whose IoUs are summed in their order: the last bit tells."""
+        """The qualities (1, C) over all scenes, whose IoUs are summed in order, which affects the last bit."""
         sums = vars(PanopticCounts.joined(counts))
         return class_qualities({name: values[None] for name, values in sums.items()}, rule_of(self.rules))
 
@@ -240,10 +240,10 @@ def rule_of(rules: ProtocolRules) -> Rule:
 
 
 def visible_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
-    """The truth that a method is told under a protocol, if it is told any: as it stands, but for where stuff counts.
+    """The ground truth that oracle methods get for a protocol: unchanged, except for protocols with stuff.
 
-    There every labelled point belongs to a segment, and what the annotation gives a class and no instance, as
-    ScanNet++'s does with walls, becomes one instance a class.
+    For those every labelled point belongs to a segment, and points annotated with a class but no instance, such as
+    walls in ScanNet++, become one instance per class.
 
     >>> from su3d_bench.core.types import LabelSet, IntArray
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
@@ -270,10 +270,10 @@ def count_segments(
     scores: Float64Array,
     class_ids: Int64Array,
 ) -> PanopticCounts:
-    """The counts of K masks on the N points of a truth with class ids (N,) and instance numbers (N,), 0 for none.
+    """The counts of K masks on N ground-truth points with class ids (N,) and instance numbers (N,), 0 for none.
 
-    A point in several masks belongs to that of the greatest score, the first of equals; masks whose class id (K,) is
-    not scored take no point. Points of class -1 are left out of truth and masks.
+    A point in several masks belongs to that of the greatest score, the first on ties; masks whose class id (K,) is not
+    scored are ignored. Points of class -1 are excluded from ground truth and masks.
     """
     called = _scored_index(rules, class_ids)
     order = np.argsort(-scores, kind="stable")
@@ -287,7 +287,7 @@ def count_segments(
 
 
 def _scored_index(rules: ProtocolRules, ids: IntArray) -> Int64Array:
-    """The place of each class id among the scored classes, -1 where it is none of them."""
+    """The index of each class id among the scored classes, -1 if it is not one of them."""
     return places_among_scored(rules)[class_index_of_ids(rules, ids)]
 
 
@@ -296,6 +296,6 @@ def _shared_warning(masks: Masks, scores: Float64Array, n_points: int) -> str | 
     n_shared, n_covered = int((n_covering > 1).sum()), int((n_covering > 0).sum())
     if not n_shared:
         return None
-    by = "the greatest confidence" if len(np.unique(scores)) > 1 else "equal confidence the first"
+    by = "the highest confidence" if len(np.unique(scores)) > 1 else "the first of equal confidence"
     share = f"{100 * n_shared / n_covered:.1f} %"
-    return f"{share} of the points that masks cover are in several; each counts for that of {by}"
+    return f"{share} of the points that masks cover are in several; each counts for the mask with {by}"

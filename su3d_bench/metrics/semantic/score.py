@@ -1,4 +1,4 @@
-"""Protocols of kind ``semantic``: which points count, what the prediction is called there, what that comes to."""
+"""Protocols of kind ``semantic``: the scored points, their predicted classes, and the metrics."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
 
-GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
+GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # name of a group's value, and the class value that it averages
 
 
 class SemanticMetric(Metric[SemanticCounts]):
-    """A class a point, counted in a confusion matrix of the scored points.
+    """One class per point, counted in a confusion matrix of the scored points.
 
-    ConceptGraphs' rows differ: the pooled one averages over the classes that have scored points, that of a scene over
-    the classes that its ground truth contains.
+    ConceptGraphs' rows differ: the pooled one averages over the classes with scored points, that of a scene over the
+    classes that its ground truth contains.
     """
 
     truth = GroundTruth
@@ -89,7 +89,7 @@ class SemanticMetric(Metric[SemanticCounts]):
 
     @property
     def _entries(self) -> tuple[ClassEntry, ...]:
-        """The classes that the metrics number."""
+        """The classes that the metrics index."""
         return self.rules.scored if self.rules.metric in {"scannet", "ovo"} else self.rules.classes
 
     def _values(self, metrics: SemanticMetrics) -> Values:
@@ -117,7 +117,7 @@ class SemanticMetric(Metric[SemanticCounts]):
         keep = np.flatnonzero(has_points if pooled else whole.is_present)
         confusion = whole.confusion.copy()
         if pooled:
-            # Of a class that a ground-truth cloud has and no scored point, the original slices away what was called so
+            # The original slices away the predictions of a class of the ground-truth cloud without scored points
             confusion[:, np.flatnonzero(whole.is_present & ~has_points)] = 0
         folded = np.zeros_like(confusion)
         folded[:, [*keep, -1]] = _keep_columns(confusion, keep)
@@ -125,18 +125,18 @@ class SemanticMetric(Metric[SemanticCounts]):
 
 
 def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
-    """The columns ``keep`` and a last one with all others: a point called anything else is called wrongly."""
+    """The columns ``keep`` and a last one with all others: any other prediction is wrong."""
     n_elsewhere = confusion.sum(axis=1) - confusion[:, keep].sum(axis=1)
     return np.concatenate([confusion[:, keep], n_elsewhere[:, None]], axis=1)
 
 
 @dataclass(frozen=True)
 class PredictedPoints:
-    """The P points that a protocol of kind ``semantic`` looks at, and what a prediction calls them.
+    """The P points that a protocol of kind ``semantic`` evaluates, with their predicted classes.
 
-    ``source`` (P,): the truth's point that each one takes its class from. ``true_class`` and ``predicted`` (P,) are -1
-    for none; ``mask`` (P,) is the object, or row of features, that gives the predicted class, None where classes are
-    voted for; ``distance_m`` (P,) of its point. ``is_wanted`` (P,) points are in the matrix, ``is_scored`` (P,)
+    ``source`` (P,): the ground-truth point that each takes its class from. ``true_class`` and ``predicted`` (P,) are -1
+    for none; ``mask`` (P,) is the object, or row of features, that gives the predicted class, None with votes on
+    classes; ``distance_m`` (P,) is that of its point. ``is_wanted`` (P,) points are in the matrix, ``is_scored`` (P,)
     ones of a scored class. ``is_present`` (C,) scored classes are in the scene, ``is_counted`` (C,) ones in the matrix;
     ``classes`` are those of the prediction's objects.
     """
@@ -157,7 +157,7 @@ class PredictedPoints:
 def call_points(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
 ) -> PredictedPoints:
-    """What each evaluation point is and is called."""
+    """The true and the predicted class of each evaluation point."""
     class_of_label = labelling.class_index_of_ids(rules, truth.semantic)
     is_scored = labelling.scored_classes(rules)
     is_present = present(class_of_label, len(rules.classes)) & is_scored
@@ -168,7 +168,7 @@ def call_points(
         _, source = transfer.nearest(truth.points, targets)
         true_class = np.where(source >= 0, class_of_label[source], -1)
     # those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
-    # because what is predicted there is a false positive
+    # because predictions there are false positives
     is_counted = is_present if rules.metric == "conceptgraphs" else is_scored | (rules.metric == "hovsg")
     is_wanted = (true_class >= 0) & is_counted[true_class]
     classes = with_unnamed(rules, labelling.classes_of_prediction(rules, prediction, encoder, is_present))
@@ -202,7 +202,7 @@ def call_points(
 
 
 def with_unnamed(rules: ProtocolRules, class_index: Int64Array) -> Int64Array:
-    """The class indices of objects, or of points where something was predicted, with ``unnamed`` in place of -1.
+    """The class indices of objects, or of points with a prediction, with ``unnamed`` in place of -1.
 
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> [with_unnamed(load_protocol(f"scannet-{name}"), np.array([-1, 3])).tolist() for name in ("semantic", "ovo20")]
@@ -221,9 +221,9 @@ def owners_at(
     targets: transfer.Points,
     wanted: BoolArray,
 ) -> tuple[Int64Array, Float64Array]:
-    """The object, or row of features, whose point is nearest to each wanted target, -1 for none, and how far it is.
+    """The object, or row of features, whose point is nearest to each wanted target, -1 for none, and the distance.
 
-    Of the objects only those that ``takes_part`` (K,) names are looked at.
+    Only the objects marked by ``takes_part`` (K,) are considered.
     """
     owner, rank = _point_owners(prediction, takes_part)
     if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
@@ -243,7 +243,7 @@ def transfer_votes(
     *,
     of_masks: bool = False,
 ) -> tuple[Int64Array, Float64Array]:
-    """The class, or ``of_masks`` the mask, that most neighbours of each wanted target have, and how far the nearest is.
+    """The majority class, or with ``of_masks`` mask, of each wanted target's neighbours, and the nearest distance.
 
     Objects without a class do not vote.
     """
@@ -256,7 +256,7 @@ def transfer_votes(
 
 
 def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
-    """The points of all objects, one object after another, and the object (or row of features) of each."""
+    """The concatenated points of all objects, and the object (or row of features) of each."""
     if isinstance(prediction, DenseFeatures):
         point = np.flatnonzero(has_feature(prediction))
         return point, point
@@ -267,16 +267,16 @@ def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
 
 
 def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:
-    """The object (or row of features) of each point of the prediction, and its rank among points at one distance.
+    """The object (or row of features) of each predicted point, and its rank among points at equal distance.
 
-    Both are -1 where a point takes no part. A point that several instances share belongs to the first.
+    Both are -1 for points that are not considered. A point that several instances share belongs to the first.
     """
     if isinstance(prediction, DenseFeatures):
         rows = np.arange(len(prediction.points))
         return rows, np.where(takes_part & has_feature(prediction), 0, -1)
     if isinstance(prediction, Partition):
         owner = prediction.instance.astype(np.int64)
-        owner[(owner >= 0) & ~np.append(takes_part, True)[owner]] = -1  # of no rows at all there is not even a last one
+        owner[(owner >= 0) & ~np.append(takes_part, True)[owner]] = -1  # without any rows there is no last one
         return owner, owner
     kept = np.flatnonzero(takes_part)
     first = transfer.first_owner(transfer.select(prediction, kept), len(prediction.points))
@@ -285,7 +285,7 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
 
 
 def _one_per_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
-    """``rank`` (N,) where each object keeps its first point a voxel, -1 for all others."""
+    """``rank`` (N,) if each object keeps its first point per voxel, -1 for all others."""
     taking = np.flatnonzero(rank >= 0)
     voxel = voxel_coordinates(points[taking], voxel_m)
     first = transfer.first_rows(np.column_stack([owner[taking], voxel]))

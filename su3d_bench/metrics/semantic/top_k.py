@@ -1,4 +1,4 @@
-"""Protocols of kind ``top-k``: the likeliest classes of a point, of which any label of the point makes a hit.
+"""Protocols of kind ``top-k``: the most likely classes of a point, a hit if any is among the point's labels.
 
 Source: semantic/eval/eval_semantic.py and semantic/utils/confmat.py of scannetpp/scannetpp at commit f3b4712.
 """
@@ -22,14 +22,14 @@ from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetric
 from su3d_bench.metrics.semantic.score import owners_at
 from su3d_bench.numerics.statistics import ratio
 
-ONE_CLASS = "the prediction names one class a point: top {k} is top 1"
+ONE_CLASS = "the prediction has one class per point: top {k} is top 1"
 
 
 @dataclass(frozen=True)
 class TopKCounts(Counts):
-    """What one scene, or several, adds: ``best`` and ``any`` (C, C + 1) int64 of the first class and of the k.
+    """The counts of one scene or several: ``best`` and ``any`` (C, C + 1) int64 of the first class and of the k.
 
-    Rows are labels, columns predicted classes, the last one for points that are called none. ``is_present`` (C,)
+    Rows are labels, columns predicted classes, the last one for points without a predicted class. ``is_present`` (C,)
     classes are among the labels of the scenes.
     """
 
@@ -40,7 +40,7 @@ class TopKCounts(Counts):
     is_present: BoolArray = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
-        """Points of a class that the scenes do not contain, other numbers of points, fewer hits among more classes."""
+        """Points of a class that the scenes do not contain, unequal numbers of points, or fewer hits for k classes."""
         absent = np.flatnonzero((self.best.any(axis=1) | self.any.any(axis=1)) & ~self.is_present)
         if len(absent):
             return f"'best' or 'any' has points of class {absent[0]}, which the scene does not have"
@@ -51,15 +51,15 @@ class TopKCounts(Counts):
 
     @property
     def each(self) -> tuple[SemanticCounts, SemanticCounts]:
-        """The two matrices as counts of one class a point."""
+        """The two matrices as counts of one class per point."""
         return SemanticCounts(self.best, self.is_present), SemanticCounts(self.any, self.is_present)
 
 
 def top_k_confusion(labels: Int64Array, ranked: Int64Array, n_classes: int) -> Int64Array:
-    """Counts (C, C + 1) of pairs (label, predicted class), one a point of ``labels`` (N, L) and ``ranked`` (N, k).
+    """Counts (C, C + 1) of pairs (label, predicted class), one per point of ``labels`` (N, L) and ``ranked`` (N, k).
 
-    Both hold class indices, -1 for no more. Points without a label are skipped. The best ranked class that is among the
-    labels is a hit; where none is, the first label stands against the first class, in the last column where that is -1.
+    Both are class indices, padded with -1. Points without a label are skipped. The best ranked class that is among the
+    labels is a hit; otherwise the first label is paired with the first class, in the last column if that is -1.
 
     >>> labels = np.array([[0, 1], [0, -1], [-1, -1], [1, 0]])
     >>> ranked = np.array([[2, 1], [2, 1], [0, 1], [-1, -1]])
@@ -80,8 +80,8 @@ def top_k_confusion(labels: Int64Array, ranked: Int64Array, n_classes: int) -> I
 
 @dataclass(frozen=True)
 class RankedPoints:
-    """The classes (N, k) that each wanted point of a truth is called, the likeliest first, -1 for no more, and how far
-    (N,) the point is that they come from."""
+    """The predicted classes (N, k) of each wanted ground-truth point, the most likely first, padded with -1, and the
+    distance (N,) to the point that they come from."""
 
     classes: Int64Array
     distance_m: Float64Array
@@ -91,7 +91,7 @@ class RankedPoints:
 def ranked_at(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None, wanted: BoolArray
 ) -> RankedPoints:
-    """What the ``wanted`` (N,) points of a truth are called: the classes of the nearest object, or row of features."""
+    """The predicted classes of the ``wanted`` (N,) ground-truth points: those of the nearest object or feature row."""
     assert rules.top_k is not None
     is_present = present(_labels(rules, truth).ravel(), len(rules.classes))
     ranked = labelling.ranked_classes(rules, prediction, encoder, is_present, rules.top_k)
@@ -103,7 +103,7 @@ def ranked_at(
 
 
 class TopKMetric(Metric[TopKCounts]):
-    """The likeliest classes of a point against all labels that it has."""
+    """The most likely classes of a point, compared with all its labels."""
 
     truth = GroundTruth
     counts = TopKCounts
@@ -120,7 +120,7 @@ class TopKMetric(Metric[TopKCounts]):
     def per_scene(self, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
         if truth.evaluation_points is not None:
-            raise DataError(f"{rules.name}: the truth '{truth.variant}' has no labels on its evaluation points")
+            raise DataError(f"{rules.name}: ground truth '{truth.variant}' has no labels on its evaluation points")
         labels = _labels(self.rules, truth)
         is_present = present(labels.ravel(), len(rules.classes))
         wanted: BoolArray = np.any(labels >= 0, axis=1)
@@ -173,13 +173,13 @@ class TopKMetric(Metric[TopKCounts]):
         return answer
 
     def _metrics(self, counts: Sequence[TopKCounts]) -> tuple[SemanticMetrics, SemanticMetrics]:
-        """Of the first class and of the k, over all classes; those that are not scored have no point and no value."""
+        """Values for the first class and for the k, over all classes; unscored ones have no points and no value."""
         whole = TopKCounts.joined(counts)
         return semantic.scannet_metrics(whole.best), semantic.scannet_metrics(whole.any)
 
 
 def _labels(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
-    """The class indices (N, L) of the labels of each point, -1 for no more, none for points that are left out."""
+    """The class indices (N, L) of the labels of each point, padded with -1; none for excluded points."""
     ids = truth.semantic[:, None] if truth.every_semantic is None else truth.every_semantic
     labels = labelling.class_index_of_ids(rules, ids.ravel()).reshape(ids.shape)
     labels[~np.append(labelling.scored_classes(rules), False)[labels]] = -1

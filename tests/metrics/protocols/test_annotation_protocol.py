@@ -1,4 +1,4 @@
-"""The annotation protocol: labels n and n' against the lexicon, masks well, under- and over-merged, by hand."""
+"""The annotation protocol: labels n and n' compared with the lexicon; well-, under- and over-merged masks, by hand."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def values(prediction: Instances, refine: Refine | None = None) -> dict[str, flo
 
 
 def named(names: tuple[str, ...]) -> Instances:
-    """The true masks with names of perception and, in one view each, a second name of more weight."""
+    """The true masks with names from perception and, in one view each, a second name with more weight."""
     whole = truth_as_prediction(TRUTH, with_labels=False)
     k = len(names)
     views = np.zeros((2 * k, 2), np.int32)
@@ -65,7 +65,7 @@ def named(names: tuple[str, ...]) -> Instances:
     )  # fmt: skip
 
 
-def test_the_truth_itself_is_all_right() -> None:
+def test_ground_truth_scores_one_in_annotation() -> None:
     found = values(truth_as_prediction(TRUTH, with_labels=True))
     assert [found[key] for key in ("label n", "well-merged", "under-merged", "over-merged")] == [1, 1, 0, 0]
     assert found["n_label n"] == len(NAMES) - 1  # the wall is not judged
@@ -73,23 +73,23 @@ def test_the_truth_itself_is_all_right() -> None:
     assert found["n_label n'"] == 0
 
 
-def test_labels_go_by_the_lexicon() -> None:
+def test_labels_are_compared_with_the_lexicon() -> None:
     names = ("wall", "office chair", "table", "coffee table", "floor lamp", "throw pillow", "", "rucksack")
     found = values(named(names))
-    assert found["label n"] == 5 / 7  # a chair called a table and a book without a name are wrong
+    assert found["label n"] == 5 / 7  # a chair named table and a book without a name are wrong
     assert found["label n'"] == 5 / 7
 
 
-def test_refined_names_are_those_that_are_handed_in() -> None:
+def test_refined_names_are_the_given_ones() -> None:
     right = RefinedNames(NAMES, "the model m of su3d-bench runs refine, names of 5 views")
     prediction = named(("couch",) * len(NAMES))
     assert (values(prediction, lambda _: right)["label n"], values(prediction, lambda _: right)["label n'"]) == (0, 1)
     assert "n': the model m" in " ".join(score_scene(RULES, truth(lambda _: right), prediction, None).warnings)
 
 
-def test_what_labels_n_prime_leave_out_counts_before_and_not_after() -> None:
+def test_instances_excluded_by_n_prime_count_only_for_n() -> None:
     chair, table = np.flatnonzero(TRUTH.instance == 2), np.flatnonzero(TRUTH.instance == 4)
-    both = np.concatenate([chair[:60], np.flatnonzero(TRUTH.instance == 3)])  # over-merged: of two chairs
+    both = np.concatenate([chair[:60], np.flatnonzero(TRUTH.instance == 3)])  # over-merged: two chairs
     masks = [chair[60:], both, table, np.flatnonzero(TRUTH.instance == 5)]
     prediction = instances(TRUTH.points, masks, ["chair", "chair", "chair", "lamp"])
     refined = RefinedNames(("chair", "wall", "table", "lamp"), "the model m", ("", "'wall' is background", "", ""))
@@ -98,23 +98,23 @@ def test_what_labels_n_prime_leave_out_counts_before_and_not_after() -> None:
     assert (found["over-merged"], found["over-merged n'"]) == (0.25, 0.0)
     assert found["well-merged n'"] == found["n_well-merged n'"] / 3 == 1.0
     said = " ".join(score_scene(RULES, truth(lambda _: refined), prediction, None).warnings)
-    assert "n' leaves out 1 of 4 instances: 'wall' is background" in said
+    assert "n' excludes 1 of 4 instances: 'wall' is background" in said
 
 
-def test_what_covers_a_part_is_whole_once_the_rest_is_left_out() -> None:
+def test_part_becomes_well_merged_when_the_other_part_is_excluded() -> None:
     chair = np.flatnonzero(TRUTH.instance == 2)
     prediction = instances(TRUTH.points, [chair[:80], chair[80:]], ["chair", "chair"])
     found = values(prediction, lambda _: RefinedNames(("chair", "floor"), "the model m", ("", "'floor' is background")))
     assert (found["under-merged"], found["well-merged n'"]) == (1.0, 1.0)
 
 
-def test_the_vote_leaves_out_what_is_background_under_it() -> None:
+def test_vote_excludes_background_instances() -> None:
     voted = voted_names(replace(named(("chair", *["wall"] * 7)), view_scores=np.tile([0.9, 0.1], 8)))
     assert voted is not None
     assert voted.is_kept.tolist() == [True, *[False] * 7]
 
 
-def test_the_vote_takes_the_name_of_most_weight() -> None:
+def test_vote_uses_the_name_with_most_weight() -> None:
     prediction = replace(named(("chair",) * 8), view_scores=np.tile([0.1, 0.9], 8))
     voted = voted_names(prediction)
     assert voted is not None
@@ -122,12 +122,12 @@ def test_the_vote_takes_the_name_of_most_weight() -> None:
     assert voted_names(truth_as_prediction(TRUTH, with_labels=True)) is None
 
 
-def test_who_named_is_what_stands_behind_the_name_of_a_scene_alone() -> None:
-    told = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' leaves out 1 of 4"]
+def test_label_source_is_read_only_after_the_scene_name() -> None:
+    told = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' excludes 1 of 4"]
     assert remarks_starting(told, REFINED_BY) == ("the vote", "a model")
 
 
-def test_a_label_that_the_method_decided_goes_before_the_name() -> None:
+def test_label_of_the_method_has_priority_over_the_name() -> None:
     prediction = replace(named(("a",) * 8), labels=("b", *[""] * 7))
     assert labels_n(prediction) == ("b", *["a"] * 7)
 
@@ -136,21 +136,21 @@ def test_a_label_that_the_method_decided_goes_before_the_name() -> None:
     ("shared", "judged"),
     [
         ([[100, 0]], ("well-merged",)),
-        ([[76, 24]], ("well-merged",)),  # 24 % of others, below a quarter
+        ([[76, 24]], ("well-merged",)),  # 24 % from other objects, below a quarter
         ([[75, 25]], ("over-merged",)),
         ([[75, 0], [25, 0]], ("well-merged", "under-merged")),
         ([[74, 0], [26, 0]], ("under-merged", "under-merged")),
-        ([[100, 0], [100, 0]], ("under-merged", "under-merged")),  # the same thing twice was not merged
+        ([[100, 0], [100, 0]], ("under-merged", "under-merged")),  # duplicates of one object were not merged
         ([[10, 90], [100, 0]], ("well-merged", "well-merged")),
         ([[0, 0]], ("well-merged",)),
     ],
 )
-def test_merging_is_judged_by_shares(shared: list[list[int]], judged: tuple[str, ...]) -> None:
+def test_merging_is_judged_by_covered_shares(shared: list[list[int]], judged: tuple[str, ...]) -> None:
     assert RULES.merging is not None
     assert judge_merging(RULES.merging, CoveredObjects(np.array([1, 2]), np.array(shared))) == judged
 
 
-def test_masks_of_half_and_of_two_objects_are_faulty() -> None:
+def test_half_masks_and_masks_of_two_objects_are_faulty() -> None:
     chair, table = np.flatnonzero(TRUTH.instance == 2), np.flatnonzero(TRUTH.instance == 4)
     lamp, book = np.flatnonzero(TRUTH.instance == 5), np.flatnonzero(TRUTH.instance == 7)
     masks = [chair[:75], chair[75:], table, np.concatenate([lamp, book])]
@@ -158,7 +158,7 @@ def test_masks_of_half_and_of_two_objects_are_faulty() -> None:
     assert [found[key] for key in ("well-merged", "under-merged", "over-merged")] == [0.25, 0.5, 0.25]
 
 
-def test_instances_that_stand_for_nothing_that_is_judged_are_told() -> None:
+def test_unjudged_instances_are_reported() -> None:
     whole = truth_as_prediction(TRUTH, with_labels=True)
     masks, labels = [whole.mask(k) for k in range(len(whole))], list(whole.labels or ())
     without_wall = instances(TRUTH.points, masks[1:], labels[1:])
@@ -176,13 +176,13 @@ def test_shuffled_instances_change_nothing() -> None:
     assert values(mixed)["label n"] == values(prediction)["label n"]
 
 
-def test_a_map_without_names_is_told_why() -> None:
+def test_map_without_names_gives_a_reason() -> None:
     assert "needs names" in str(kind_incompatibility(RULES, truth_as_prediction(TRUTH, with_labels=False)))
     partition = Partition(TRUTH.points, TRUTH.instance - 1, np.ones((8, 3), np.float32))
     assert "gives a partition" in str(kind_incompatibility(RULES, partition))
 
 
-def test_labels_of_the_file_beside_a_map_are_taken_while_it_is_that_maps(tmp_path: Path) -> None:
+def test_label_file_is_used_only_with_its_own_map(tmp_path: Path) -> None:
     job = JobFolder(tmp_path)
     prediction = named(("chair",) * 8)
     write_bytes(job.prediction, b"a map")

@@ -1,4 +1,4 @@
-"""Protocols of kind ``boxes``: overlaps known in closed form, counts by hand, and another program for each number."""
+"""Protocols of kind ``boxes``: overlaps in closed form, counts by hand, and an independent check of each value."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LABELS = LabelSet("replica", (*IDS.values(), WALL), (*IDS, "wall"))
 
 
 def turn(*degrees: float) -> Float64Array:
-    """The rotation about z, then y, then x by so many degrees."""
+    """The rotation about z, then y, then x, in degrees."""
     whole = np.eye(3)
     for axis, angle in zip((2, 1, 0), np.radians(degrees), strict=False):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -41,7 +41,7 @@ def box(centre: tuple[float, ...], sizes: tuple[float, ...], rotation: Float64Ar
 # ---- overlaps
 
 UNIT = box((0, 0, 0), (1, 1, 1))
-OCTAGON = 2 * (math.sqrt(2) - 1)  # a unit square and itself turned by 45 degrees share a regular octagon
+OCTAGON = 2 * (math.sqrt(2) - 1)  # a unit square and its copy rotated by 45 degrees share a regular octagon
 
 
 @pytest.mark.parametrize(
@@ -63,17 +63,15 @@ OCTAGON = 2 * (math.sqrt(2) - 1)  # a unit square and itself turned by 45 degree
         (UNIT, box((0, 0, 0), (1, 1, 0), turn(45)), 0.0),
     ],
 )
-def test_the_shared_volume_of_boxes_is_that_of_the_formula(
-    first: OrientedBox, second: OrientedBox, shared: float
-) -> None:
+def test_shared_volume_of_boxes_equals_the_formula(first: OrientedBox, second: OrientedBox, shared: float) -> None:
     for one, other in ((first, second), (second, first)):
         assert shared_volume(one, other) == pytest.approx(shared, abs=1e-12)
         either = float(np.prod(one.sizes) + np.prod(other.sizes)) - shared
         assert box_iou(one, other) == pytest.approx(shared / either, abs=1e-12)
 
 
-def test_a_corner_cut_across_the_diagonal_of_space_has_its_volume() -> None:
-    """A half space whose border leaves the cube's corner at t along each edge cuts off t^3 / 6."""
+def test_corner_cut_across_the_space_diagonal_has_its_volume() -> None:
+    """A half space whose boundary meets each edge at distance t from a cube's corner cuts off t^3 / 6."""
     normal = np.ones(3) / math.sqrt(3)
     first = np.array([1.0, -1.0, 0.0]) / math.sqrt(2)
     axes = np.stack([first, np.cross(normal, first), normal], axis=1)
@@ -83,7 +81,7 @@ def test_a_corner_cut_across_the_diagonal_of_space_has_its_volume() -> None:
         assert shared_volume(UNIT, beyond) == pytest.approx(t**3 / 6, abs=1e-12)
 
 
-def test_the_shared_volume_of_random_boxes_is_that_of_the_hull_of_their_half_spaces() -> None:
+def test_shared_volume_of_random_boxes_equals_the_half_space_hull() -> None:
     from scipy.optimize import linprog
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
@@ -116,7 +114,7 @@ def test_the_shared_volume_of_random_boxes_is_that_of_the_hull_of_their_half_spa
     assert n_met > 100
 
 
-def test_the_smallest_box_of_the_corners_of_a_box_is_the_box() -> None:
+def test_smallest_box_of_box_corners_is_the_box() -> None:
     turned = box((1, 2, 3), (0.5, 1, 2), turn(20, 30, 40))
     found = smallest_box(turned.corners, turned.rotation)
     np.testing.assert_allclose(found.centre, turned.centre, atol=1e-12)
@@ -138,15 +136,15 @@ def values(*counts: BoxCounts, rules: ProtocolRules | None = None) -> dict[str, 
     return metric_of(rules).combine(list(counts))
 
 
-def test_of_two_instances_on_one_box_the_more_confident_one_is_right() -> None:
+def test_more_confident_of_two_instances_on_one_box_is_right() -> None:
     both = values(counted([[0.9], [0.6]], [0], [0, 0], [0.4, 0.8]))
     assert (both["AP25"], both["AP50"], both["recall50"], both["precision50"]) == (1.0, 1.0, 1.0, 0.5)
-    # the more confident one is too loose for 0.5 and takes its place in the curve as a wrong one
+    # the more confident one is too loose for 0.5 and counts in the curve as a wrong one
     loose = values(counted([[0.9], [0.4]], [0], [0, 0], [0.4, 0.8]))
     assert (loose["AP25"], loose["AP50"], loose["recall50"]) == (1.0, 0.5, 1.0)
 
 
-def test_an_instance_whose_best_box_is_taken_is_wrong_though_another_is_free() -> None:
+def test_instance_whose_best_box_is_taken_is_wrong_even_if_another_is_free() -> None:
     found = values(counted([[0.9, 0.0], [0.7, 0.6]], [0, 0], [0, 0], [0.9, 0.8]))
     assert (found["AP50"], found["recall50"], found["precision50"], found["centroid"]) == (0.5, 0.5, 0.5, 1.0)
 
@@ -157,28 +155,28 @@ def test_an_iou_must_be_above_its_threshold() -> None:
     assert values(counted([[0.25]], [0], [0], [1.0]))["AP25"] == 0.0
 
 
-def test_instances_of_one_confidence_enter_the_curve_together_in_whatever_order() -> None:
+def test_instances_of_equal_confidence_enter_the_curve_together_in_any_order() -> None:
     rows, true = [[0.9, 0.0], [0.0, 0.0], [0.0, 0.8]], [0, 0]
     for order in ([0, 1, 2], [1, 0, 2], [2, 1, 0]):
         found = values(counted([rows[k] for k in order], true, [0, 0, 0], [1.0] * 3))
         assert found["AP50"] == pytest.approx(2 / 3) and found["recall50"] == 1.0
 
 
-def test_the_area_is_under_the_envelope() -> None:
+def test_area_is_computed_under_the_envelope() -> None:
     """Right, wrong, right of three boxes: precision 1 up to a third, then 2/3 up to two thirds."""
     found = values(counted([[0.9, 0, 0], [0, 0, 0], [0, 0.9, 0]], [0, 0, 0], [0, 0, 0], [0.9, 0.8, 0.7]))
     assert found["AP50"] == pytest.approx(1 / 3 + 2 / 3 / 3)
 
 
-def test_a_missing_class_counts_nothing_and_one_that_nobody_predicts_counts_zero() -> None:
+def test_absent_class_is_ignored_and_unpredicted_class_scores_zero() -> None:
     found = values(counted([[0.9, 0.0]], [0, 1], [0], [1.0], 3))
     assert (found["AP50"], found["recall50"], found["precision50"], found["centroid"]) == (0.5, 0.5, 1.0, 0.5)
-    # an instance of a class without a box lowers precision alone
+    # an instance of a class without a box lowers only precision
     wrong = values(counted([[0.9, 0.0], [0.0, 0.0]], [0, 1], [0, 2], [1.0, 1.0], 3))
     assert (wrong["AP50"], wrong["precision50"]) == (0.5, 0.5)
 
 
-def test_an_empty_map_scores_zero_and_a_scene_without_boxes_nothing() -> None:
+def test_empty_map_scores_zero_and_scene_without_boxes_is_undefined() -> None:
     empty = values(counted([], [0, 1], [], []))
     assert {empty[name] for name in ("AP25", "AP50", "centroid", "recall25", "recall50")} == {0.0}
     assert all(math.isnan(empty[name]) for name in ("class", "precision25", "precision50"))
@@ -189,8 +187,8 @@ def test_an_empty_map_scores_zero_and_a_scene_without_boxes_nothing() -> None:
 
 def test_the_class_is_that_of_the_best_instance_on_a_box() -> None:
     assert values(counted([[0.3], [0.9]], [0], [1, 0], [0.9, 0.5]))["class"] == 0.0
-    assert values(counted([[0.2], [0.9]], [0], [1, 0], [0.9, 0.5]))["class"] == 1.0  # the first finds nothing
-    assert values(counted([[0.3], [0.9]], [0], [1, 0], [0.5, 0.5]))["class"] == 1.0  # of equals the nearer
+    assert values(counted([[0.2], [0.9]], [0], [1, 0], [0.9, 0.5]))["class"] == 1.0  # the first one finds nothing
+    assert values(counted([[0.3], [0.9]], [0], [1, 0], [0.5, 0.5]))["class"] == 1.0  # on ties the better IoU
     assert values(counted([[0.9]], [0], [-1], [0.5]))["class"] == 0.0  # of none of the classes
 
 
@@ -204,7 +202,7 @@ def truth_of(*objects: tuple[str, OrientedBox]) -> GroundTruth:
 
 
 def map_of(*instances: tuple[str, OrientedBox, float]) -> Instances:
-    """A map whose instances are the corners of boxes."""
+    """A map with the corners of boxes as instances."""
     points = np.concatenate([np.zeros((0, 3)), *(one.corners for _, one, _ in instances)]).astype(np.float32)
     masks = [np.arange(8 * k, 8 * k + 8) for k in range(len(instances))]
     scores = np.array([score for _, _, score in instances])
@@ -218,7 +216,7 @@ def score_of(truth: GroundTruth, prediction: Instances, rules: ProtocolRules = R
     return score_scene(rules, truth, prediction, None)
 
 
-def test_perfect_instances_score_one_however_their_objects_are_turned() -> None:
+def test_perfect_instances_score_one_for_any_rotation() -> None:
     truth = truth_of(("chair", CHAIR), ("sofa", SOFA), ("wall", box((0, 9, 0), (9, 0.1, 3))))
     result = combine(RULES, {"a": score_of(truth, map_of(("chair", CHAIR, 0.9), ("sofa", SOFA, 0.3)))})
     assert set(result.metrics.values()) == {1.0}
@@ -226,8 +224,8 @@ def test_perfect_instances_score_one_however_their_objects_are_turned() -> None:
     assert all(math.isnan(share) for share in result.coverage.values())
 
 
-def test_along_the_axes_of_the_world_a_turned_object_has_the_iou_of_the_formula() -> None:
-    """A cube turned by 45 degrees about z fills half of its straight box."""
+def test_rotated_object_has_the_analytic_iou_along_world_axes() -> None:
+    """A cube rotated by 45 degrees about z fills half of its axis-aligned box."""
     turned = box((1, 2, 3), (1, 1, 1), turn(45))
     truth, prediction = truth_of(("chair", turned)), map_of(("chair", turned, 1.0))
     along_truth, along_world = (
@@ -241,7 +239,7 @@ def test_along_the_axes_of_the_world_a_turned_object_has_the_iou_of_the_formula(
     assert combine(rules, {"a": score_of(flat, prediction, rules)}).metrics["AP50"] == 0.0
 
 
-def test_a_centroid_beside_its_box_a_class_beside_its_object_and_few_points_are_told() -> None:
+def test_centroid_outside_box_wrong_class_and_few_points_are_counted() -> None:
     truth = truth_of(("chair", CHAIR), ("sofa", SOFA))
     beside = map_of(("chair", box((1.2, 0, 0), (1, 1, 1)), 1.0), ("table", SOFA, 0.5))
     metrics = combine(RULES, {"a": score_of(truth, beside)}).metrics

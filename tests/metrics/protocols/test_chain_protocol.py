@@ -1,4 +1,4 @@
-"""Is an object found by each of its texts? The count by hand, over a map, and chains made from the truth of a scene."""
+"""Whether an object is found by each of its texts: by hand, over a map, and with chains generated from ground truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RULES = load_protocol("beacon3d")
 TRUTH = room()
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
 CLASS, LOOK, WHERE = frozenset(("class",)), frozenset(("class", "appearance")), frozenset(("class", "spatial"))
-# Objects 2 and 3 are chairs, of which the first is ranked first; 5 is the lamp, found by whatever names it.
+# Objects 2 and 3 are chairs, of which the first is ranked first; 5 is the lamp, found by any text that names it.
 CHAIR = ChainedText("chair", (2, 3), tags=CLASS, places=tuple(Place(0, k, 1) for k in range(3)))
 LEFT = tuple(ChainedText(f"chair {k} of the left", (2,), tags=WHERE, places=(Place(0, k, 0),)) for k in range(3))
 RIGHT = tuple(replace(one, object_ids=(3,)) for one in LEFT)
@@ -37,18 +37,18 @@ def values(prediction: object, *cases: ChainedText) -> dict[str, float | None]:
     return found
 
 
-def test_objects_are_right_where_each_of_their_finest_texts_is() -> None:
+def test_object_is_right_if_all_its_finest_texts_are() -> None:
     found = values(PERFECT, *LEFT, CHAIR, *LAMP)
     assert [found[name] for name in ("case", "object", "chain", "class", "spatial")] == [1.0] * 5
     assert (found["n_case"], found["n_object"], found["n_chain"], found["geometry"]) == (7, 2, 6, None)
-    missed = values(PERFECT, *RIGHT, CHAIR, *LAMP)  # the texts speak of the chair that is ranked second
+    missed = values(PERFECT, *RIGHT, CHAIR, *LAMP)  # the texts describe the chair that is ranked second
     assert (missed["object"], missed["case"], missed["spatial"]) == (0.5, 4 / 7, 0.0)
     assert (missed["chain"], missed["coarse alone"], missed["fine alone"], missed["neither"]) == (0.5, 0.5, 0.0, 0.0)
     one = values(PERFECT, LEFT[0], LEFT[1], RIGHT[2], CHAIR)
     assert one["object"] == 0.0 and one["chain"] == pytest.approx(2 / 3)
 
 
-def test_the_four_sorts_of_chains_are_all_of_them() -> None:
+def test_four_kinds_of_chains_cover_all_chains() -> None:
     generator = np.random.default_rng(0)
     cases = (*LEFT, CHAIR, *LAMP)
     for _ in range(20):
@@ -57,7 +57,7 @@ def test_the_four_sorts_of_chains_are_all_of_them() -> None:
         assert (sorts.sum(axis=0) == 1).all() and set(TAGS) < set(rows)
 
 
-def test_an_empty_map_finds_nothing_and_another_object_is_wrong() -> None:
+def test_empty_map_finds_nothing_and_wrong_object_is_wrong() -> None:
     assert values(nothing(TRUTH), *LAMP)["object"] == 0.0
     assert PERFECT.features is not None
     elsewhere = instances(TRUTH.points, [np.flatnonzero(TRUTH.instance == 4)], None, PERFECT.features[4:5])
@@ -65,7 +65,7 @@ def test_an_empty_map_finds_nothing_and_another_object_is_wrong() -> None:
 
 
 def scene() -> GroundTruth:
-    """A table with a lamp, a book and a vase on it, and things beside it."""
+    """A table with a lamp, a book and a vase on it, and objects next to it."""
     corners = [("lamp", (0, 0, 0), (0.5, 0.5, 1.8)), ("lamp", (3.2, 3.2, 0.8), (0.2, 0.2, 0.4)),
                ("table", (3, 3, 0), (0.9, 0.9, 0.8)), ("chair", (4.1, 3.2, 0), (0.5, 0.5, 0.9)),
                ("book", (3.6, 3.6, 0.8), (0.2, 0.15, 0.05)), ("backpack", (1, 4, 0), (0.4, 0.3, 0.5)),
@@ -77,7 +77,7 @@ def scene() -> GroundTruth:
     return GroundTruth(points.astype(np.float32), semantic, owner, TRUTH.labels, "mesh-vertices", "made")
 
 
-def test_chains_that_are_made_mean_their_object_alone_and_begin_with_its_name() -> None:
+def test_generated_chains_describe_only_their_object_and_begin_with_its_name() -> None:
     truth = scene()
     objects = known_objects(truth, 100)
     made = chain_truth("made/a", truth, objects)
@@ -97,7 +97,7 @@ def test_chains_that_are_made_mean_their_object_alone_and_begin_with_its_name() 
     assert {place.object for case in few for place in case.places} == {0}
 
 
-def test_an_object_with_fewer_than_three_texts_of_its_own_is_not_asked_for() -> None:
+def test_object_with_fewer_than_three_unique_texts_is_not_asked_for() -> None:
     objects = known_objects(scene(), 100)
     name = objects.by_id(1).name
     asked = [new_question("a/b", "instance", name, (1, 2), "")]

@@ -1,4 +1,4 @@
-"""What holds under every protocol: the truth scores 1, an empty map 0, order is nothing, parts come to the whole."""
+"""Invariants of every protocol: ground truth scores 1, an empty map 0, order does not matter, parts combine."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ OF_ROOMS = (
 OF_TEXTS = ("openlex3d-topn", "openlex3d-ranking", "query-ap", "openlex3d-queries")
 OF_QUESTIONS = ("rooms-presence", "rooms-retrieval")
 NAMES = (*OF_ROOMS, "replica-boxes", *OF_TEXTS, *OF_QUESTIONS)
-ANSWERS = {"chair": (2,), "lamp": (5,), "table": (4,)}  # of two chairs the one that is ranked first
-# what an empty map scores beside 0: where nothing is said to be there, half is right by chance
+ANSWERS = {"chair": (2,), "lamp": (5,), "table": (4,)}  # the chair that is ranked first of two
+# scores of an empty map other than 0: without any yes, half is right by chance
 EMPTY = {
     "openlex3d-topn": {"missing": 1.0},
     "rooms-presence": {f"AUROC {sampling}": 0.5 for sampling in SAMPLINGS},
     "replica-boxes": {"class": np.nan},
 }
 PERFECT = {"openlex3d-topn": {"synonyms": 1.0}}
-# where perfect masks of objects that meet, or of queries for several objects, need not reach 1
+# protocols in which perfect masks of touching objects, or for queries with several objects, may score below 1
 WITHOUT_CEILING = {"openlex3d-queries", "query-ap"}
 
 
@@ -74,14 +74,14 @@ def encoder_of(name: str) -> Any:
 
 def perfect(truth: Any, *, with_labels: bool = False) -> Instances:
     if isinstance(truth, PresenceTruth | RetrievalTruth):
-        return scored_room.truth_as_prediction(truth.scene, with_labels=False)  # texts are held against features alone
+        return scored_room.truth_as_prediction(truth.scene, with_labels=False)  # texts are compared with features only
     if isinstance(truth, GroundTruth):
         return scored_room.truth_as_prediction(truth, with_labels=with_labels)
     return open_scene.perfect(truth)
 
 
 def noisy(truth: Any, seed: int) -> Instances:
-    """Parts of the objects, each with a feature between its own and others, the second with that of the last."""
+    """Parts of the objects, each with a feature between its own and others, the second with that of the last one."""
     rng = np.random.default_rng(seed)
     whole = perfect(truth)
     assert whole.features is not None
@@ -109,7 +109,7 @@ def scores_of(name: str) -> dict[str, SceneScore]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_truth_scores_one_and_an_empty_map_nothing(name: str) -> None:
+def test_ground_truth_scores_one_and_empty_map_zero(name: str) -> None:
     truth = truth_of(name, 0)
     nothing = scored_room.instances(perfect(truth).points, [], None)
     headline = load_protocol(name).headline
@@ -122,7 +122,7 @@ def test_the_truth_scores_one_and_an_empty_map_nothing(name: str) -> None:
 
 
 def renumbered(truth: Any) -> Any:
-    """The same truth with other numbers of objects, and its queries the other way round."""
+    """The same ground truth with other object numbers, and its queries in reverse order."""
     if isinstance(truth, PresenceTruth | RetrievalTruth):
         asked: Any = truth.asked[::-1]
         return replace(truth, asked=asked)
@@ -143,7 +143,7 @@ def renumbered(truth: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_order_of_instances_and_the_numbers_of_objects_change_nothing(name: str) -> None:
+def test_instance_order_and_object_ids_change_nothing(name: str) -> None:
     truth = truth_of(name, 3)
     prediction = noisy(truth, 3)
     order = np.random.default_rng(0).permutation(len(prediction))
@@ -153,21 +153,21 @@ def test_the_order_of_instances_and_the_numbers_of_objects_change_nothing(name: 
     before = values(name, truth, prediction)
     assert any(0 < value < 1 for value in before.values())
     after = values(name, renumbered(truth), shuffled)
-    # AP25 may depend on the order of masks, as ScanNet's does
+    # AP25 may depend on the order of masks, as in ScanNet
     assert {key: value for key, value in after.items() if key != "AP25"} == pytest.approx(
         {key: value for key, value in before.items() if key != "AP25"}, rel=1e-12
     )
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scenes_come_to_the_same_from_their_files_and_in_whatever_order(name: str) -> None:
+def test_stored_scenes_combine_equally_in_any_order(name: str) -> None:
     rules, scores = load_protocol(name), scores_of(name)
     stored = {scene: unpack_scores(pack_scores({name: score}))[name] for scene, score in reversed(scores.items())}
     assert json.dumps(combine(rules, stored).to_json()) == json.dumps(combine(rules, scores).to_json())
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scenes_drawn_several_times_count_as_so_many_scenes(name: str) -> None:
+def test_scene_drawn_several_times_counts_as_several_scenes(name: str) -> None:
     metric, counts = metric_of(load_protocol(name)), [score.counts for score in scores_of(name).values()]
     weights = np.array([[1, 1, 1, 1], [0, 2, 1, 0], [0, 0, 0, 1]])
     drawn, classes = metric.resampled(counts, weights), metric.resampled_classes(counts, weights)

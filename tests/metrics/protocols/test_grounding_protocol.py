@@ -1,4 +1,4 @@
-"""The object that a sentence means: ScanRefer's IoU and shares to the last bit, files of sentences, and rules."""
+"""The object that a sentence describes: ScanRefer's IoU and accuracies to the last bit, sentence files, and rules."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RULES = load_protocol("grounding")
 PROBLEMS = json.loads((CASES / "grounding01_scanrefer.json").read_text())["problems"]
 TRUTH = room()
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
-# Objects 2 and 3 are chairs, 4 the table, 5 the lamp; of equal masks the first is ranked first.
+# Objects 2 and 3 are chairs, 4 the table, 5 the lamp; on ties the first mask is ranked first.
 ASKED = (TextQuery("the chair", (2,)), TextQuery("a lamp", (5,)), TextQuery("chair on the right", (3,)))
 
 
@@ -43,7 +43,7 @@ def values(prediction: object, truth: QueryTruth) -> dict[str, float | None]:
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS)))
-def test_the_iou_of_scanrefer_holds_to_the_last_bit(index: int) -> None:
+def test_scanrefer_iou_is_equal_in_every_bit(index: int) -> None:
     problem = PROBLEMS[index]
     pairs = zip(np.array(problem["predicted"]), np.array(problem["true"]), strict=True)
     iou = np.array([box_iou(*pair) for pair in pairs])
@@ -51,11 +51,11 @@ def test_the_iou_of_scanrefer_holds_to_the_last_bit(index: int) -> None:
     assert [float((iou >= threshold).mean()) for threshold in (0.25, 0.5)] == problem["answer"]
 
 
-def test_the_instance_ranked_first_must_stand_in_the_place_of_the_object() -> None:
+def test_first_instance_must_be_at_the_object() -> None:
     found = values(PERFECT, asking(*ASKED))
     assert (found["Acc@0.25"], found["Acc@0.5"], found["n_Acc@0.5"]) == (2 / 3, 2 / 3, 3)
     either = values(PERFECT, asking(TextQuery("chair", (3, 2))))
-    assert either["Acc@0.5"] == 1.0  # of several that are meant, any
+    assert either["Acc@0.5"] == 1.0  # any of several described objects
 
 
 def test_a_part_of_an_object_has_a_smaller_box() -> None:
@@ -66,12 +66,12 @@ def test_a_part_of_an_object_has_a_smaller_box() -> None:
     assert [values(part, asking(ASKED[1]))[f"Acc@{name}"] for name in ("0.25", "0.5")] == [1.0, 0.0]
 
 
-def test_an_empty_map_finds_nothing_and_nothing_asked_has_no_value() -> None:
+def test_empty_map_finds_nothing_and_no_queries_give_no_value() -> None:
     assert values(nothing(TRUTH), asking(*ASKED))["Acc@0.25"] == 0.0
     assert values(PERFECT, asking())["Acc@0.25"] is None
 
 
-def test_sentences_are_read_from_the_files_of_scanrefer_and_nr3d(tmp_path: Path) -> None:
+def test_sentences_are_read_from_scanrefer_and_nr3d_files(tmp_path: Path) -> None:
     row = {"scene_id": "scene0011_00", "object_id": "4", "description": "the brown chair"}
     (tmp_path / "ScanRefer_filtered_val.json").write_text(json.dumps([row, row]))
     (tmp_path / "nr3d.csv").write_text('scan_id,target_id,utterance\nscene0011_00,4,"the chair, brown"\n')
@@ -97,7 +97,7 @@ def share(rows: np.ndarray, right: np.ndarray) -> float | None:
 
 
 @pytest.mark.parametrize("index", range(len(GROUPED)))
-def test_what_scanrefer_calls_unique_and_its_shares_hold_to_the_last_bit(index: int, tmp_path: Path) -> None:
+def test_scanrefer_unique_and_accuracies_are_equal_in_every_bit(index: int, tmp_path: Path) -> None:
     problem = GROUPED[index]
     path = tmp_path / "ScanRefer_filtered_val.json"
     path.write_text(json.dumps(problem["rows"]))
@@ -111,11 +111,11 @@ def test_what_scanrefer_calls_unique_and_its_shares_hold_to_the_last_bit(index: 
     for name, answer in zip(RULES.value_names, problem["answer"], strict=True):
         group, _, measure = name.rpartition(" ")
         found = share(in_group(groups, group or "all", "scanrefer"), iou >= float(measure.removeprefix("Acc@")))
-        assert (found or 0.0) == answer  # it says 0 of nothing
+        assert (found or 0.0) == answer  # it returns 0 without sentences
 
 
 @pytest.mark.parametrize("index", range(len(CHOSEN)))
-def test_the_sentences_that_nr3d_counts_and_its_shares_hold_to_the_last_bit(index: int, tmp_path: Path) -> None:
+def test_nr3d_scored_sentences_and_accuracies_are_equal_in_every_bit(index: int, tmp_path: Path) -> None:
     problem, path = CHOSEN[index], tmp_path / "nr3d.csv"
     names = ("scan_id", "target_id", "utterance", "stimulus_id", "tokens", "mentions_target_class")
     with path.open("w", newline="") as file:
@@ -130,9 +130,9 @@ def test_the_sentences_that_nr3d_counts_and_its_shares_hold_to_the_last_bit(inde
     assert [None if one is None else one * 100 for one in found] == (problem["answer"] or [None] * 5)
 
 
-def test_queries_of_other_files_are_grouped_by_the_classes_of_the_truth() -> None:
+def test_queries_of_other_files_are_grouped_by_ground_truth_classes() -> None:
     found = values(PERFECT, asking(*ASKED))
-    # the lamp is the only one; of two chairs the first is found
+    # the lamp is unique; the first of two chairs is found
     assert (found["unique Acc@0.5"], found["multiple Acc@0.5"], found["n_multiple Acc@0.5"]) == (1.0, 0.5, 2)
     groups = [query.groups for query in asking(*ASKED).queries]
     assert groups[2] == ("multiple", "easy", "view-dependent") and groups[1][0] == "unique"
@@ -140,7 +140,7 @@ def test_queries_of_other_files_are_grouped_by_the_classes_of_the_truth() -> Non
     assert own.queries[0].groups == ("hard", "view-independent", "multiple")
 
 
-def test_a_choice_is_among_the_boxes_that_are_given() -> None:
+def test_choice_is_among_the_given_boxes() -> None:
     def chosen(prediction: object, *queries: TextQuery) -> dict[str, float | None]:
         score = score_scene(GIVEN, asking(*queries), prediction, ENCODER)  # type: ignore[arg-type]
         found: dict[str, float | None] = plain_json(combine(GIVEN, {"a": score}).metrics)
@@ -150,23 +150,23 @@ def test_a_choice_is_among_the_boxes_that_are_given() -> None:
     assert (found["accuracy"], found["easy"], found["hard"], found["view-dependent"]) == (2 / 3, 2 / 3, None, 0.0)
     assert PERFECT.features is not None
     lamp = np.flatnonzero(TRUTH.instance == 5)
-    part = lamp[TRUTH.points[lamp, 2] < 0.1]  # too little of it for any IoU: the place is what counts
+    part = lamp[TRUTH.points[lamp, 2] < 0.1]  # too small for any IoU: only the position counts
     assert chosen(instances(TRUTH.points, [part], None, PERFECT.features[4:5]), ASKED[1])["accuracy"] == 1.0
     beyond = np.vstack([TRUTH.points, TRUTH.points[lamp] + 50]).astype(np.float32)
     far = np.arange(len(TRUTH.points), len(beyond))
     both = instances(beyond, [far, lamp], None, PERFECT.features[[4, 4]])
-    assert chosen(both, ASKED[1])["accuracy"] == 1.0  # the first stands in the place of nothing that is given
+    assert chosen(both, ASKED[1])["accuracy"] == 1.0  # the first overlaps none of the given boxes
     left_out = TextQuery("a lamp", (5,), ("left out",))
     assert chosen(PERFECT, left_out)["accuracy"] is None
     assert chosen(nothing(TRUTH), ASKED[1])["accuracy"] == 0.0
 
 
-def test_boxes_stand_along_the_walls_that_the_dataset_knows() -> None:
+def test_boxes_are_aligned_with_the_dataset_walls() -> None:
     rows = TRUTH.instance == 4
     turn: Float64Array = np.eye(4)
     turn[:2, :2] = [[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]]
     turn[:3, 3] = 3, -2, 0.5
-    low = np.flatnonzero(rows & (TRUTH.points[:, 0] < 3.39))  # an IoU of 0.47, along the turned axes of 0.51
+    low = np.flatnonzero(rows & (TRUTH.points[:, 0] < 3.39))  # an IoU of 0.47, along the rotated axes 0.51
     assert PERFECT.features is not None
     part = instances(TRUTH.points, [low], None, PERFECT.features[3:4])
     for alignment, right in ((None, 0.0), (turn, 1.0)):
@@ -177,7 +177,7 @@ def test_boxes_stand_along_the_walls_that_the_dataset_knows() -> None:
     assert np.abs(back - TRUTH.points).max() < 1e-5
 
 
-def test_scannet_gives_its_axis_alignment_and_the_classes_of_names(tmp_path: Path) -> None:
+def test_scannet_has_axis_alignment_and_classes_of_names(tmp_path: Path) -> None:
     folder = write_scan(tmp_path)
     dataset = ScanNet(tmp_path)
     assert dataset.axis_alignment(SCAN)[:3, 3].tolist() == [5, 6, 7]
@@ -203,7 +203,7 @@ def test_scannet_gives_its_axis_alignment_and_the_classes_of_names(tmp_path: Pat
         ("scene0011_00-chair-2-4-5", "(" * 9000, "'tokens' must be a list of words"),
     ],
 )
-def test_each_fault_of_a_row_of_nr3d_is_one_line(tmp_path: Path, stimulus: str, tokens: str, message: str) -> None:
+def test_each_invalid_nr3d_row_is_one_line(tmp_path: Path, stimulus: str, tokens: str, message: str) -> None:
     path = tmp_path / "nr3d.csv"
     with path.open("w", newline="") as file:
         table = csv.writer(file)

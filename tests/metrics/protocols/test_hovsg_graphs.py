@@ -1,4 +1,4 @@
-"""HOV-SG's objects, rooms and floors: what its own evaluator answers, and what it leaves open."""
+"""HOV-SG's objects, rooms and floors: equal to its own evaluator, and cases that it does not define."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CASE: dict[str, Any] = {
 
 
 class GivenTextEncoder:
-    """An encoder that knows the feature of each name."""
+    """An encoder with a fixed feature per name."""
 
     name, digest, device = "given", "given", "cpu"
 
@@ -54,13 +54,13 @@ class GivenTextEncoder:
 
 
 def rules_of(n: int) -> Any:
-    """HOV-SG's rules over ``n`` categories c0, c1, ... that are compared as they stand."""
+    """HOV-SG's rules over ``n`` categories c0, c1, ... that are compared unchanged."""
     classes = tuple(ClassEntry(id=k + 1, name=f"c{k}") for k in range(n))
     return OBJECT_RULES.model_copy(update={"classes": classes, "prompts": (), "prompt": "{}"})
 
 
 def numbers(rules: Any, *scenes: tuple[GroundTruth, Instances], encoder: Any = None) -> dict[str, float]:
-    """What the scenes score together, from counts as a run keeps them."""
+    """The values over all scenes, from counts as stored in a run."""
     scores = {f"s{k}": score_scene(rules, truth, found, encoder) for k, (truth, found) in enumerate(scenes)}
     kept = {name: unpack_scores(pack_scores({rules.name: score}))[rules.name] for name, score in scores.items()}
     return dict(combine(rules, kept, with_intervals=False).metrics)
@@ -91,7 +91,7 @@ def truth_of(clouds: list[np.ndarray], ids: list[int], boxes: Any = (), places: 
 
 
 @pytest.mark.parametrize("index", range(30))
-def test_objects_have_the_answer_of_hovsgs_evaluator(index: int) -> None:
+def test_objects_equal_the_hovsg_evaluator(index: int) -> None:
     problem, arrays = CASE["hovsg01_objects"][0][index], CASE["hovsg01_objects"][1]
     names = [f"c{k}" for k in range(problem["names"])]
     ids = [names.index(name) + 1 if name in names else 0 for name in problem["categories"]]
@@ -102,7 +102,7 @@ def test_objects_have_the_answer_of_hovsgs_evaluator(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(30))
-def test_floors_and_rooms_have_the_answer_of_hovsgs_evaluator(index: int) -> None:
+def test_floors_and_rooms_equal_the_hovsg_evaluator(index: int) -> None:
     problem, arrays = CASE["hovsg02_places"][0][index], CASE["hovsg02_places"][1]
     clouds = {side: split(arrays[f"{side}_{index}"], problem["sizes"][side]) for side in ("true", "pred")}
     rooms = [Room(cloud, *row) for cloud, row in zip(clouds["true"], problem["true"], strict=True)]
@@ -122,7 +122,7 @@ def test_floors_and_rooms_have_the_answer_of_hovsgs_evaluator(index: int) -> Non
     assert answer == pytest.approx(problem["answer"], abs=1e-15)
 
 
-def test_the_truth_itself_is_found_whole_and_the_area_ends_at_the_last_ten(tmp_path: Any) -> None:
+def test_ground_truth_is_found_completely_and_the_area_ends_at_the_last_ten(tmp_path: Any) -> None:
     write_walk(tmp_path)
     oracle = Oracle(Oracle.Config())
     oracle.receive_ground_truth(truth := Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects"))
@@ -132,7 +132,7 @@ def test_the_truth_itself_is_found_whole_and_the_area_ends_at_the_last_ten(tmp_p
     assert set(numbers(PLACE_RULES, (truth, oracle.finish())).values()) == {1.0}
 
 
-def test_labels_are_the_first_ranks_and_what_they_do_not_name_is_never_right() -> None:
+def test_labels_are_the_first_ranks_and_unnamed_categories_are_never_right() -> None:
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     truth = truth_of([cube, cube + 5], [1, 2])
     found = map_of([cube, cube + 5], labels=["c2", "c0"], further_labels=[["c0"], [""]])
@@ -163,11 +163,11 @@ def test_a_map_without_floors_and_rooms_is_refused_in_one_line() -> None:
         score_scene(PLACE_RULES, truth, map_of([np.eye(3)], labels=["c0"]), None)
     with pytest.raises(PredictionError, match="needs features and an encoder, or labels"):
         score_scene(OBJECT_RULES, truth, map_of([np.eye(3)]), None)
-    with pytest.raises(DataError, match="knows no floors and no rooms"):
+    with pytest.raises(DataError, match="has no floors and rooms"):
         score_scene(PLACE_RULES, replace(truth, places=None), map_of([], labels=()), None)
 
 
-def test_another_number_of_floors_finds_no_bound_and_says_so(tmp_path: Any) -> None:
+def test_wrong_number_of_floors_finds_no_bound_and_warns(tmp_path: Any) -> None:
     write_walk(tmp_path)
     truth = Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects")
     found = READERS["hovsg-graph"].read(write_graph(tmp_path / "x"), "x").content
@@ -175,14 +175,14 @@ def test_another_number_of_floors_finds_no_bound_and_says_so(tmp_path: Any) -> N
     right, wrong = found, replace(found, places=replace(found.places, floors=(Floor(0.0, 1.0), Floor(1.4, 2.4))))
     score = score_scene(PLACE_RULES, truth, wrong, None)
     assert score.warnings == (
-        "2 floors are predicted, 1 are true: no bound counts as found (the original ends in an error)",
+        "2 floors are predicted, 1 are true: no bound counts as found (the original raises an error)",
     )
     both = numbers(PLACE_RULES, (truth, right), (truth, wrong))
     assert (both["number of floors"], both["floor recall"], both["room recall"]) == (0.5, 0.5, 1.0)
     assert floor_bounds([], [Floor(0, 1)])[0].tolist() == [0, 2]
 
 
-def test_points_at_the_radius_are_not_near_and_shares_are_of_the_right_side() -> None:
+def test_points_at_the_radius_do_not_overlap_and_shares_use_the_right_side() -> None:
     one, other = Cloud(np.array([[0.0, 0], [1, 0], [2, 0]])), Cloud(np.array([[0.5, 0], [2.25, 0]]))
     assert (one.n_near(other, 0.5), other.n_near(one, 0.5), one.n_near(other, 0.51)) == (1, 1, 3)
     assert larger_share(one, other, 0.5) == 0.5 and larger_share(other, one, 0.51) == 1.0
@@ -190,7 +190,7 @@ def test_points_at_the_radius_are_not_near_and_shares_are_of_the_right_side() ->
     assert covered_share(Cloud(np.zeros((0, 2))), one, 1.0) == 0.0 == larger_share(one, Cloud(np.zeros((0, 2))), 1.0)
 
 
-def test_voxels_are_those_of_open3d() -> None:
+def test_voxels_equal_open3d() -> None:
     import open3d as o3d
 
     points = np.random.default_rng(0).random((300, 3)) * 0.4
@@ -200,5 +200,5 @@ def test_voxels_are_those_of_open3d() -> None:
     np.testing.assert_allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], rtol=0, atol=1e-15)
 
 
-def test_the_names_of_the_walk_are_categories_of_the_list() -> None:
+def test_hm3dsem_walk_names_are_categories_of_the_list() -> None:
     assert {name for _, name, _, _ in OBJECTS} <= {entry.name for entry in OBJECT_RULES.classes}

@@ -1,4 +1,4 @@
-"""Class-agnostic AP: three rules for what is an instance and what is void, of which no two give the same number."""
+"""Class-agnostic AP: three rules for instances and void, each with different values."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
-CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is none of the 200
+CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is not one of the 200
 LABELS = LabelSet("scannet", (CHAIR, WALL, OTHER), ("chair", "wall", "gadget"))
 N = 200
 
 
 def scan(unannotated: int = N) -> GroundTruth:
-    """Two chairs, a wall and a thing of no class, 200 points each, and points that nobody annotated."""
+    """Two chairs, a wall and an object without a class, 200 points each, and unannotated points."""
     semantic = np.repeat([CHAIR, CHAIR, WALL, OTHER, 0], [N, N, N, N, unannotated]).astype(np.int32)
     instance = np.repeat([1, 2, 3, 4, 0], [N, N, N, N, unannotated]).astype(np.int32)
     points = np.random.default_rng(0).random((len(semantic), 3)).astype(np.float32)
@@ -50,7 +50,7 @@ def test_each_rule_has_its_own_instances(name: str, n_instances: int) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_truth_scores_one_but_where_unannotated_points_are_an_instance_and_an_empty_map_zero(name: str) -> None:
+def test_ground_truth_scores_one_unless_unannotated_points_are_an_instance_and_empty_map_zero(name: str) -> None:
     truth = scan()
     assert ap_of(name, truth, masks(truth)) == 0.0
     value = ap_of(name, truth, masks(truth, 1, 2, 3, 4))
@@ -60,16 +60,16 @@ def test_the_truth_scores_one_but_where_unannotated_points_are_an_instance_and_a
     assert ap_of(name, truth, masks(truth, 1, 2, 3, 4, 0)) == 1.0
 
 
-def test_what_lies_on_void_is_dropped_under_open3dis() -> None:
+def test_masks_on_void_are_dropped_by_open3dis() -> None:
     assert ap_of("class-agnostic-open3dis", scan(), masks(scan(), 1, 2, 0)) == 1.0
 
 
 @pytest.mark.parametrize("is_own_writer", [True, False], ids=["MaskClustering's writer", "Mask3D's writer"])
-def test_both_forms_of_ground_truth_give_maskclustering_the_same_counts(is_own_writer: bool) -> None:
-    """Values as the two programs write them, then mod 1000 + 1000 x the first class, as --no_class does."""
+def test_both_ground_truth_forms_of_maskclustering_give_equal_counts(is_own_writer: bool) -> None:
+    """Values as written by the two programs, then mod 1000 + 1000 x the first class, as with --no_class."""
     truth = scan()
     known = np.isin(truth.semantic, [entry.id for entry in load_protocol("scannet200-instance").scored])
-    identity = truth.instance.astype(np.int64) - 1  # the position in segGroups, -1 where there is none
+    identity = truth.instance.astype(np.int64) - 1  # the index in segGroups, -1 for none
     if is_own_writer:
         written = np.where(known, truth.semantic, 0) * 1000 + (identity + 1) + 1
     else:
@@ -83,7 +83,7 @@ def test_both_forms_of_ground_truth_give_maskclustering_the_same_counts(is_own_w
     assert theirs.is_true.tolist() == ours.is_true.tolist()  # type: ignore[attr-defined]
 
 
-def test_an_instance_id_or_more_objects_than_the_encoding_can_hold_are_refused() -> None:
+def test_instance_id_or_number_of_objects_beyond_the_encoding_is_refused() -> None:
     rules = load_protocol("class-agnostic-segment3d")
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
         encode_without_classes(rules, np.array([CHAIR]), np.array([1000]))
@@ -93,14 +93,14 @@ def test_an_instance_id_or_more_objects_than_the_encoding_can_hold_are_refused()
         encode_without_classes(rules, 1 + number // 500, 1 + number % 500)
 
 
-# ---- what the originals answer where the order of objects counts, or numbers begin anew with each class
+# ---- answers of the originals if the order of objects matters, or if numbers restart with each class
 
 CASE = "agnostic01_class_after_class"
 PROBLEMS = json.loads((CASES / f"{CASE}.json").read_text())["problems"]
 
 
 def problem(index: int) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
-    """The truth, label * 1000 + instance, and the masks of each scene."""
+    """Ground truth, label * 1000 + instance, and the masks of each scene."""
     with np.load(CASES / f"{CASE}.npz") as archive:
         for s in range(PROBLEMS[index]["n_scenes"]):
             values = archive[f"gt_{index}_{s}"]
@@ -110,7 +110,7 @@ def problem(index: int) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
 
 @pytest.mark.parametrize("name", ["open3dis", "segment3d"])
 @pytest.mark.parametrize("index", range(len(PROBLEMS)))
-def test_objects_are_matched_class_after_class_to_the_bits_of_the_original(index: int, name: str) -> None:
+def test_objects_are_matched_class_by_class_as_in_the_original_in_every_bit(index: int, name: str) -> None:
     rules = load_protocol(f"class-agnostic-{name}")
     scores = {}
     for s, (values, masks) in enumerate(problem(index)):

@@ -1,4 +1,4 @@
-"""Semantic protocols by the vote of several neighbours: HOV-SG's and OVO's; and ScanNet's with 20 and 200 classes."""
+"""Semantic protocols with votes of several neighbours (HOV-SG, OVO), and ScanNet's with 20 and 200 classes."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def metrics(rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Pa
     return [result.metrics[name] for name in rules.headline]
 
 
-# ---- what the original answers
+# ---- equal to the original
 
 
-def test_the_golden_hovsg_values_come_out() -> None:
-    as_index = {-1: 0} | {one: one for one in range(8)}  # -1 and 0 are ignored alike
+def test_golden_hovsg_values_are_reproduced() -> None:
+    as_index = {-1: 0} | {one: one for one in range(8)}  # -1 and 0 are both ignored
     truth, predicted = (np.array([as_index[one] for one in GOLDEN[key]]) for key in ("gt", "pred"))
     is_scored = np.array([one not in GOLDEN["ignore"] for one in range(8)])
     confusion = per_scene(truth, predicted, np.ones(8, bool)).confusion
@@ -60,16 +60,16 @@ def test_a_class_of_a_single_point_counts() -> None:
 # ---- the label set
 
 
-def test_the_substring_rule_leaves_out_the_classes_that_the_original_does() -> None:
+def test_substring_rule_ignores_the_classes_of_the_original() -> None:
     ignored = {entry.id for entry in HOVSG.classes if HOVSG.is_ignored(entry.name)}
     assert ignored == {0, 31, 37, 40, 44, 93, 94, 95, 97}
     assert {entry.id for entry in EXACT.classes if EXACT.is_ignored(entry.name)} == {0, 31, 37, 40, 93, 97}
     assert (len(HOVSG.classes), len(OVO.classes)) == (102, 51)
 
 
-def test_the_mean_of_the_prompts_is_that_of_their_directions() -> None:
+def test_mean_of_prompts_is_the_mean_of_their_directions() -> None:
     class Loud(OneHotEncoder):
-        """The second template speaks a hundred times as loud, along an axis of its own."""
+        """The feature of the second template is a hundred times longer, along its own axis."""
 
         def encode_texts(self, texts: Sequence[str]) -> Float32Array:
             return np.array([[100.0, 0.0] if text.startswith("There") else [0.0, 1.0] for text in texts], np.float32)
@@ -83,8 +83,8 @@ def test_the_mean_of_the_prompts_is_that_of_their_directions() -> None:
 
 
 @pytest.mark.parametrize("rules", [HOVSG, EXACT], ids=lambda rules: str(rules.name))
-def test_the_truth_on_its_own_points_does_not_reach_one_where_objects_meet(rules: ProtocolRules) -> None:
-    """The vote of the neighbours smooths the border, on the scored points themselves too."""
+def test_ground_truth_on_its_own_points_scores_below_one_where_objects_touch(rules: ProtocolRules) -> None:
+    """The vote of neighbours smooths the border, also on the scored points themselves."""
     truth = two_that_meet(rules)
     prediction = truth_as_prediction(truth, with_labels=True)
     assert all(0.8 < value < 1 for value in metrics(rules, truth, prediction))
@@ -92,15 +92,15 @@ def test_the_truth_on_its_own_points_does_not_reach_one_where_objects_meet(rules
     assert set(metrics(alone, truth, prediction)) == {1.0}
 
 
-def test_what_lies_on_the_vertices_is_not_voted_on_under_ovo_and_a_cloud_beside_them_is() -> None:
+def test_ovo_votes_only_for_clouds_off_the_vertices() -> None:
     truth = two_that_meet(OVO)
     prediction = truth_as_prediction(truth, with_labels=True)
     assert set(metrics(OVO, truth, prediction)) == {1.0}
     assert all(0.8 < value < 1 for value in metrics(OVO, truth, replace(prediction, points=truth.points + 1e-6)))
 
 
-def test_under_ovo_neighbours_vote_for_their_object_and_not_for_its_class() -> None:
-    """Two points of a chair among one of each of three tables: the chair, though three points say table."""
+def test_ovo_neighbours_vote_for_objects_not_classes() -> None:
+    """Two points of a chair and one of each of three tables: the chair wins, though three points are of tables."""
     vertex = np.zeros((1, 3), np.float32)
     ring = np.array([[0.1, 0, 0], [0, 0.11, 0], [0, 0, 0.12], [-0.13, 0, 0], [0, -0.14, 0]], np.float32)
     of_chair = np.array([ID["chair"]], np.int32)
@@ -112,7 +112,7 @@ def test_under_ovo_neighbours_vote_for_their_object_and_not_for_its_class() -> N
         assert combine(rules, scores).per_class["chair"]["recall"] == recall
     dense = DenseFeatures(ring, ENCODER.encode_texts(["chair", "chair", "table", "table", "table"]).astype(np.float16))
     scores = {"a": score_scene(OVO, fitting(OVO, truth), dense, ENCODER)}
-    assert combine(OVO, scores).per_class["chair"]["recall"] == 0.0  # without objects the classes vote
+    assert combine(OVO, scores).per_class["chair"]["recall"] == 0.0  # without objects, classes vote
 
 
 def two_that_meet(rules: ProtocolRules) -> GroundTruth:
@@ -123,7 +123,7 @@ def two_that_meet(rules: ProtocolRules) -> GroundTruth:
     return GroundTruth(points, semantic, (semantic == ID["chair"]) + np.int32(1), LABELS, rules.ground_truth, "test")
 
 
-def test_what_is_predicted_on_an_ignored_surface_lowers_the_iou_under_hovsg_and_not_under_conceptgraphs() -> None:
+def test_prediction_on_an_ignored_surface_lowers_iou_for_hovsg_but_not_for_conceptgraphs() -> None:
     truth = room()
     whole = truth_as_prediction(truth, with_labels=True)
     names = whole.labels or ()
@@ -136,7 +136,7 @@ def test_what_is_predicted_on_an_ignored_surface_lowers_the_iou_under_hovsg_and_
         assert (values[1] < values[0]) == is_lower
 
 
-def test_objects_that_overlap_vote_each_and_one_without_a_class_does_not() -> None:
+def test_overlapping_objects_vote_separately_and_one_without_a_class_does_not() -> None:
     truth = room()
     chairs = np.flatnonzero(truth.instance == 2)
     for extra, recall in ((["table", "table"], 0.0), (["unheard", "unheard"], 1.0), (["table", "chair"], 1.0)):
@@ -146,7 +146,7 @@ def test_objects_that_overlap_vote_each_and_one_without_a_class_does_not() -> No
         assert combine(HOVSG, {"a": score}).per_class["chair"]["recall"] == recall
 
 
-def test_under_ovo_what_has_no_class_is_called_the_last_class_of_its_list() -> None:
+def test_ovo_calls_points_without_a_class_the_last_class() -> None:
     """update_confmat takes -1 as an index: of the column of the last class."""
     lists = {name: load_protocol(name).unnamed for name in ("replica-ovo51", "scannet-ovo20", "scannet-ovo200")}
     assert lists == {"replica-ovo51": "switch", "scannet-ovo20": "background", "scannet-ovo200": "mattress"}
@@ -156,32 +156,32 @@ def test_under_ovo_what_has_no_class_is_called_the_last_class_of_its_list() -> N
     is_switch = truth.instance == 2
     with_switch = replace(truth, semantic=np.where(is_switch, switch, truth.semantic).astype(np.int32))
     for found in (
-        instances(truth.points, [chairs], ["unheard"]),  # an object of no class
+        instances(truth.points, [chairs], ["unheard"]),  # an object without a class
         instances(truth.points, [chairs[:1]], ["switch"]),  # vertices in no mask
         instances(truth.points + np.float32(0.001), [chairs, chairs[:9]], ["unheard", "chair"]),  # it votes
     ):
         result = combine(OVO, {"a": score_scene(OVO, with_switch, found, None)})
         assert result.per_class["switch"]["recall"] > 0.9
     of_chairs = combine(OVO, {"a": score_scene(OVO, truth, instances(truth.points, [chairs], ["unheard"]), None)})
-    assert of_chairs.per_class["switch"]["IoU"] == 0.0  # never true, and predicted: it counts
+    assert of_chairs.per_class["switch"]["IoU"] == 0.0  # never true, but predicted: it counts
     assert set(metrics(OVO, with_switch, nothing(truth))) == {0.0}
 
 
-def test_a_class_a_vertex_beside_files_of_truth_counts_alike() -> None:
+def test_one_class_per_vertex_scores_equally_against_ground_truth_files() -> None:
     rules = load_protocol("scannet-ovo20")
     labels = np.array([1, 1, 2, 0])
     truth = VertexTruth(labels * 1000 + 1, labels, ())
     called = VertexLabels(np.array([1, -1, 0, -1], np.int32))
     outcome = score_on_vertices(rules, truth, "a", called, None)
     found = combine(rules, {"a": outcome.score})
-    assert found.per_class["background"]["IoU"] == 0.0  # two labelled vertices are called so
+    assert found.per_class["background"]["IoU"] == 0.0  # two labelled vertices are predicted as such
     assert found.per_class["wall"]["recall"] == 0.5
     assert found.metrics["mIoU"] == pytest.approx(0.5 / 3)
     none = score_on_vertices(rules, truth, "a", VertexLabels(np.zeros(0, np.int32)), None)
     assert np.isnan(combine(rules, {"a": none.score}).per_class["background"]["IoU"])
 
 
-def test_objects_of_the_first_class_vote_as_all_others() -> None:
+def test_objects_of_the_first_class_vote_like_all_others() -> None:
     truth, first = room(), OVO.classes[0]
     own = np.flatnonzero(truth.instance == 2)
     semantic = np.where(truth.instance == 2, first.id, 0).astype(np.int32)
@@ -194,7 +194,7 @@ def test_objects_of_the_first_class_vote_as_all_others() -> None:
 
 
 def scan(rules: ProtocolRules, truth_names: Sequence[str], predicted: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Values of each class of a scan with ten points a name, and of its groups."""
+    """Values of each class of a scan with ten points per name, and of its groups."""
     labels = LabelSet("scannet", tuple(c.id for c in rules.classes), tuple(c.name for c in rules.classes))
     known = dict(zip(labels.names, labels.ids, strict=True))
     semantic = np.repeat([known.get(name, 0) for name in truth_names], 10).astype(np.int32)
@@ -206,18 +206,18 @@ def scan(rules: ProtocolRules, truth_names: Sequence[str], predicted: Sequence[s
 
 
 @pytest.mark.parametrize("name", ["scannet-semantic", "scannet200-semantic"])
-def test_scannet_counts_a_prediction_of_no_known_class_as_wrong_and_an_absent_class_not_at_all(name: str) -> None:
+def test_scannet_counts_unknown_predictions_as_wrong_and_ignores_absent_classes(name: str) -> None:
     values = scan(load_protocol(name), ["chair", "chair", "table", "unlabelled"], ["chair", "ufo", "desk", "sink"])
     assert values["chair"]["IoU"] == values["chair"]["recall"] == 0.5
     assert values["table"]["IoU"] == 0.0
-    assert values["desk"]["IoU"] == 0.0 and np.isnan(values["desk"]["recall"])  # never true, yet predicted
-    assert np.isnan(values["sink"]["IoU"])  # predicted on an unlabelled point alone
+    assert values["desk"]["IoU"] == 0.0 and np.isnan(values["desk"]["recall"])  # never true, but predicted
+    assert np.isnan(values["sink"]["IoU"])  # predicted only on an unlabelled point
     assert np.isnan(values["bathtub"]["IoU"])
     assert values["all"]["mIoU"] == pytest.approx(0.5 / 3)
     assert values["all"]["mAcc"] == 0.25
 
 
-def test_scannet200_has_the_means_of_its_three_groups() -> None:
+def test_scannet200_has_means_of_its_three_groups() -> None:
     rules = load_protocol("scannet200-semantic")
     assert [sum(c.group == name for c in rules.scored) for name in ("head", "common", "tail")] == [66, 68, 66]
     values = scan(rules, ["chair", "table", "bag", "cup"], ["chair", "chair", "bag", "clock"])

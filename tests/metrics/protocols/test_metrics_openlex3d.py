@@ -1,4 +1,4 @@
-"""OpenLex3D's measures of labels: the original's answers, values worked by hand, and what changes nothing."""
+"""OpenLex3D's measures of labels: equal to the original, hand-computed values, and invariants."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def values_of(rules: Any, truth: OpenLexTruth, prediction: Prediction) -> dict[s
     return dict(combine_scenes(rules, {"scene": score_scene(rules, truth, prediction, ENCODER)}).metrics)
 
 
-# ---- what the original answers
+# ---- equal to the original
 
 
 def golden_labels() -> dict[int, ObjectLabels]:
@@ -78,19 +78,19 @@ def golden_categories() -> tuple[list[int], np.ndarray, np.ndarray]:
     return ids, row, point_categories(row, unit, top, category_table(objects, ids, words))
 
 
-def test_the_category_of_every_golden_point_is_the_originals() -> None:
+def test_golden_point_categories_equal_the_original() -> None:
     _, _, category = golden_categories()
     assert [CATEGORIES[one] if one >= 0 else "none" for one in category] == GOLDEN["ol_topn"]["cats"]
 
 
-def test_the_golden_category_frequencies_come_out() -> None:
+def test_golden_category_frequencies_are_reproduced() -> None:
     ids, row, category = golden_categories()
     means = combine([count_categories(row, category, len(ids))])
     assert dict(zip(CATEGORIES, means.tolist(), strict=True)) == GOLDEN["ol_topn"]["freq"]
 
 
 @pytest.mark.parametrize("case", ["ol_rank_syn", "ol_rank_sec"])
-def test_the_golden_rank_scores_come_out(case: str) -> None:
+def test_golden_rank_scores_are_reproduced(case: str) -> None:
     ranks, first, last, highest = GOLDEN[case]["args"]
     ours = rank_scores(np.array(ranks), first, last, highest)
     np.testing.assert_allclose([part.tolist() for part in ours], GOLDEN[case]["scores"], rtol=0, atol=1e-15)
@@ -99,12 +99,12 @@ def test_the_golden_rank_scores_come_out(case: str) -> None:
 # ---- by hand
 
 
-def test_labels_are_compared_without_spaces_and_with_their_case() -> None:
+def test_labels_are_compared_without_spaces_but_with_case() -> None:
     table = category_table({1: ObjectLabels(("tv stand",))}, [1], ["tvstand", "t v stand", "TV stand"])
     assert table.tolist() == [[0, 0, 5]]
 
 
-def test_clutter_counts_any_label_of_the_object_that_stands_near() -> None:
+def test_clutter_counts_any_label_of_a_nearby_object() -> None:
     objects = {1: ObjectLabels(("a",), clutter=(2, 77)), 2: ObjectLabels(("b",), ("c",), ("d",), clutter=(3,))}
     words = ["b", "c", "d", "e"]
     assert [CATEGORIES[one] for one in category_table(objects, [1], words)[0]] == ["clutter"] * 3 + ["incorrect"]
@@ -118,21 +118,21 @@ def test_an_object_without_synonyms_or_with_an_excluded_one_is_not_scored() -> N
 A = ObjectLabels(("a",))
 
 
-def test_ranks_are_counted_by_points_of_objects_that_have_any() -> None:
+def test_ranks_are_counted_for_points_of_objects_with_labels() -> None:
     scores = np.array([[1.0, 0.5, np.nan], [0.0, 0.25, np.nan], [0.5, np.nan, 1.0]])
     counts = count_ranks(np.array([0, 0, 0, -1, 2]), np.array([0, 4, 0, 4, 0]), scores, 3)
     assert counts.n_points.tolist() == [3, 1]
     np.testing.assert_array_equal(counts.totals, [[2.0, 1.25, np.nan], [0.5, np.nan, 1.0]])
 
 
-def test_an_object_counts_the_same_however_many_points_it_has() -> None:
+def test_objects_have_equal_weight_for_any_number_of_points() -> None:
     counts = count_categories(np.array([0] * 99 + [1]), np.array([0] * 99 + [5]), 2)
     assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
 
 
-def test_of_the_labels_of_a_point_the_one_that_is_nearest_for_its_own_object_counts() -> None:
-    table = np.array([[0, 5, 3], [5, 1, 5], [2, 5, 5]])  # of three objects, for three words
-    top = np.array([[0, 2], [1, 2], [2, 2]])  # of three units
+def test_best_label_of_a_point_for_its_own_object_counts() -> None:
+    table = np.array([[0, 5, 3], [5, 1, 5], [2, 5, 5]])  # three objects, three words
+    top = np.array([[0, 2], [1, 2], [2, 2]])  # three units
     rows, units = np.repeat([-1, 0, 1, 2], 4), np.tile([-1, 0, 1, 2], 4)
     expected = [-1, -1, -1, -1, 4, 0, 3, 3, 4, 5, 1, 5, 4, 2, 5, 5]
     assert point_categories(rows, units, top, table).tolist() == expected
@@ -148,20 +148,20 @@ def test_a_box_that_ends_at_the_last_rank_has_nothing_to_its_right() -> None:
     assert score.tolist() == [1.0, 1.0, 1.0]
 
 
-def test_an_object_whose_synonyms_are_no_prompts_has_no_synonym_score_but_a_secondary_one() -> None:
+def test_object_whose_synonyms_are_not_prompts_has_only_a_secondary_score() -> None:
     labels = ranked_labels(ObjectLabels(("unheard",), ("flower",)), ["x", "flower"])
     scores = labels.scores(np.array([[1, 0], [0, 1]]))
     assert np.isnan(scores[:, 1]).all()
     assert scores[:, 2].tolist() == scores[:, 0].tolist() == [1.0, 0.0]
 
 
-def test_the_overall_score_weighs_every_label_alike() -> None:
+def test_overall_score_weighs_labels_equally() -> None:
     labels = ranked_labels(ObjectLabels(("a", "b"), ("c",)), ["a", "b", "c", "d"])
     scores = labels.scores(np.array([[0, 1, 3, 2]]))[0]
     assert scores.tolist() == pytest.approx([2 / 3, 1.0, 0.0])
 
 
-def test_ranks_outside_their_box_count_by_how_far_they_lie_from_it() -> None:
+def test_ranks_outside_their_box_count_by_distance() -> None:
     labels = ranked_labels(ObjectLabels(("a", "b"), ("c",)), ["a", "b", "c", "d", "e"])
     scores = labels.scores(np.array([[0, 2, 1, 3, 4], [4, 0, 3, 1, 2]]))
     # the boxes are 0..1 and 2..2 of 0..4: 1 and 1 - 1 / 3, 1 - 1 / 2; then 1 - 3 / 3 and 1, 1 - 1 / 2
@@ -172,13 +172,13 @@ def test_ranks_outside_their_box_count_by_how_far_they_lie_from_it() -> None:
 # ---- a whole scene
 
 
-def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
+def test_empty_prediction_is_all_missing_and_ranks_zero() -> None:
     truth = lex_truth()
     assert values_of(TOPN, truth, nothing_at(truth)) == {name: float(name == "missing") for name in CATEGORIES}
     assert values_of(RANKING, truth, nothing_at(truth)) == {"overall": 0.0, "synonyms": 0.0, "secondary": 0.0}
     ranked, nothing = (score_scene(RANKING, truth, one, ENCODER).counts for one in (perfect(truth), nothing_at(truth)))
     assert isinstance(ranked, ObjectCounts) and isinstance(nothing, ObjectCounts)
-    assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, the first one too
+    assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, including the first
     assert np.isnan(nothing.totals).tolist() == np.isnan(ranked.totals).tolist()
     unseen = replace(truth, objects={**truth.objects, 99: ObjectLabels(("pot",))})  # an object without points
     without = score_scene(RANKING, unseen, nothing_at(truth), ENCODER).counts
@@ -187,14 +187,14 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
 
 
 @pytest.mark.parametrize("rules", [TOPN, RANKING], ids=lambda rules: rules.name)
-def test_units_that_are_compared_in_many_blocks_score_as_in_one(rules: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_units_compared_in_blocks_score_as_in_one(rules: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     truth, prediction = lex_truth(), noisy(0)
     in_one = values_of(rules, truth, prediction)
-    monkeypatch.setattr(score, "_BLOCK_UNITS", 2)  # of five
+    monkeypatch.setattr(score, "_BLOCK_UNITS", 2)  # of five units
     assert values_of(rules, truth, prediction) == pytest.approx(in_one, abs=1e-12)
 
 
-def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
+def test_point_is_missing_beyond_five_centimetres_but_ranked_at_any_distance() -> None:
     truth = lex_truth()
     whole = perfect(truth)
     far = instances_with(truth.points + np.array([0, 0, 30], np.float32), masks_of(whole), whole.features)
@@ -220,7 +220,7 @@ def test_one_of_five_labels_is_enough_for_a_category() -> None:
     assert values_of(rules, truth, mixed)["synonyms"] < values_of(TOPN, truth, mixed)["synonyms"] == 1.0
 
 
-def test_labels_that_the_method_gives_count_as_its_only_ones() -> None:
+def test_labels_of_the_method_are_its_only_ones() -> None:
     truth = lex_truth()
     whole = perfect(truth)
     named = instances_with(truth.points, masks_of(whole), None, labels=labels_of(truth))
@@ -243,7 +243,7 @@ def test_a_partition_and_dense_features_score_as_the_same_instances(rules: Any) 
 
 
 def noisy(seed: int) -> Any:
-    """Disjoint parts of the objects, each with a feature between its own words and others."""
+    """Disjoint parts of the objects, each with a feature between its own words and others'."""
     rng = np.random.default_rng(seed)
     truth = lex_truth(seed)
     whole = perfect(truth)
@@ -252,7 +252,7 @@ def noisy(seed: int) -> Any:
     return instances_with(truth.points, masks, whole.features + rng.random(whole.features.shape).astype(np.float32))
 
 
-def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
+def test_cloud_is_downsampled_as_in_open3d() -> None:
     import open3d
 
     points = (np.random.default_rng(0).random((2000, 3)) - 0.37).astype(np.float32)
@@ -261,8 +261,8 @@ def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
     assert sorted(voxel_means(points, 0.05).tolist()) == sorted(theirs.tolist())
 
 
-def test_without_voxels_every_point_speaks_for_itself() -> None:
-    """A chair and a table one centimetre apart, and a map of both; in voxels of 5 cm they are one thing."""
+def test_without_voxels_every_point_counts_separately() -> None:
+    """A chair and a table one centimetre apart, and a map of both; in voxels of 5 cm they are merged."""
     points = np.array([[0.01, 0, 0], [0.02, 0, 0]], np.float32)
     truth = OpenLexTruth(points, np.array([7, 12]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test")
     features = np.stack([WordEncoder().feature({word: 1.0}) for word in ("chair", "table")])
@@ -274,7 +274,7 @@ def test_without_voxels_every_point_speaks_for_itself() -> None:
 
 
 @pytest.mark.parametrize(("far_m", "is_missing"), [(0.0625, False), (0.063, True)])
-def test_a_point_just_as_far_as_the_cap_has_the_label_of_its_nearest(far_m: float, is_missing: bool) -> None:
+def test_point_at_the_cap_has_the_label_of_its_nearest(far_m: float, is_missing: bool) -> None:
     at_cap = TOPN.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"cap_m": 0.0625})})
     truth = OpenLexTruth(
         np.zeros((1, 3), np.float32), np.array([7]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test"
@@ -287,10 +287,10 @@ def test_a_point_just_as_far_as_the_cap_has_the_label_of_its_nearest(far_m: floa
 # ---- scenes together
 
 
-# ---- what a reader is told, and what is refused
+# ---- warnings and errors
 
 
-def test_points_of_several_instances_are_told() -> None:
+def test_points_in_several_instances_are_reported() -> None:
     truth = lex_truth()
     whole = perfect(truth)
     assert whole.features is not None
@@ -305,14 +305,14 @@ def test_a_prediction_without_features_cannot_be_ranked() -> None:
     named = instances_with(truth.points, masks_of(perfect(truth)), None, labels=labels_of(truth))
     assert kind_incompatibility(TOPN, named) is None
     reason = kind_incompatibility(RANKING, named)
-    assert reason == "openlex3d-ranking: needs features to compare with texts, and the prediction has none"
+    assert reason == "openlex3d-ranking: needs features to compare with texts, the prediction has none"
     with pytest.raises(PredictionError, match="needs features"):
         score_scene(RANKING, truth, named, ENCODER)
     with pytest.raises(PredictionError, match="needs features and an encoder"):
         score_scene(RANKING, truth, perfect(truth), None)
 
 
-def test_a_truth_that_does_not_hold_together_is_refused() -> None:
+def test_inconsistent_openlex3d_ground_truth_is_refused() -> None:
     points = np.zeros((3, 3), np.float32)
     with pytest.raises(DataError, match="do not agree"):
         OpenLexTruth(points, np.zeros(2, np.int64), {}, PROMPTS, "v", "s")
@@ -320,5 +320,5 @@ def test_a_truth_that_does_not_hold_together_is_refused() -> None:
         OpenLexTruth(points, np.zeros(3, np.int64), {}, (), "v", "s")
 
 
-def test_a_point_of_no_known_object_is_not_scored() -> None:
+def test_point_of_an_unknown_object_is_not_scored() -> None:
     assert openlex3d.distinct_pairs(np.array([-1, 0]), np.array([0, -1]))[2].tolist() == []

@@ -1,4 +1,4 @@
-"""ScanNet++'s protocols give what its own evaluators answer, to the last bit, from files on disk."""
+"""ScanNet++'s protocols equal its own evaluators to the last bit, from files on disk."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def truth_of(semantic: np.ndarray, instance: np.ndarray, masked: np.ndarray, eve
 
 
 def score_files(folder: Path, truths: dict[str, GroundTruth], rules: Any) -> ProtocolResult:
-    """What the files in ``folder`` score, read by the reader that knows them."""
+    """The scores of the files in ``folder``, read by the reader that recognizes them."""
     scores = {}
     for name, truth in truths.items():
         content = recognise(folder, FORMATS[rules.name]).read(folder, name).content
@@ -66,7 +66,7 @@ FORMATS = {"scannetpp-instance": "scannetpp", "scannetpp-semantic": "scannetpp-s
 
 
 def unpack_scores_of(scores: dict[str, Any]) -> dict[str, Any]:
-    """The scores as a run keeps them."""
+    """The scores as stored in a run."""
     return {
         name: next(iter(unpack_scores(pack_scores({score.protocol: score})).values())) for name, score in scores.items()
     }
@@ -77,7 +77,7 @@ def same(value: float, expected: float | None) -> bool:
 
 
 @pytest.mark.parametrize("index", range(30))
-def test_a_list_of_masks_has_the_answer_of_the_benchmarks_script(index: int, tmp_path: Path) -> None:
+def test_list_of_masks_equals_the_benchmark_script(index: int, tmp_path: Path) -> None:
     problem, truths = PROBLEMS["scannetpp01_instance"][index], {}
     (tmp_path / "predicted_masks").mkdir()
     for s, one in enumerate(arrays_of("scannetpp01_instance", index)):
@@ -102,7 +102,7 @@ def test_a_list_of_masks_has_the_answer_of_the_benchmarks_script(index: int, tmp
 
 
 @pytest.mark.parametrize("index", range(30))
-def test_ranked_classes_have_the_answer_of_the_benchmarks_script(index: int, tmp_path: Path) -> None:
+def test_ranked_classes_equal_the_benchmark_script(index: int, tmp_path: Path) -> None:
     problem, truths = PROBLEMS["scannetpp02_semantic"][index], {}
     for s, one in enumerate(arrays_of("scannetpp02_semantic", index)):
         every = np.where(one["labels"] >= 0, one["labels"] + 1, 0).astype(np.int32)
@@ -126,17 +126,17 @@ def test_the_84_classes_are_the_100_without_the_stuff_and_lines_count_from_one()
 
 
 def test_a_scene_without_a_submission_counts_as_missed() -> None:
-    assert not any(map(skips_missing_scenes, (INSTANCE, SEMANTIC)))  # there the script stops
+    assert not any(map(skips_missing_scenes, (INSTANCE, SEMANTIC)))  # there the script fails
 
 
-def test_files_of_class_ids_are_refused_where_the_benchmark_counts_places() -> None:
+def test_class_id_files_are_refused_if_the_benchmark_uses_indices() -> None:
     facts = ContentFacts("vertex-labels", 3, class_ids=np.array([1, 2, 3]), n_points=3)
-    assert "number the classes by their place in the list from 0" in (content_incompatibility(SEMANTIC, facts) or "")
+    assert "number the classes by their index in the list" in (content_incompatibility(SEMANTIC, facts) or "")
     assert content_incompatibility(TOP_K, facts) is None
     assert content_incompatibility(SEMANTIC, replace(facts, class_ids=None)) is None
 
 
-def test_masked_points_leave_truth_and_masks_of_every_protocol_of_masks() -> None:
+def test_masked_points_are_excluded_from_ground_truth_and_masks() -> None:
     semantic, instance = np.repeat([10, 0, 5], 150), np.repeat([1, 0, 2], 150)
     masked = np.r_[0:60, 140:160]
     truth = truth_of(semantic, instance, masked)
@@ -163,7 +163,7 @@ def test_masked_points_leave_truth_and_masks_of_every_protocol_of_masks() -> Non
 # ---- top k, on a room
 
 
-def test_the_features_of_a_map_are_ranked_and_the_first_is_what_one_class_would_be() -> None:
+def test_first_ranked_class_equals_single_classification() -> None:
     truth = room_truth()
     names = [LABELS.name_of(int(one)) for one in truth.semantic]
     features = np.stack([ENCODER.feature(f"a {name} in a scene") for name in names])
@@ -178,14 +178,14 @@ def test_the_features_of_a_map_are_ranked_and_the_first_is_what_one_class_would_
 
 
 def room_truth() -> GroundTruth:
-    """A few objects with a label each."""
+    """A few objects with one label each."""
     points = np.random.default_rng(1).random((60, 3)).astype(np.float32)
     semantic = np.repeat([ID["chair"], ID["table"], ID["lamp"]], 20).astype(np.int32)
     instance = np.repeat([1, 2, 3], 20).astype(np.int32)
     return GroundTruth(points, semantic, instance, LABELS, "mesh-vertices", "made for a test")
 
 
-def test_one_class_a_point_makes_top_k_top_1_and_is_said() -> None:
+def test_one_class_per_point_makes_top_k_top_1_with_a_warning() -> None:
     truth = room_truth()
     called = np.where(np.arange(60) < 30, ID["chair"], ID["table"]).astype(np.int32)
     score = score_scene(TOP_K, truth, map_of(VertexLabels(called), truth.points, TOP_K), None)

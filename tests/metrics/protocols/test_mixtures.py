@@ -1,4 +1,4 @@
-"""In which rules protocols differ, and that every choice of them between two makes a protocol."""
+"""The rules in which protocols differ; every choice of them between two gives a valid protocol."""
 
 from __future__ import annotations
 
@@ -28,9 +28,7 @@ def of_rule(rules: ProtocolRules, rule: str) -> object:
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS, ids=lambda rules: rules.name)
-def test_every_choice_of_rules_makes_a_protocol_from_the_first_to_the_second(
-    first: ProtocolRules, second: ProtocolRules
-) -> None:
+def test_every_choice_of_differing_rules_is_a_valid_protocol(first: ProtocolRules, second: ProtocolRules) -> None:
     mixtures = Mixtures(first, second)
     rules = [one.rule for one in differing(first, second)]
     moved = [rule for group in mixtures.groups for rule in group]
@@ -47,7 +45,7 @@ def test_every_choice_of_rules_makes_a_protocol_from_the_first_to_the_second(
     assert {field for field in same if getattr(last, field) != getattr(second, field)} == set()
 
 
-def test_pairs_of_each_kind_are_walked() -> None:
+def test_pairs_of_each_kind_are_covered() -> None:
     assert {first.kind for first, _ in PAIRS} >= {"semantic", "instance"}
     assert len(PAIRS) > 30
 
@@ -58,24 +56,24 @@ def protocol(folder: Path, name: str, *lines: str, base: str = "rooms-instance")
     return load_protocol(str(path))
 
 
-def test_rules_that_need_one_another_move_together() -> None:
+def test_dependent_rules_are_grouped() -> None:
     groups = Mixtures(load_protocol("scannet200-instance"), load_protocol("class-agnostic-maskclustering")).groups
     (together,) = [group for group in groups if "class_agnostic" in group]
     assert {"classes", "vocabulary", "prompt"} <= set(together)
 
 
-def test_classes_and_what_is_left_out_of_them_move_together() -> None:
+def test_classes_and_ignored_classes_are_grouped() -> None:
     groups = Mixtures(load_protocol("rooms-instance"), load_protocol("replica-openmask3d")).groups
     assert ("classes", "ignore") in groups and ("transfer.evaluation_voxel_m",) in groups
 
 
-def test_class_ids_of_a_list_of_their_own_move_with_the_truth_that_holds_them() -> None:
+def test_own_class_id_lists_are_grouped_with_their_ground_truth() -> None:
     groups = Mixtures(load_protocol("scannet-instance"), load_protocol("scannet200-instance")).groups
     (together,) = [group for group in groups if "classes" in group]
     assert "ground_truth" in together
 
 
-def test_a_rule_alone_is_a_group_and_what_only_names_is_none(tmp_path: Path) -> None:
+def test_single_rule_is_a_group_and_naming_fields_are_not(tmp_path: Path) -> None:
     other = protocol(tmp_path, "mine", "version = 7", "min_region_size = 7", "[transfer]", "cap_m = 0.5")
     mixtures = Mixtures(load_protocol("rooms-instance"), other)
     assert set(mixtures.groups) == {("min_region_size",), ("transfer.cap_m",)}
@@ -83,7 +81,7 @@ def test_a_rule_alone_is_a_group_and_what_only_names_is_none(tmp_path: Path) -> 
     assert (only.first, only.second) == (mixtures.first.min_region_size, 7)
 
 
-def test_the_same_rules_differ_in_nothing() -> None:
+def test_same_rules_have_no_differences() -> None:
     rules = load_protocol("rooms-semantic")
     assert differing(rules, rules) == [] and Mixtures(rules, rules).groups == ()
 
@@ -92,9 +90,9 @@ def test_the_same_rules_differ_in_nothing() -> None:
     ("first", "second", "message"),
     [
         ("rooms-semantic", "rooms-instance", "rooms-semantic is of kind 'semantic' and rooms-instance of kind"),
-        ("rooms-instance", "scannet-instance", "no truth has both"),
+        ("rooms-instance", "scannet-instance", "no ground truth has both"),
     ],
 )
-def test_what_cannot_be_mixed_is_told_in_one_line(first: str, second: str, message: str) -> None:
+def test_unmixable_protocols_give_one_line(first: str, second: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Mixtures(load_protocol(first), load_protocol(second))

@@ -1,6 +1,6 @@
-"""Made problems of OpenLex3D's three protocols with what the original answers, and the files of each of its datasets.
+"""Generated problems of OpenLex3D's three protocols with the original's results, and the files of its datasets.
 
-A problem has scenes of one dataset; places are in tenths of a millimetre, objects and labels as in the release.
+A problem has scenes of one dataset; positions are in tenths of a millimetre, objects and labels as in the release.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from su3d_bench.metrics.scoring import combine, score_scene
 
 PROBLEMS = json.loads((CASES / "openlex3d01_made.json").read_text())
 TOPN, RANKING, QUERIES = (load_protocol(f"openlex3d-{name}") for name in ("topn", "ranking", "queries"))
-SAMPLED = CASES / "openlex3d/0a76e06478.pth"  # one scene of the problems as ScanNet++'s toolbox saves it, by torch
+SAMPLED = CASES / "openlex3d/0a76e06478.pth"  # one scene of the problems as saved by ScanNet++'s toolbox with torch
 
 
 @dataclass
 class TableEncoder:
-    """Features of texts as a problem gives them."""
+    """Text features from a problem."""
 
     table: dict[str, list[int]]
     name: str = "table"
@@ -87,7 +87,7 @@ def write_visible(folder: Path, points: np.ndarray) -> None:
 
 
 def write_objects(folder: Path, scene: dict[str, Any]) -> None:
-    """The files of a scene of HM3D's walks that are read of it."""
+    """The files of an HM3DSem walk that are read."""
     owner, points = np.array(scene["owner"]), metres(scene["points"]).astype(np.float64)
     ids = [int(one) for one in dict.fromkeys(scene["owner"])]
     (folder / "objects").mkdir(parents=True)
@@ -103,11 +103,11 @@ def predicted(scene: dict[str, Any]) -> Partition:
     return Partition(metres(scene["cloud"]), np.array(scene["index"], np.int32), features)
 
 
-# ---- what the original answers
+# ---- equal to the original
 
 
 @pytest.mark.parametrize("number", range(len(PROBLEMS)))
-def test_a_made_problem_has_the_three_answers_of_openlex3d(number: int, tmp_path: Path) -> None:
+def test_generated_problem_equals_openlex3d_in_three_protocols(number: int, tmp_path: Path) -> None:
     problem = PROBLEMS[number]
     encoder, files = TableEncoder(problem["texts"]), write_labels(tmp_path, problem)
     for rules in (TOPN, RANKING, QUERIES):
@@ -137,7 +137,7 @@ def of_dataset(name: str) -> dict[str, Any]:
     return next(one for one in fitting if name == "hm3d" or -1 in one["scenes"][first]["owner"])
 
 
-def test_the_sampled_points_of_scannetpp_are_read_and_those_of_no_object_answer_nothing(tmp_path: Path) -> None:
+def test_sampled_points_of_scannetpp_are_read_and_points_without_object_match_nothing(tmp_path: Path) -> None:
     problem, scene = of_dataset("scannetpp"), "0a76e06478"
     (tmp_path / "scannetpp/prepared_semantics").mkdir(parents=True)
     shutil.copy(SAMPLED, tmp_path / "scannetpp/prepared_semantics")
@@ -148,7 +148,7 @@ def test_the_sampled_points_of_scannetpp_are_read_and_those_of_no_object_answer_
         points_of("scannetpp", tmp_path, "1f7cbbdde1")
 
 
-def test_the_objects_of_hm3d_are_read_one_after_another_also_under_the_long_name_of_the_scene(tmp_path: Path) -> None:
+def test_hm3d_objects_are_read_in_order_also_with_the_long_scene_name(tmp_path: Path) -> None:
     scene = of_dataset("hm3d")["scenes"]["00824"]
     for folder in ("hm3d/00824", "hm3dsem_walks/val/00824-Dd4bFSTQ8gi"):
         write_objects(tmp_path / folder, scene)
@@ -160,7 +160,7 @@ def test_the_objects_of_hm3d_are_read_one_after_another_also_under_the_long_name
         points_of("hm3d", tmp_path, "00824")
 
 
-def test_without_a_cloud_of_visible_points_all_points_count_but_for_replica(tmp_path: Path) -> None:
+def test_without_visible_cloud_all_points_count_except_for_replica(tmp_path: Path) -> None:
     problem = of_dataset("hm3d")
     write_labels(tmp_path / "lex", problem)
     for name, scene in problem["scenes"].items():
@@ -184,14 +184,14 @@ def test_without_a_cloud_of_visible_points_all_points_count_but_for_replica(tmp_
         ('{"objects": [{"id": 1}, {"id": 1}]}', "an object stands there twice"),
     ],
 )
-def test_a_damaged_list_of_objects_is_one_line(info: str, message: str, tmp_path: Path) -> None:
+def test_damaged_object_list_is_one_line(info: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "hm3d/00824").mkdir(parents=True)
     (tmp_path / "hm3d/00824/scene_info.json").write_text(info)
     with pytest.raises(DataError, match=f"^hm3d/00824: .*{message}"):
         points_of("hm3d", tmp_path, "00824")
 
 
-def test_another_archive_of_torch_is_no_file_of_sampled_points(tmp_path: Path) -> None:
+def test_other_torch_archive_is_not_a_sampled_point_file(tmp_path: Path) -> None:
     (tmp_path / "prepared_semantics").mkdir()
     shutil.copy(CASES / "online_maps/ovo_map.ckpt", tmp_path / "prepared_semantics/a.pth")
     with pytest.raises(DataError):

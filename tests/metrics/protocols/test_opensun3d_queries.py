@@ -1,4 +1,4 @@
-"""A map that is asked the queries of the OpenSUN3D challenge has the answer of its script over what is exported."""
+"""A map with the queries of the OpenSUN3D challenge scores as its script does on the exported files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ ENCODER: Any = Axes()
 
 
 def scenes_of(problem: Any, folder: Path) -> Iterator[tuple[str, str, GroundTruth, Instances]]:
-    """Name, query, truth, as read from a file below ``folder``, and map of each scene."""
+    """Name, query, ground truth, as read from a file in ``folder``, and map of each scene."""
     (folder / TRUTH_FOLDER).mkdir(parents=True)
     for number, scene in enumerate(problem["scenes"]):
         name = f"{number:08d}"
@@ -71,21 +71,21 @@ def values_of(rules: ProtocolRules, problem: Any, folder: Path) -> list[float | 
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS)))
-def test_a_map_that_is_asked_has_the_answer_of_the_challenges_script(index: int, tmp_path: Path) -> None:
+def test_queried_map_equals_the_challenge_script(index: int, tmp_path: Path) -> None:
     found, expected = values_of(RULES, PROBLEMS[index], tmp_path), PROBLEMS[index]["answer"]
     assert [value is None for value in found] == [value is None for value in expected]
     pairs = [(a, b) for a, b in zip(found, expected, strict=True) if a is not None]
     assert all(abs(a - b) <= 2.3e-16 for a, b in pairs)
 
 
-def test_a_scene_may_be_asked_several_texts_and_each_has_its_own_masks(tmp_path: Path) -> None:
+def test_scene_with_several_texts_has_masks_for_each(tmp_path: Path) -> None:
     (_, _, truth, found), *_ = scenes_of(PROBLEMS[0], tmp_path)
     both = combine(RULES, {"a": score_scene(RULES, asked(truth, "a", "b"), found, ENCODER)}).metrics
     apart = {text: score_scene(RULES, asked(truth, text), found, ENCODER) for text in "ab"}
     assert both == combine(RULES, apart).metrics
 
 
-def test_an_exported_map_is_scored_as_the_map_and_comes_back_byte_for_byte(tmp_path: Path) -> None:
+def test_exported_map_scores_like_the_map_and_is_read_back_byte_for_byte(tmp_path: Path) -> None:
     whole = [one for one in PROBLEMS if all(len(scene["masks"]) > 1 for scene in one["scenes"])]
     problem = next(one for one in whole if one["answer"][2])
     first, second = tmp_path / "first", tmp_path / "second"
@@ -105,30 +105,30 @@ def test_an_exported_map_is_scored_as_the_map_and_comes_back_byte_for_byte(tmp_p
     assert [scored[name] for name in ("ap", "ap50", "ap25")] == pytest.approx(expected, abs=2.3e-16)
 
 
-def test_a_list_that_the_challenges_own_script_cannot_read_is_told(tmp_path: Path) -> None:
+def test_list_that_the_challenge_script_cannot_read_gives_a_remark(tmp_path: Path) -> None:
     points = np.zeros((3, 3), np.float32)
     one = Instances.of(points, [np.array([0]), np.array([], int)], None, np.eye(3, dtype=np.float32)[:2])
     remarks = write_opensun3d(answer_to("a", one, RULES, points, ENCODER), "a", tmp_path)
     assert remarks == (
-        "1 of 2 masks have no point of the ground truth and were left out",
-        "has 1 mask: the challenge's own script stops at a list of fewer than 2",
+        "1 of 2 masks have no point of the ground truth and were omitted",
+        "has 1 mask: the challenge's own script fails on a list of fewer than 2",
     )
     assert (tmp_path / "a.txt").read_text() == "predicted_masks/a_000.txt 1.0\n"
     assert (tmp_path / "predicted_masks/a_000.txt").read_text() == "1\n0\n0\n"
 
 
-def test_what_cannot_answer_a_text_is_refused_in_one_line() -> None:
+def test_predictions_that_cannot_answer_texts_are_refused_in_one_line() -> None:
     points = np.zeros((3, 3), np.float32)
     dense = DenseFeatures(points, np.zeros((3, 3), np.float16))
     for content, message in (
         (dense, "has no masks"),
-        (Instances.of(points, [np.array([0])]), "needs features to compare with texts, and the prediction has none"),
+        (Instances.of(points, [np.array([0])]), "needs features to compare with texts, the prediction has none"),
     ):
         with pytest.raises(PredictionError, match=message):
             answer_to("a", content, RULES, points, ENCODER)
 
 
-def test_questions_of_a_dataset_are_what_the_rules_must_say(tmp_path: Path) -> None:
+def test_protocol_with_dataset_questions_checks_its_rules(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\nextends = "opensun3d-queries"\ntop_k = 3\n')
     with pytest.raises(ConfigError, match="top_k: metric 'opensun3d' counts every mask of a scene"):

@@ -1,4 +1,4 @@
-"""Whose evaluation each protocol repeats: a table that must be whole, facts shown everywhere, cases that hold."""
+"""The original evaluation of each protocol: a complete table, facts shown everywhere, and its cases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ compared = "AP"
 
 
 @pytest.mark.parametrize("name", protocol_names())
-def test_every_protocol_says_whose_evaluation_it_is_and_its_cases_are_there(name: str) -> None:
+def test_every_protocol_states_its_original_and_its_cases_exist(name: str) -> None:
     stated = original_of(name)
     assert stated is not None
     for pattern in stated.original.cases:
@@ -45,21 +45,21 @@ def own(folder: Path, table: str, base: str = "scannet-instance") -> str:
     return str(path)
 
 
-def test_a_file_that_extends_another_takes_its_original_over_as_that_of_the_other(tmp_path: Path) -> None:
+def test_file_that_extends_another_inherits_its_original(tmp_path: Path) -> None:
     taken = original_of(own(tmp_path, ""))
     assert taken is not None and taken.base == "scannet-instance"
     assert taken.original.code == "ScanNet/ScanNet" and taken.facts["original of"].startswith("scannet-instance")
     stated = original_of(own(tmp_path, WHOLE))
     assert stated is not None and (stated.base, stated.original.code) == (None, "a/b")
-    assert stated.original.cases == () and stated.original.problems == 0  # the table is taken over whole or not at all
+    assert stated.original.cases == () and stated.original.problems == 0  # inherited as a whole or not at all
 
 
-def test_what_is_said_of_an_original_moves_no_rule(tmp_path: Path) -> None:
+def test_original_table_changes_no_rule(tmp_path: Path) -> None:
     with_one, without = load_protocol(own(tmp_path, WHOLE)).digest, load_protocol(own(tmp_path, "")).digest
     assert with_one == without
 
 
-def test_rules_of_ones_own_need_say_nothing_and_those_of_the_program_must(
+def test_custom_rules_need_no_original_table_and_built_in_ones_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = rules_file("rooms-instance").read_text().partition("[original]")[0]
@@ -77,7 +77,7 @@ REFUSED = [
     (WHOLE.replace('licence = "none stated"\n', ""), "original: give code, commit, files, licence"),
     (WHOLE.replace('data = "nobody\'s"\n', ""), "the key 'original.data' is missing"),
     (WHOLE + 'none = "ours"\n', "original: give code, commit, files, licence"),
-    (WHOLE + "largest_difference = 0.0\n", "original: largest_difference: belongs to problems"),
+    (WHOLE + "largest_difference = 0.0\n", "original: largest_difference: give it if, and only if"),
     (WHOLE + 'license = "MIT"\n', "unknown key 'original.license'; did you mean 'licence'?"),
     (WHOLE.replace("0123abc", "main"), "original.commit: string should match"),
     (WHOLE.replace('"a/b"', '"https://a/b"'), "original.code: string should match"),
@@ -86,7 +86,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("table", "message"), REFUSED)
-def test_a_table_that_is_not_whole_is_one_line(
+def test_incomplete_original_table_is_one_line(
     table: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["protocols", "show", own(tmp_path, table)]) == 2
@@ -94,14 +94,14 @@ def test_a_table_that_is_not_whole_is_one_line(
     assert message in error and "mine.toml" in error and error.count("\n") == 1
 
 
-# ---- what the original evaluators of instances answered of the same made problems
+# ---- results of the original instance evaluators on the same generated problems
 
 FOUND = json.loads((CASES / "originals_instance.json").read_text())
-LAST_BITS = {"class-agnostic-maskclustering": 1.2e-16}  # its means are summed in another order
+LAST_BITS = {"class-agnostic-maskclustering": 1.2e-16}  # its means are summed in a different order
 
 
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in FOUND["answers"] for k in FOUND["answers"][name]])
-def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -> None:
+def test_generated_instance_problem_equals_the_original(name: str, number: str) -> None:
     rules = load_protocol(name)
     scenes = {str(s): synthetic_instances.scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
     found = combine(rules, scenes, with_intervals=False).metrics
@@ -110,19 +110,19 @@ def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -
     np.testing.assert_allclose(ours, answer, rtol=0, atol=LAST_BITS.get(name, 0))
 
 
-# ---- and those of one class a point
+# ---- and of one class per point
 
 ROUNDING = {"replica-conceptgraphs-ex6": 6e-8}  # the original's ratios are float32
 OF_POINTS = json.loads((CASES / "originals_semantic.json").read_text())
 
 
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in OF_POINTS for k in range(len(OF_POINTS[name]))])
-def test_a_made_problem_of_points_has_the_answer_of_the_original(name: str, number: int) -> None:
+def test_generated_point_problem_equals_the_original(name: str, number: int) -> None:
     rules, problem = load_protocol(name), OF_POINTS[name][number]
     read = synthetic_objects.scored if rules.metric == "ovo" else synthetic_points.scored
     scores = {str(s): read(rules, scene) for s, scene in enumerate(problem["scenes"])}
     found = combine(rules, scores, with_intervals=False)
-    if rules.metric == "ovo":  # with the means of thirds, NaN where no class of one is true or called
+    if rules.metric == "ovo":  # with the means of thirds, NaN if no class of one is true or predicted
         values = dict(found.metrics) | {
             f"{group} {key}": value for group, row in found.groups.items() for key, value in row.items()
         }
@@ -130,7 +130,7 @@ def test_a_made_problem_of_points_has_the_answer_of_the_original(name: str, numb
         assert {key: values[key] for key in wanted} == pytest.approx(wanted, rel=0, abs=2.3e-16, nan_ok=True)
         return
     answer = problem["answer"]
-    if name in ("scannet-semantic", "scannet200-semantic"):  # the IoU of each class that is true or predicted
+    if name in ("scannet-semantic", "scannet200-semantic"):  # the IoU of each true or predicted class
         assert {of_class: row["IoU"] for of_class, row in found.per_class.items() if row["IoU"] == row["IoU"]} == answer
         return
     each = answer if isinstance(answer, list) else [answer]
@@ -149,7 +149,7 @@ OF_A_CLASS = ("AP25", "recall25", "AP50", "recall50")
 
 
 @pytest.mark.parametrize("number", range(len(OF_BOXES)))
-def test_a_made_problem_of_boxes_has_the_answer_of_votenet(number: int) -> None:
+def test_generated_box_problem_equals_votenet(number: int) -> None:
     rules, problem = load_protocol("replica-boxes"), OF_BOXES[number]
     scores = {str(s): synthetic_boxes.scored(rules, scene) for s, scene in enumerate(problem["scenes"])}
     found = combine(rules, scores, with_intervals=False)
@@ -161,7 +161,7 @@ def test_a_made_problem_of_boxes_has_the_answer_of_votenet(number: int) -> None:
 
 
 @pytest.mark.parametrize("number", range(len(OF_QUERIES)))
-def test_a_made_problem_of_text_queries_has_the_answer_of_scannets_script(number: int) -> None:
+def test_generated_text_query_problem_equals_the_scannet_script(number: int) -> None:
     problem = OF_QUERIES[number]
     found = synthetic_queries.scored(load_protocol("query-ap"), problem["scenes"])
     ours = [found.ap, found.ap50, found.ap25, *found.table[0]]

@@ -1,4 +1,4 @@
-"""Panoptic quality from labelled points on: panopticapi's answers, points left out, stuff that has no instances."""
+"""Panoptic quality from labelled points: equal to panopticapi, excluded points, stuff without instances."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from su3d_bench.runs.finished import read_run
 
 RULES = load_protocol("rooms-panoptic")
 FOUND = json.loads((CASES / "panoptic03_labelled_points.json").read_text())
-# Whose walls have a class and no instance, as in ScanNet++.
+# A dataset whose walls have a class but no instance, as in ScanNet++.
 OPEN_WALLS = """
 from dataclasses import replace
 import numpy as np
@@ -41,7 +41,7 @@ class OpenWalls(Painted):
 
 
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in FOUND for k in range(len(FOUND[name]))])
-def test_a_made_problem_of_labelled_points_has_the_answer_of_panopticapi(name: str, number: int) -> None:
+def test_generated_labelled_points_equal_panopticapi(name: str, number: int) -> None:
     problem = FOUND[name][number]
     assert our_qualities(load_protocol(name), problem["scenes"]).tolist() == problem["answer"]
 
@@ -51,7 +51,7 @@ def open_walls() -> GroundTruth:
     return replace(truth, instance=np.where(truth.semantic == ID["wall"], 0, truth.instance).astype(np.int32))
 
 
-def test_points_that_evaluations_leave_out_are_in_no_predicted_segment_either() -> None:
+def test_points_excluded_from_evaluation_are_in_no_predicted_segment() -> None:
     truth = open_walls()
     masks = truth_as_prediction(room(), with_labels=True)
     ids = np.array([ID[str(name)] for name in masks.labels or ()])
@@ -64,7 +64,7 @@ def test_points_that_evaluations_leave_out_are_in_no_predicted_segment_either() 
     assert gone.n_false.sum() == 0 and gone.n_matched.sum() == whole.n_matched.sum() - 2
 
 
-def test_the_truth_that_is_told_has_an_instance_for_each_class_without_one_where_stuff_counts_alone() -> None:
+def test_oracle_ground_truth_has_one_instance_per_stuff_class_only_if_stuff_counts() -> None:
     truth = open_walls()
     told = visible_truth(RULES, truth)
     assert set(told.instance[truth.semantic == ID["wall"]].tolist()) == {truth.instance.max() + 1}
@@ -77,16 +77,16 @@ def test_the_truth_that_is_told_has_an_instance_for_each_class_without_one_where
     )
 
 
-def test_stuff_without_instances_is_whole_in_the_score_of_the_truth_beside_an_evaluation() -> None:
+def test_stuff_without_instances_is_complete_in_the_ceiling_of_an_evaluation() -> None:
     truth = open_walls()
     outcome = score_on_truth(RULES, truth, "a", truth_as_prediction(truth, with_labels=True), None)
     assert outcome.ceiling is not None
     of_truth = combine(RULES, {"a": outcome.ceiling}).metrics
     assert (of_truth["PQ"], of_truth["PQ stuff"]) == (1.0, 1.0)
-    assert combine(RULES, {"a": outcome.score}).metrics["PQ stuff"] == 0.0  # masks of things alone
+    assert combine(RULES, {"a": outcome.score}).metrics["PQ stuff"] == 0.0  # masks of things only
 
 
-def test_a_run_of_the_truth_has_its_stuff_where_stuff_counts_and_nowhere_else(
+def test_oracle_run_has_stuff_only_if_stuff_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     see_painted(monkeypatch)

@@ -1,4 +1,4 @@
-"""Panoptic quality: the originals' answers to the last bit, hand-worked segments, and what a map is scored by."""
+"""Panoptic quality: equal to the originals to the last bit, hand-computed segments, and the scoring of a map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def segments(classes: Sequence[int], numbers: Sequence[int]) -> Segments:
 
 
 @pytest.mark.parametrize(("name", "index"), [(name, k) for name in ORIGINALS for k in range(len(PROBLEMS[name]))])
-def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int) -> None:
+def test_panoptic_values_equal_the_original_in_every_bit(name: str, index: int) -> None:
     rule, problem = ORIGINALS[name], PROBLEMS[name][index]
     with np.load(CASES / f"{name}.npz") as archive:
         is_thing, ends, points = (archive[f"{index}/{key}"] for key in ("is_thing", "ends", "points"))
@@ -41,11 +41,11 @@ def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int)
     qualities = panoptic.class_qualities(vars(PanopticCounts.joined(counts)), rule)
     means = panoptic.means({key: values[None] for key, values in qualities.items()}, is_thing, rule)
     for key, values in qualities.items():
-        assert np.nan_to_num(values).tolist() == answer["classes"][key]  # of what is nowhere the original prints 0
+        assert np.nan_to_num(values).tolist() == answer["classes"][key]  # the original prints 0 for absent classes
     assert {key: float(value[0]) for key, value in means.items()} == {key: answer[key] for key in means}
 
 
-def test_an_iou_of_one_half_is_no_match() -> None:
+def test_iou_of_one_half_is_not_a_match() -> None:
     truth = segments([0] * 4, [1] * 4)
     half = panoptic.per_scene(truth, segments([0, 0, -1, -1], [5, 5, 0, 0]), ONE_THING)
     more = panoptic.per_scene(truth, segments([0, 0, 0, -1], [5, 5, 5, 0]), ONE_THING)
@@ -59,33 +59,33 @@ def test_stuff_is_one_segment_whatever_its_numbers() -> None:
     assert panoptic.per_scene(truth, found, THING_AND_STUFF).iou.tolist() == [0.0, 1.0]
 
 
-def test_void_is_taken_off_the_union_and_excuses_what_is_mostly_in_it() -> None:
+def test_void_is_subtracted_from_the_union_and_excuses_segments_mostly_in_it() -> None:
     truth = segments([0, 0, -1, -1, -1, -1], [1, 1, 0, 0, 0, 0])
     found = segments([0] * 6, [1, 1, 1, 2, 2, 2])
     counts = panoptic.per_scene(truth, found, ONE_THING)
     assert (counts.n_matched[0], counts.iou[0], counts.n_false[0]) == (1, 1.0, 0)
     half_void = panoptic.per_scene(segments([1, -1], [0, 0]), segments([0, 0], [1, 1]), THING_AND_STUFF)
-    assert half_void.n_false.tolist() == [1, 0]  # more than a half is ignored, a half is not
+    assert half_void.n_false.tolist() == [1, 0]  # more than half is ignored, half is not
 
 
-def test_points_of_a_thing_that_no_instance_has_are_a_crowd() -> None:
+def test_thing_points_without_instance_are_a_crowd() -> None:
     crowd = segments([0] * 5, [0] * 5)
     counts = panoptic.per_scene(crowd, segments([0, 0, 0, -1, -1], [1, 1, 1, 0, 0]), ONE_THING)
     assert (counts.n_matched[0], counts.n_false[0], counts.n_missed[0]) == (0, 0, 0)
     other = panoptic.per_scene(crowd, segments([1] * 5, [0] * 5), THING_AND_STUFF)
-    assert other.n_false.tolist() == [0, 1]  # a crowd excuses its own class alone
+    assert other.n_false.tolist() == [0, 1]  # a crowd excuses only its own class
     as_kitti = panoptic.per_scene(crowd, segments([0] * 5, [1] * 5), ONE_THING, "semantic-kitti")
     assert as_kitti.iou.tolist() == [1.0]
 
 
-def test_small_segments_are_neither_missed_nor_wrong_where_there_is_a_least_size() -> None:
+def test_small_segments_are_neither_missed_nor_wrong_with_a_minimum_size() -> None:
     truth, found = segments([0, 0, 1, 1], [1, 1, 0, 0]), segments([1, 1, 0, 0], [0, 0, 8, 8])
     for size, expected in ((2, [1, 1]), (3, [0, 0])):
         counts = panoptic.per_scene(truth, found, THING_AND_STUFF, "semantic-kitti", size)
         assert (counts.n_false.tolist(), counts.n_missed.tolist()) == (expected, expected)
 
 
-def test_a_point_in_several_masks_is_that_of_the_greatest_confidence_and_the_first_of_equals() -> None:
+def test_point_in_several_masks_belongs_to_the_most_confident_or_first() -> None:
     masks = Masks.of_sets([np.arange(4), np.arange(4), np.arange(4)])
     semantic, instance = np.full(4, ID["chair"]), np.ones(4, np.int64)
     ids = np.array([ID["lamp"], ID["chair"], ID["table"]])
@@ -98,14 +98,14 @@ def test_a_point_in_several_masks_is_that_of_the_greatest_confidence_and_the_fir
     assert without.n_matched[place["chair"]] == 1  # a mask without a class hides nothing
 
 
-def test_groups_of_classes_have_means_of_their_own() -> None:
+def test_groups_of_classes_have_their_own_means() -> None:
     rules = load_protocol("scannet200-panoptic")
     none, one_each = np.zeros(200, np.int64), np.ones(200, np.int64)
     whole = metric_of(rules).pooled([PanopticCounts(none, none, one_each, np.zeros(200))])
     assert whole.groups == {name: {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0} for name in ("head", "common", "tail")}
 
 
-def test_text_files_of_masks_are_scored_against_text_files_of_truth(
+def test_mask_text_files_are_scored_against_ground_truth_text_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Things that are there and things that are not: POPE's answers to the last bit, hand-worked ones, what is asked."""
+"""Present and absent objects: equal to POPE to the last bit, hand-computed values, and the questions."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def once(counts: Sequence[PresenceCounts]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("index", range(len(POPE["numbers"])))
-def test_the_numbers_of_popes_script_hold_to_the_last_bit(index: int) -> None:
+def test_pope_values_are_equal_in_every_bit(index: int) -> None:
     problem = POPE["numbers"][index]
     ends = np.cumsum(problem["sizes"])[:-1]
     parts = zip(np.split(np.array(problem["there"]), ends), np.split(np.array(problem["yes"]), ends), strict=True)
@@ -61,7 +61,7 @@ def test_the_numbers_of_popes_script_hold_to_the_last_bit(index: int) -> None:
 
 
 @pytest.mark.parametrize("index", range(len(POPE["negatives"])))
-def test_what_is_absent_is_drawn_as_pope_draws_it(index: int) -> None:
+def test_absent_objects_are_drawn_as_in_pope(index: int) -> None:
     problem = POPE["negatives"][index]
     rooms, mine = problem["rooms"], problem["rooms"][problem["scene"]]
     absent = [name for name in dict.fromkeys(name for one in rooms for name in one) if name not in mine]
@@ -70,13 +70,13 @@ def test_what_is_absent_is_drawn_as_pope_draws_it(index: int) -> None:
         assert [other for _, other in found] == expected
 
 
-def test_auroc_is_the_share_of_pairs_in_the_right_order_equal_ones_by_half() -> None:
+def test_auroc_is_the_share_of_correctly_ordered_pairs_with_ties_as_half() -> None:
     values = once([counts_of([1, 1, 0, 0], [0] * 4, [0.9, 0.4, 0.4, 0.1])])
     assert values["AUROC random"] == (1 + 1 + 0.5 + 1) / 4
     assert np.isnan(values["AUROC popular"])
 
 
-def test_a_map_that_never_says_yes_has_no_precision_and_an_f1_of_zero() -> None:
+def test_map_that_never_says_yes_has_undefined_precision_and_zero_f1() -> None:
     values = once([counts_of([1, 0], [0, 0])])
     assert np.isnan(values["precision random"])
     assert (values["recall random"], values["F1 random"], values["accuracy random"]) == (0.0, 0.0, 0.5)
@@ -84,7 +84,7 @@ def test_a_map_that_never_says_yes_has_no_precision_and_an_f1_of_zero() -> None:
     assert np.isnan(nothing_there["F1 random"])
 
 
-def test_a_perfect_map_says_yes_to_what_is_there_and_no_to_what_is_not() -> None:
+def test_perfect_map_says_yes_to_present_and_no_to_absent_objects() -> None:
     values = metric_of(RULES).combine([score_scene(RULES, QUESTIONS, PERFECT, ENCODER).counts])
     assert [values[f"{name} random"] for name in MEASURES] == [1.0, 1.0, 1.0, 1.0, 0.5, 1.0]
     assert (values["n_random"], values["n_popular"]) == (4, 0)
@@ -111,7 +111,7 @@ class Plane:
 
 
 @pytest.mark.parametrize(("degrees", "is_yes"), [((19.0, 60.0), True), ((21.0, 60.0), False)])
-def test_yes_needs_an_instance_that_is_nearer_to_the_text_than_to_every_canonical_phrase(
+def test_yes_needs_an_instance_nearer_to_the_text_than_to_every_canonical_phrase(
     degrees: tuple[float, ...], is_yes: bool
 ) -> None:
     at = np.radians(degrees)
@@ -125,19 +125,19 @@ def test_yes_needs_an_instance_that_is_nearer_to_the_text_than_to_every_canonica
     assert counts.sampling.tolist() == [1]
 
 
-def test_relevancy_is_that_of_lerf() -> None:
+def test_relevancy_equals_lerf() -> None:
     assert RULES.presence is not None
     cosine, canonical = np.array([[0.31, 0.2]]), np.array([[0.1, 0.25, 0.2, 0.0]])
     shares = np.exp(10 * cosine[..., None]) / (np.exp(10 * cosine[..., None]) + np.exp(10 * canonical[:, None, :]))
     np.testing.assert_allclose(relevancies(cosine, canonical, RULES.presence), shares.min(axis=2), rtol=1e-14)
 
 
-def test_a_map_without_features_is_told_what_it_lacks() -> None:
+def test_map_without_features_gives_a_reason_for_presence() -> None:
     with pytest.raises(PredictionError, match="needs features"):
         score_scene(RULES, QUESTIONS, truth_as_prediction(TRUTH, with_labels=True), ENCODER)
 
 
-def test_a_room_is_asked_for_what_it_has_and_for_as_much_that_it_has_not() -> None:
+def test_room_has_equally_many_present_and_absent_questions() -> None:
     objects = known_objects(TRUTH, 100)
     asked = presence_questions("rooms/a", TRUTH, objects, 4, counted_rooms())
     names = {plain_name(name) for name in LABELS.names}
@@ -152,9 +152,9 @@ def test_a_room_is_asked_for_what_it_has_and_for_as_much_that_it_has_not() -> No
     assert asked != presence_questions("rooms/b", TRUTH, objects, 4, counted_rooms())
 
 
-def test_what_may_be_called_like_something_that_is_there_is_not_absent() -> None:
+def test_synonyms_of_present_objects_are_not_absent() -> None:
     small = TRUTH.semantic.copy()
-    small[-1] = LABELS.ids[LABELS.names.index("sofa")]  # one vertex that belongs to no object
+    small[-1] = LABELS.ids[LABELS.names.index("sofa")]  # one vertex without an object
     absent = absent_names(replace(TRUTH, semantic=small), known_objects(TRUTH, 100))
     there = ("chair", "table", "lamp", "cushion", "book", "backpack", "sofa")
     assert not [name for name in absent for known in there if is_called(name, known) or is_called(known, name)]
@@ -163,7 +163,7 @@ def test_what_may_be_called_like_something_that_is_there_is_not_absent() -> None
 
 
 @pytest.mark.parametrize("name", ["rooms", "replica", "scannet", "scannetpp", "hm3dsem"])
-def test_every_dataset_with_names_of_classes_is_asked_for_absent_things_by_the_same_rules(name: str) -> None:
+def test_every_dataset_with_class_names_has_the_same_rules_for_absent_objects(name: str) -> None:
     rules = load_protocol(f"{name}-presence")
     classes = load_protocol("scannet200-panoptic" if name == "scannet" else f"{name}-panoptic").classes
     ids, called = zip(*((entry.id, entry.name) for entry in classes), strict=True)
@@ -179,13 +179,13 @@ def test_every_dataset_with_names_of_classes_is_asked_for_absent_things_by_the_s
     assert name in registry.DATASETS and rules.ground_truth in registry.load("dataset", name).variants
 
 
-def test_where_nothing_absent_is_left_less_is_asked() -> None:
+def test_fewer_questions_are_asked_if_no_absent_objects_remain() -> None:
     assert list(drawn("a/b", "popular", ["bed", "lamp"], ["sink"], [["sink"]])) == [("bed", "sink"), ("lamp", None)]
     assert list(drawn("a/b", "adversarial", ["bed"], ["sink"], [["bed"]])) == [("bed", "sink")]  # by chance
 
 
 @pytest.mark.parametrize("scene", ["bedroom3", "bathroom0"])
-def test_the_rooms_over_which_it_is_counted_are_those_of_the_generator(scene: str, tmp_path: Path) -> None:
+def test_co_occurrence_is_counted_over_the_generators_rooms(scene: str, tmp_path: Path) -> None:
     names = [plain_name(LABELS.name_of(thing.class_id)) for thing in Rooms(tmp_path).objects(scene)]
     rooms = counted_rooms()
     assert tuple(dict.fromkeys(name for name in names if not is_room_surface(name))) in rooms

@@ -1,4 +1,4 @@
-"""Protocols: what the built-in ones fix, what a kind takes, what a prediction or a truth lacks for one."""
+"""Protocols: the built-in rules, the needs of each kind, and what a prediction or ground truth lacks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_protocol_is_named_as_its_file_and_names_others_that_exist(name: str) 
 
 
 @pytest.mark.parametrize("name", protocol_names())
-def test_every_rule_that_is_taken_from_an_original_says_from_where(name: str) -> None:
+def test_every_rule_from_an_original_states_its_source(name: str) -> None:
     text = rules_file(name).read_text()
     assert "Source" in text or "ConceptGraphs' rules" in text
 
@@ -97,12 +97,12 @@ def test_scannet200_groups_have_64_68_and_66_classes() -> None:
     assert [groups.count(name) for name in ("head", "common", "tail")] == [64, 68, 66]
 
 
-def test_the_rooms_classes_are_those_that_the_rooms_generate() -> None:
+def test_rooms_classes_are_the_generated_ones() -> None:
     ours = {(entry.id, entry.name) for entry in load_protocol("rooms-instance").classes}
     assert ours == {(known.id, known.name) for known in CLASSES}
 
 
-def test_prompts_take_the_class_name_as_it_is_unless_the_rules_replace_it() -> None:
+def test_prompts_use_the_class_name_unless_the_rules_replace_it() -> None:
     assert load_protocol("replica-conceptgraphs-ex6").texts_of("tv-screen") == ("an image of tv-screen",)
     assert load_protocol("scannet-instance").texts_of("otherfurniture") == ("a other in a scene",)
 
@@ -114,14 +114,14 @@ def test_the_substring_rule_ignores_names_that_contain_the_word() -> None:
 
 
 @pytest.mark.parametrize("name", protocol_names())
-def test_protocols_that_must_not_be_compared_are_told_from_both_sides(name: str) -> None:
+def test_incomparable_protocols_are_listed_from_both_sides(name: str) -> None:
     rules = load_protocol(name)
     others = not_comparable_with(rules)
     assert set(rules.not_comparable_with) <= set(others)
     assert all(name in not_comparable_with(load_protocol(other)) for other in others)
 
 
-def test_the_digest_says_nothing_of_rules_with_their_defaults() -> None:
+def test_digest_ignores_rules_with_default_values() -> None:
     class Later(ProtocolRules):
         is_new: bool = False
 
@@ -131,13 +131,13 @@ def test_the_digest_says_nothing_of_rules_with_their_defaults() -> None:
     assert later.model_copy(update={"is_new": True}).digest != rules.digest
 
 
-def test_rules_that_are_read_stay_as_they_are() -> None:
+def test_loaded_rules_are_immutable() -> None:
     rules: Any = load_protocol("rooms-semantic")
     with pytest.raises(ValidationError, match="frozen"):
         rules.version = 9
 
 
-def test_the_digest_moves_with_every_rule() -> None:
+def test_digest_changes_with_every_rule() -> None:
     rules = load_protocol("rooms-semantic")
     changed = rules.model_copy(update={"prompt": "a picture of {}"})
     assert rules.digest == load_protocol("rooms-semantic").digest
@@ -150,7 +150,7 @@ def test_every_kind_has_rules_and_a_metric_and_every_metric_belongs_to_a_kind() 
     assert set(names) == set(get_args(MetricName))
 
 
-def test_a_single_name_or_class_is_enough_to_be_judged_by() -> None:
+def test_one_name_or_class_is_enough_for_scoring() -> None:
     mask, points = np.arange(2, dtype=np.int32), np.zeros((2, 3), np.float32)
     for labels, has_names in ((["chair", ""], True), (["", ""], False)):
         assert ContentFacts.of(instances(points, [mask, mask], labels)).has_names == has_names
@@ -164,7 +164,7 @@ MESH = TruthFacts("truth", "replica", ("mesh-vertices",))
 TRUTHS = [
     ("rooms-semantic", MESH, None),
     ("rooms-instance", MESH, None),
-    ("rooms-instance", replace(MESH, has_instances=False), "needs instances, the ground truth holds class ids alone"),
+    ("rooms-instance", replace(MESH, has_instances=False), "needs instances, the ground truth has class ids only"),
     ("rooms-semantic", replace(MESH, has_instances=False, has_points=False), None),
     ("rooms-annotation", replace(MESH, has_points=False), "needs the objects of a dataset"),
     ("rooms-semantic", replace(MESH, label_space="nyu40"), "it scores the labels of 'replica', truth has those of"),
@@ -175,18 +175,20 @@ TRUTHS = [
 
 
 @pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
-def test_a_truth_that_lacks_what_a_protocol_scores_is_told(name: str, truth: TruthFacts, reason: str | None) -> None:
+def test_ground_truth_without_what_a_protocol_needs_gives_a_reason(
+    name: str, truth: TruthFacts, reason: str | None
+) -> None:
     said = truth_incompatibility(load_protocol(name), truth)
     assert said == reason if reason is None else str(said).startswith(reason)
 
 
-def test_questions_of_a_dataset_itself_need_one_that_knows_them() -> None:
+def test_dataset_questions_need_a_dataset_with_questions() -> None:
     rules = load_protocol("rooms-retrieval").model_copy(update={"questions": "dataset"})
-    assert "knows questions and answers itself, which truth does not" in str(truth_incompatibility(rules, MESH))
+    assert "a dataset with questions and answers, which truth does not have" in str(truth_incompatibility(rules, MESH))
     assert truth_incompatibility(rules, replace(MESH, knows_questions=True)) is None
 
 
-def test_class_ids_up_to_forty_are_of_nyu_and_larger_ones_of_scannet200() -> None:
+def test_class_ids_up_to_forty_are_nyu40_and_larger_ones_scannet200() -> None:
     assert [list_of_ids(one) for one in (1, 40, 41)] == ["nyu40-vertices"] * 2 + ["scannet200-vertices"]
     facts = {one: ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array([3, one])) for one in (40, 41)}
     twenty, two_hundred = load_protocol("scannet-instance"), load_protocol("scannet200-instance")
@@ -206,9 +208,7 @@ def test_class_ids_up_to_forty_are_of_nyu_and_larger_ones_of_scannet200() -> Non
         ("vertex-masks", "all", False), ("vertex-masks", "some", False), ("vertex-masks", "none", True),
     ],
 )  # fmt: skip
-def test_an_encoder_is_asked_for_where_features_must_stand_for_names(
-    form: Form, labels: str, needs_encoder: bool
-) -> None:
+def test_encoder_is_required_if_features_replace_names(form: Form, labels: str, needs_encoder: bool) -> None:
     facts = ContentFacts(form, 3, 512, has_labels=labels != "none", has_every_label=labels == "all")
     rules = load_protocol("rooms-semantic")
     assert n_feature_dimensions(rules, facts) == (512 if needs_encoder else None)
@@ -219,6 +219,6 @@ def test_an_encoder_is_asked_for_where_features_must_stand_for_names(
     assert compares_texts == (512 if needs_encoder or form == "instances" else None)
 
 
-def test_a_misspelt_name_is_told_with_the_likely_one() -> None:
+def test_misspelt_name_gives_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'\\?"):
         load_protocol("rooms-semantics")

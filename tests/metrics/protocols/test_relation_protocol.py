@@ -1,4 +1,4 @@
-"""Scene graphs: FROSS' recalls to the last bit, relations by boxes, the annotation of ReplicaSSG, and faults."""
+"""Scene graphs: FROSS' recalls to the last bit, relations by boxes, the annotation of ReplicaSSG, and errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from su3d_bench.store.predictions import read_prediction, write_prediction
 MADE = json.loads((CASES / "relations01_replicassg.json").read_text())
 RULES = load_protocol("rooms-relations")
 REPLICA = load_protocol("replica-relations")
-GRID = 4096  # coordinates of the problems are such parts of a metre, which float32 holds
+GRID = 4096  # coordinates of the problems are multiples of 1/4096 m, exact in float32
 OF_CASES = REPLICA.model_copy(
     update={
         "classes": tuple(ClassEntry(id=number, name=name) for number, name in enumerate(MADE["classes"], 1)),
@@ -68,7 +68,7 @@ def predicted_scan(scan: dict[str, Any]) -> Instances:
 
 
 @pytest.mark.parametrize("index", range(len(MADE["problems"])))
-def test_the_recalls_of_fross_hold_to_the_last_bit(index: int) -> None:
+def test_fross_recalls_are_equal_in_every_bit(index: int) -> None:
     problem = MADE["problems"][index]
     scores = {
         name: score_scene(OF_CASES, true_scan(scan), predicted_scan(scan), None)
@@ -91,23 +91,23 @@ def values(truth: GroundTruth, prediction: Prediction, rules: Any = RULES) -> di
 
 
 def stacked() -> GroundTruth:
-    """The made room with its lamp set on the table beside it."""
+    """The synthetic room with its lamp moved onto the table next to it."""
     truth = room()
     points = truth.points.copy()
     points[truth.instance == 5] = points[truth.instance == 5] * [0.5, 0.5, 1] + [1.1, 0.2, 0.8]
     return replace(truth, points=points.astype(np.float32))
 
 
-def test_the_oracle_has_every_relation_that_boxes_give_and_an_empty_map_none() -> None:
+def test_oracle_has_every_geometric_relation_and_empty_map_none() -> None:
     truth = stacked()
     perfect = values(truth, truth_as_prediction(truth, with_labels=True))
     assert [perfect[name] for name in RULES.value_names] == [1.0] * 5
-    assert perfect["n_predicate R@1"] > 1 and perfect["n_object R@1"] == 7  # the wall is no object
+    assert perfect["n_predicate R@1"] > 1 and perfect["n_object R@1"] == 7  # the wall is not an object
     assert values(truth, truth_as_prediction(truth, with_labels=False))["relationship R@1"] == 1.0  # by features
     assert [values(truth, nothing(truth))[name] for name in RULES.value_names] == [0.0] * 5
 
 
-def test_a_wrong_class_costs_the_triplet_and_an_edge_of_its_own_the_predicate() -> None:
+def test_wrong_class_costs_the_triplet_and_own_edges_the_predicate() -> None:
     truth = stacked()
     whole = truth_as_prediction(truth, with_labels=True)
     assert whole.labels is not None
@@ -117,7 +117,7 @@ def test_a_wrong_class_costs_the_triplet_and_an_edge_of_its_own_the_predicate() 
     assert found["predicate R@1"] == 1.0 and found["relationship R@1"] < 1.0 and found["object R@1"] == 6 / 7
     edges = np.array([[lamp, whole.labels.index("table")]], np.int32)
     own = replace(whole, edges=edges, edge_scores=np.array([[0.5, 0.5]]), predicates=("on", "in"))
-    assert values(truth, own)["predicate R@1"] == 0.0  # of equals the last: in
+    assert values(truth, own)["predicate R@1"] == 0.0  # the last on ties: in
     own = replace(own, edge_scores=np.array([[0.6, 0.5]]))
     right = values(truth, own)
     assert right["predicate R@1"] == right["relationship R@1"] == 1 / right["n_predicate R@1"]
@@ -127,7 +127,7 @@ def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() ->
     boxes = np.array([[[0, 0, 0], [1, 1, 0.7]], [[0.4, 0.4, 0.7], [0.6, 0.6, 1.0]], [[3, 0, 0], [4, 1, 0.7]]])
     names = ("table", "lamp", "table")
     assert geometric_edges(boxes, names, ("under", "on")) == {(1, 0): 1, (0, 1): 0}
-    boxes[1, :, 2] += 0.035  # just within reach of the top: somebody else's threshold says no
+    boxes[1, :, 2] += 0.035  # just within reach of the top: with a slightly different threshold it is not
     assert geometric_edges(boxes, names, ("on",)) == {(1, 0): 0}
     assert geometric_edges(boxes, names, ("on",), sure=True) == {}
     assert GEOMETRIC == RELATIONS
@@ -155,7 +155,7 @@ def written(folder: Path) -> Replica:
     return Replica(folder)
 
 
-def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Path) -> None:
+def test_replicassg_annotation_is_on_face_centres(tmp_path: Path) -> None:
     truth = written(tmp_path).ground_truth("room0", "replicassg")
     assert truth.points.tolist() == [[0.5, 0.5, 0], [0.5, 1.5, 0], [1.5, 0.5, 0], [1.5, 1.5, 0]]
     chair, table = (next(entry.id for entry in REPLICA.classes if entry.name == name) for name in ("chair", "table"))
@@ -164,7 +164,7 @@ def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Pat
     oracle = Oracle(Oracle.Config())
     oracle.receive_ground_truth(truth)
     found = values(truth, oracle.finish(), REPLICA)
-    # the sofa has no face: nobody can find it, nor what it stands with
+    # the sofa has no face: it cannot be found, nor its relations
     assert [found[name] for name in REPLICA.headline] == [2 / 3, 1 / 2, 1 / 2]
 
 
@@ -180,7 +180,7 @@ def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Pat
         ("replica_to_visual_genome.json", "{", "[", "not JSON"),
     ],
 )
-def test_each_fault_of_the_annotation_is_one_line(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
+def test_each_invalid_annotation_is_one_line(tmp_path: Path, name: str, old: str, new: str, message: str) -> None:
     dataset = written(tmp_path)
     path = tmp_path / "ReplicaSSG" / name
     path.write_text(path.read_text().replace(old, new, 1))
@@ -190,7 +190,7 @@ def test_each_fault_of_the_annotation_is_one_line(tmp_path: Path, name: str, old
 
 
 def graph(names: tuple[str, ...] = ("chair", "table")) -> dict[str, Any]:
-    """What FROSS writes of a scene: both objects where they are, and the one near the other."""
+    """FROSS' output for a scene: both objects at their positions, one near the other."""
     classes = [entry.name for entry in REPLICA.classes]
     return {
         "pcd": [np.array([[0.5, 0.5, 0], [0.5, 1.5, 0]]), np.array([[1.5, 0.5, 0.0]])],
@@ -208,7 +208,7 @@ def write_graphs(path: Path, scenes: Any) -> Path:
     return path
 
 
-def test_files_of_fross_are_evaluated_by_name(
+def test_fross_files_are_evaluated_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written(tmp_path)
@@ -221,21 +221,21 @@ def test_files_of_fross_are_evaluated_by_name(
     stored = next((tmp_path / "run").rglob("prediction.npz"))
     kept = read_prediction(stored)
     assert isinstance(kept, Instances) and kept.edges is not None and kept.edges.tolist() == [[0, 1]]
-    write_prediction(tmp_path / "again.npz", kept)  # the edges outlive being stored
+    write_prediction(tmp_path / "again.npz", kept)  # the edges are stored too
     assert read_prediction(tmp_path / "again.npz").predicates == REPLICA.predicates  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pcd": 3}, "'pcd' is 3; expected a list of points an object"),
-        ({"cls": np.eye(20)[[1, 2]]}, r"'cls' is .*; expected 2 rows of 150, as ReplicaSSG has"),
+        ({"pcd": 3}, "'pcd' is 3; expected one list of points per object"),
+        ({"cls": np.eye(20)[[1, 2]]}, r"'cls' is .*; expected 2 rows of 150, as in ReplicaSSG"),
         ({"edge_index": np.array([[0], [2]])}, "'edge_index' names object 2; the scene graph has 2"),
         ({"edge_cls": np.full((1, 50), np.nan)}, "'edge_cls' has values that are NaN or infinite"),
         ({"pcd": [np.zeros((1, 3)), np.zeros(3)]}, "object 1: the points are an array of shape"),
     ],
 )
-def test_each_fault_of_a_scene_graph_is_one_line(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_each_invalid_scene_graph_is_one_line(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     path = write_graphs(tmp_path / "predictions_x.pkl", {"room_0": graph() | change})
     reader = recognise(path, None)
     with pytest.raises(PredictionError, match=message) as caught:
@@ -257,6 +257,6 @@ def test_each_fault_of_a_scene_graph_is_one_line(tmp_path: Path, change: dict[st
         ),
     ],
 )
-def test_a_map_with_a_broken_graph_is_refused(fields: dict[str, Any], message: str) -> None:
+def test_map_with_an_invalid_graph_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(PredictionError, match=message):
         replace(Instances.of(np.zeros((1, 3), np.float32), [[0]]), **fields)

@@ -1,4 +1,4 @@
-"""The retrieval and reasoning protocols: which object an instance stands for, hand-worked shares, a run with them."""
+"""The retrieval and reasoning protocols: the object of an instance, hand-computed shares, and a run with them."""
 
 from __future__ import annotations
 
@@ -60,32 +60,32 @@ def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, f
 
 @pytest.fixture
 def all_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every object of the truth is plain to see, in no colour."""
+    """Every true object is visible, without a colour."""
     seen = {int(instance): Sight(1.0, "") for instance in np.unique(TRUTH.instance)}
     monkeypatch.setattr(ground_truths, "sights", lambda dataset, scene, truth, min_vertices: seen)
 
 
-def test_the_instance_ranked_first_is_right_where_it_stands_for_an_answer() -> None:
+def test_first_instance_is_right_if_assigned_to_an_answer() -> None:
     found = values(PERFECT)  # "red table" finds the table, which is not the answer; so does "book on table"
     assert [found[key] for key in RULES.headline] == [1.0, 1.0, 0.0, 0.5, 4 / 6]
     assert [found[f"n_{key}"] for key in RULES.headline] == [2, 1, 1, 2, 6]
     assert found["reachable"] == 1.0
 
 
-def test_an_instance_stands_for_the_object_that_it_covers_most_of() -> None:
+def test_instance_is_assigned_to_the_object_it_covers_most() -> None:
     two = [np.flatnonzero((TRUTH.instance == 2) | (TRUTH.instance == 5))[20:], np.flatnonzero(TRUTH.instance == 0)]
     covered = covered_objects(RULES.transfer, TRUTH, instances(TRUTH.points, two, None))
     assert covered.main_object.tolist() == [5, 0]
     assert covered.n_shared[0, [1, 4]].tolist() == [130, 150]
 
 
-def test_what_is_farther_than_5_cm_covers_nothing() -> None:
+def test_points_farther_than_5_cm_cover_nothing() -> None:
     moved = replace(PERFECT, points=PERFECT.points + np.float32(20.0))
     assert set(values(moved).values()) >= {0.0}
     assert values(moved)["all"] == values(moved)["reachable"] == 0.0
 
 
-def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
+def test_empty_map_has_no_first_instance() -> None:
     assert first_instances(RULES, ["chair", "lamp"], nothing(room()), ENCODER).tolist() == [-1, -1]
     assert first_instances(RULES, [], PERFECT, ENCODER).tolist() == []
     for unnamed, encoder in ((replace(PERFECT, features=None), ENCODER), (PERFECT, None)):
@@ -93,19 +93,19 @@ def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
             first_instances(RULES, ["chair"], unnamed, encoder)
 
 
-def test_a_kind_that_is_not_asked_has_no_value() -> None:
+def test_kind_without_questions_has_no_value() -> None:
     found = values(PERFECT, RetrievalTruth(TRUTH, ASKED[:1]))
     assert found["instance"] == found["all"] == 1.0
     assert found["relative"] is None  # not a number
 
 
-def test_a_partition_is_scored_as_its_instances_are() -> None:
+def test_partition_scores_like_its_instances() -> None:
     owner = TRUTH.instance.astype(np.int32) - 1
     assert PERFECT.features is not None
     assert values(Partition(TRUTH.points, owner, PERFECT.features)) == values(PERFECT)
 
 
-def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -> None:
+def test_chance_and_names_alone_are_shares_of_all_questions() -> None:
     asked = (TextTarget("instance", "chair", (2, 3), 0.25, 0.5), TextTarget("instance", "lamp", (5,), 0.125, 1.0))
     found = values(PERFECT, RetrievalTruth(TRUTH, (*asked, TextTarget("property", "red table", (4,), 0.5, 0.25))))
     assert (found["chance_instance"], found["names-alone_instance"]) == (0.1875, 0.75)
@@ -113,7 +113,7 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
     assert (found["chance_all"], found["chance_relative"]) == (0.875 / 3, None)
 
 
-def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
+def test_texts_answered_by_the_name_alone_are_separate() -> None:
     kinds = (("property by name", 4), ("relative by name", 4), ("relative by name", 8))  # "red table" finds the table
     found = values(
         PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(TextTarget(kind, "red table", (i,)) for kind, i in kinds)))
@@ -129,10 +129,10 @@ def test_scenes_pool_by_their_questions() -> None:
     assert result.metrics["all"] == 5 / 7
     assert result.metrics == result.pooled
     assert result.per_scene["b"]["all"] == 1.0
-    assert result.intervals["all"] == (0.0, 1.0)  # of 4/6 and 1/1: two scenes tell nothing
+    assert result.intervals["all"] == (0.0, 1.0)  # of 4/6 and 1/1: two scenes are uninformative
 
 
-def test_a_map_without_features_is_told_why() -> None:
+def test_map_without_features_gives_a_reason_for_retrieval() -> None:
     labelled = truth_as_prediction(TRUTH, with_labels=True)
     assert "needs features" in str(kind_incompatibility(RULES, labelled))
     with pytest.raises(PredictionError, match="needs features"):
@@ -143,19 +143,19 @@ def test_protocols_of_questions_run_only_where_they_are_named(tmp_path: Path) ->
     assert not {"rooms-retrieval", "rooms-annotation", "rooms-reasoning"} & set(protocols_for("rooms"))
     assert protocols_of_run(["rooms-retrieval"], ["rooms"]) == {"rooms": ("rooms-retrieval",)}
     own = own_questions_of_a_dataset(tmp_path)
-    with pytest.raises(ConfigError, match="needs a dataset that knows questions and answers itself, which replica"):
+    with pytest.raises(ConfigError, match="needs a dataset with questions and answers, which replica"):
         protocols_of_run([own], ["replica"])
 
 
 def own_questions_of_a_dataset(folder: Path) -> str:
-    """The path of the rooms' rules, but with the questions that the dataset itself knows."""
+    """The path of the rooms' rules, but with the questions of the dataset itself."""
     text = rules_file("rooms-retrieval").read_text().replace('questions = "generated"', 'questions = "dataset"')
     text = text.replace('synonyms = "lexicon"', "").replace('name = "rooms-retrieval"', 'name = "own-retrieval"')
     (folder / "questions.toml").write_text(text)
     return str(folder / "questions.toml")
 
 
-def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_seen: None) -> None:
+def test_questions_of_the_dataset_are_used(tmp_path: Path, all_is_seen: None) -> None:
     class Knowing:
         name = "knowing"
 
@@ -176,21 +176,21 @@ def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_
         (10.0, 10.9, True), (2.0, None, False),
     ],
 )  # fmt: skip
-def test_an_answer_is_right_within_the_rules(value: float, given: float | None, is_right: bool) -> None:
+def test_answer_is_right_within_the_tolerance(value: float, given: float | None, is_right: bool) -> None:
     assert REASONING.answers is not None
     true, told = TrueAnswer("?", "count", value, ()), SolverAnswer(given, np.zeros(0, np.int64), True)
     assert is_answer_right(REASONING.answers, true, told, np.zeros(0, np.int64)) is is_right
     assert not is_answer_right(REASONING.answers, true, replace(told, is_decided=False), np.zeros(0, np.int64))
 
 
-def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
+def test_objects_are_right_if_instances_match_exactly_them() -> None:
     main_object = np.array([4, 4, 9])
     true = TrueAnswer("which?", "nearest", None, (4,))
     for rows, is_right in (([0], True), ([0, 1], True), ([0, 2], False), ([], False)):
         assert are_objects_right(true, SolverAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
 
 
-def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:
+def test_ground_truth_answers_its_own_questions(all_is_seen: None) -> None:
     truth = question_truth(REASONING, SimpleNamespace(name="rooms"), "made", TRUTH)
     assert isinstance(truth, ReasoningTruth)
     assert len(truth.asked) > 10
@@ -242,7 +242,7 @@ def test_a_run_scores_variants_under_the_protocols_of_questions(
     assert "relative" in capsys.readouterr().out
 
 
-def test_predictions_from_elsewhere_are_scored_as_a_run_is(all_is_seen: None) -> None:
+def test_external_predictions_score_like_a_run(all_is_seen: None) -> None:
     rules = load_protocol("replica-retrieval")
     dataset = SimpleNamespace(name="replica")
     truth = question_truth(rules, dataset, "made", TRUTH)
@@ -252,4 +252,4 @@ def test_predictions_from_elsewhere_are_scored_as_a_run_is(all_is_seen: None) ->
     assert isinstance(score.counts, ShareCounts)
     assert outcome.score.counts.n_right.tolist() == score.counts.n_right.tolist()
     masks = vertex_masks("none", [], None)
-    assert "needs a map with points of its own" in str(content_incompatibility(rules, facts_of(masks)))
+    assert "needs a map with its own points" in str(content_incompatibility(rules, facts_of(masks)))
