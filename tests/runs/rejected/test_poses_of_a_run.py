@@ -109,5 +109,6 @@ def test_a_world_whose_up_is_not_z_is_a_warning_of_a_run(root: Path) -> None:
     assert main(words.split()) == 0
     (line,) = json.loads(Path("up/run.json").read_text())["warnings"]
     assert (
-        line.startswith("rgbd/bath: z is taken to be up, but -y seems to be (") and 'set up = "-y" in rgbd.toml' in line
+        line.startswith("rgbd/bath: z is assumed to be up, but -y seems to be (")
+        and 'set up = "-y" in rgbd.toml' in line
     )

@@ -138,7 +138,7 @@ def test_killed_at_any_moment_and_resumed_by_several_workers_it_gives_the_bytes_
 def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--set", "painted.fault=memory") == 3
     line = "painted/b: out of memory (Unable to allocate 512. PiB for an array with shape (72057594037927936,) and data"
-    assert f"{line} type float64); try fewer --jobs, or a machine with more\n" in capsys.readouterr().err
+    assert f"{line} type float64); try fewer --jobs or a machine with more memory\n" in capsys.readouterr().err
     assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
 
 
@@ -147,7 +147,7 @@ def test_a_disk_without_locks_is_no_place_for_a_run(tmp_path: Path, monkeypatch:
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", without_locks)
-    with pytest.raises(StoreError, match="this disk has no locks to give"), RunFolder(tmp_path).locked():
+    with pytest.raises(StoreError, match="this disk has no locks available"), RunFolder(tmp_path).locked():
         pass
 
 
