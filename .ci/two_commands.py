@@ -160,14 +160,14 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     store = max(stores, key=lambda path: len(server.files[path].content))
     whole = server.files[store]
     server.files[store] = Served(whole.content[:-1] + b"?")
-    expect("wrong checksum", fetch("models", LARGEST, *once), 2, "it was thrown away")
+    expect("wrong checksum", fetch("models", LARGEST, *once), 2, "it was deleted")
     server.files[store] = Served(whole.content, redirect="https://example.org/there")
-    expect("redirect to another host", fetch("models", LARGEST, *once), 2, "is not named for it")
+    expect("redirect to another host", fetch("models", LARGEST, *once), 2, "is not allowed for it")
     server.files[store] = whole
     sam = server.files[f"/sam/{SAM}"]
     expect("full disk", fetch("models", "sam-vit-h", *once, max_bytes=MAX_SMALL_FILE), 2, SAM)
     server.files[f"/sam/{SAM}"] = Served(sam.content, breaks_after=[50_000])
-    expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "the same command goes on from there")
+    expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "run the same command again to resume")
     assert not here(place), "something damaged is taken for whole"
     expect(
         "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
@@ -187,9 +187,9 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
     once = ("--accept", "replica", "--retries", "0", "--quiet")
     archive = server.files[f"/{REPLICA}"]
     server.files[f"/{REPLICA}"] = Served(archive.content, redirect=f"{server.other_host}/there")
-    expect("redirect to another host", fetch("replica", *once), 2, "host 'localhost' is not named for it")
+    expect("redirect to another host", fetch("replica", *once), 2, "host 'localhost' is not allowed for it")
     server.files[f"/{REPLICA}"] = Served(archive.content, breaks_after=[len(archive.content) // 2])
-    expect("break in the middle", fetch("replica", *once), 2, "the same command goes on from there")
+    expect("break in the middle", fetch("replica", *once), 2, "run the same command again to resume")
     assert not (place.data / "Replica").exists()
     expect("the same again", fetch("replica", *once), 0, "(no published checksum; recorded)")
     expect("checked", place.run("datasets", "check", "replica/*", "--quick"), 0, "replica/office4")

@@ -1,7 +1,7 @@
 """Evaluation and benchmarking of open-vocabulary, instance-level 3D scene understanding from RGB-D.
 
-What a notebook, a script, a dataset or a method of one's own needs is named here and imported at its first use, so
-that ``import su3d_bench`` stays instant.
+The public names for notebooks, scripts and user-defined datasets and methods; each is imported at its first use, so
+that ``import su3d_bench`` stays fast.
 """
 
 import os
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from su3d_bench.metrics.scoring import score_scene as score_scene
     from su3d_bench.store.predictions import read_prediction as read_prediction
 
-# The public names, by the module in which each is.
+# The public names, by module.
 _MODULES = {
     "api.lists": ("list_datasets", "list_methods", "list_protocols"),
     "api.run": ("evaluate", "run"),
@@ -56,8 +56,8 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_MODULE_OF)
 
-# ONNX Runtime from 1.29 on tells its makers of every session and keeps an identity of the machine in the user's cache;
-# it looks at this once, when it is loaded (microsoft/onnxruntime, pull request 27379). Who wants that sets 0.
+# ONNX Runtime 1.29 and later sends telemetry for every session and stores a machine id in the user's cache; it reads
+# this variable once, on import (microsoft/onnxruntime, pull request 27379). Set it to 0 to allow telemetry.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 

@@ -1,1 +1,1 @@
-"""What a program or a notebook calls: runs, predictions and finished runs, by the functions that the verbs call."""
+"""The Python API: runs, predictions and finished runs, by the same functions as the command line."""

@@ -1,7 +1,7 @@
-"""Records of runs as tables of pandas: the columns, what each holds, and how they are filled.
+"""Records of runs as pandas tables.
 
-Every number is the one of the record, to the last bit; NaN, or NA in whole numbers, stands where there is none. Texts
-are made printable: they may come from files of others.
+Every number is bit-identical to the record; missing values are NaN, or NA in integer columns. Texts are made printable,
+because they may come from untrusted files.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from su3d_bench.store.records import MetricsRecord
 
 TEXT, WHOLE, NUMBER, TRUTH, WHOLE_OR_NONE = "string", "int64", "float64", "bool", "Int64"
-# What the columns hold, by table.
+# The column types, by table.
 METRICS = {
     **dict.fromkeys(("method", "protocol", "metric"), TEXT),
     "is_headline": TRUTH,
@@ -47,7 +47,7 @@ SAMPLES = {
 
 
 def metrics_frame(metrics: MetricsRecord) -> pandas.DataFrame:
-    """A row a method, protocol and metric over all scenes; methods that no protocol scored have none."""
+    """One row per method, protocol and metric over all scenes; none for methods without a score."""
     rows = []
     for result in metrics.results:
         numbers, ceiling = result.result, result.ceiling or {}
@@ -61,12 +61,12 @@ def metrics_frame(metrics: MetricsRecord) -> pandas.DataFrame:
 
 
 def scenes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
-    """A row a method, protocol, scene and metric."""
+    """One row per method, protocol, scene and metric."""
     return frame(SCENE_DTYPES, _inner_rows(metrics, "per_scene"))
 
 
 def classes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
-    """A row a method, protocol, class and metric; of the classes that have a value."""
+    """One row per method, protocol, class and metric, for classes with a value."""
     return frame(CLASS_DTYPES, _inner_rows(metrics, "per_class"))
 
 
@@ -81,7 +81,7 @@ def _inner_rows(metrics: MetricsRecord, name: str) -> list[tuple[Any, ...]]:
 
 
 def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
-    """A row an update, with every column of any ``updates.csv``; NaN where a method has no such column."""
+    """One row per update, with every column of any ``updates.csv``; NaN if a method has no such column."""
     import pandas
 
     tables = [pandas.DataFrame({"method": one.method, "scene": one.scene, **one.columns}) for one in times]
@@ -95,12 +95,12 @@ def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
 
 
 def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
-    """A row a sample; ``report samples --columns`` says what each column holds."""
+    """One row per sample; ``report samples --columns`` describes the columns."""
     return frame(SAMPLES, [astuple(sample) for sample in samples])
 
 
 def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
-    """A row a method, protocol, metric and kind of error; the value and the gains but those of stages add up to 1."""
+    """One row per method, protocol, metric and kind of error; value and gains, except those of stages, sum to 1."""
     rows: list[tuple[Any, ...]] = []
     for one in attributions:
         for of_protocol in one.protocols:
@@ -116,7 +116,7 @@ def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
 
 
 def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
-    """A row a protocol and metric, and where classes were compared a row a class too; ``comparison`` is its JSON."""
+    """One row per protocol and metric, and per class if classes were compared; ``comparison`` is its JSON."""
     rows = []
     for protocol in comparison["protocols"]:
         pairs = [("", metric, value) for metric, value in protocol["metrics"].items()]
@@ -131,7 +131,7 @@ def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
 
 
 def frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
-    """A table of these columns, whose texts are made printable."""
+    """A table of these columns, with printable texts."""
     import pandas
 
     texts = [place for place, kind in enumerate(columns.values()) if kind == TEXT]

@@ -1,4 +1,4 @@
-"""What there is to run and to score by, as tables of pandas."""
+"""The available datasets, methods and protocols, as pandas tables."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 def list_datasets(names: Names = ()) -> pandas.DataFrame:
-    """The datasets and what of them is here, a row a scene; one of which nothing is here has a row without a scene.
+    """The datasets and their available scenes, one row per scene; a dataset without scenes has one row without a scene.
 
-    Columns: ``dataset``, ``scene``, its address as ``run`` takes it, ``state``, how many frames it has or what is
-    wrong, ``summary`` of the dataset (string); ``is_available`` (bool). A ``ConfigError`` for an unknown name.
+    Columns: ``dataset``, ``scene``, the address for ``run``, ``state``, the number of frames or the problem,
+    ``summary`` of the dataset (string); ``is_available`` (bool). Raises ``ConfigError`` for an unknown name.
 
     >>> import su3d_bench as su3d
     >>> scenes = su3d.list_datasets("rooms")
@@ -36,7 +36,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
 
 def list_methods() -> pandas.DataFrame:
     """The methods that can be run by name: ``name``, ``summary``, ``paper``, ``source``, ``licence``, ``status`` and
-    ``needs``, by commas (string, empty for none).
+    ``needs``, separated by commas (string, empty for none).
 
     >>> import su3d_bench as su3d
     >>> "opensu3d" in su3d.list_methods()["name"].tolist()
@@ -50,11 +50,11 @@ def list_methods() -> pandas.DataFrame:
 
 
 def list_protocols() -> pandas.DataFrame:
-    """The protocols of the program: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics by commas,
-    ``label_space``, ``original`` (string), ``version`` (int64). ``load_protocol`` has every rule of one.
+    """The built-in protocols: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics, separated by
+    commas, ``label_space``, ``original`` (string), ``version`` (int64). ``load_protocol`` returns all rules of one.
 
-    ``original`` is the repository and commit whose evaluation it repeats, or "none: " and why; ``su3d-bench protocols
-    show`` says what was compared, and by how much both differ.
+    ``original`` is the repository and commit whose evaluation it reproduces, or "none: " and the reason; ``su3d-bench
+    protocols show`` reports what was compared, and the differences.
 
     >>> import su3d_bench as su3d
     >>> protocols = su3d.list_protocols().set_index("name")

@@ -1,4 +1,4 @@
-"""Runs and evaluations from Python: what the verbs ``run`` and ``evaluate`` do, without a process of their own."""
+"""Runs and evaluations from Python: the commands ``run`` and ``evaluate`` as functions."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ def run(
     report: Report | None = None,
     **more: Any,
 ) -> Run:
-    """Run methods over scenes, score their maps, and give the finished run: what ``su3d-bench run`` does.
+    """Run methods over scenes, score their maps, and return the finished run, as ``su3d-bench run``.
 
-    The keywords are its flags, None stands for the flag's default: ``scenes`` are addresses or patterns (``rooms/*``),
-    ``settings`` are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``,
-    such as ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the
-    same call again takes it up; another request is refused, unless ``into`` says what ``--extend`` or ``--replace``
-    does. ``report`` is called with every ``Event``, by which progress can be shown.
+    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``settings``
+    are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as
+    ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
+    call resumes a run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend``
+    or ``--replace``. ``report`` is called with every ``Event``, to show progress.
 
-    Raises a ``ConfigError`` for a wrong request, before any work; a ``DataError`` or ``ModelMissing`` for what is not
-    here; a ``StoreError`` for a folder that holds another run; ``RunIncomplete`` where scenes failed: the folder then
-    holds all others.
+    Raises ``ConfigError`` for an invalid request, before any work; ``DataError`` or ``ModelMissing`` for missing data
+    or models; ``StoreError`` for a folder with another run; ``RunIncomplete`` if scenes failed: the folder then
+    contains all others.
 
     >>> import su3d_bench as su3d
     >>> small = {"rooms.n_frames": 8, "rooms.width": 160, "rooms.height": 120}
@@ -66,7 +66,7 @@ def run(
 
     chosen: tuple[Into, ...] = ("own", "extend", "replace")
     if into not in chosen:
-        raise ConfigError(f"run(into={into!r}): is none of {', '.join(chosen)}")
+        raise ConfigError(f"run(into={into!r}): expected one of {', '.join(chosen)}")
     values = {
         "scenes": list(several(scenes)),
         "methods": list(several(methods)),
@@ -87,7 +87,7 @@ def run(
     try:
         assigned = [f"{key}={toml_value(value)}" for key, value in (settings or {}).items()]
     except TypeError as error:
-        raise ConfigError(f"run(settings=...): {error}; texts, numbers, true or false, and lists of them") from error
+        raise ConfigError(f"run(settings=...): {error}; expected text, numbers, bools, or lists of these") from error
     place = out if out is None or "://" in str(out) else Path(out)
     plan = make_plan(asked, assigned, place, into=into)
     with _script_kept_out_of_workers():
@@ -103,12 +103,12 @@ def run(
 
 
 def _ignore_progress(event: Event) -> None:
-    """Progress that nobody asked for."""
+    """Ignore progress events."""
 
 
 @contextmanager
 def _script_kept_out_of_workers() -> Iterator[None]:
-    """Workers that start in the block do not import the script that called: it would run its whole work once more."""
+    """Keep workers started in the block from importing the calling script, which would run all its work again."""
     main = sys.modules["__main__"]
     file = getattr(main, "__file__", None)
     if file is None or getattr(main, "__spec__", None) is not None:
@@ -169,14 +169,14 @@ def evaluate(
     queries: Place | None = None,
     out: Place | None = None,
 ) -> Scores | Run:
-    """Score predictions made elsewhere, under every protocol that fits: what ``su3d-bench evaluate`` does.
+    """Score existing predictions with every protocol that fits, as ``su3d-bench evaluate``.
 
-    ``predictions`` is a folder, a file or several of them, or for several methods side by side a table
-    ``{"mine": folder, "theirs": folder}``. The keywords are the flags. The answer has the numbers; with ``out`` it is
-    written there and is a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
+    ``predictions`` is a folder, a file or several of them, or for several methods a mapping
+    ``{"mine": folder, "theirs": folder}``. The keywords are the options of the command. Returns the numbers; with
+    ``out`` they are written there and returned as a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
 
-    Raises a ``PredictionError`` for predictions that cannot be scored, a ``DataError`` for a truth that is not here, a
-    ``ConfigError`` for a wrong request, a ``StoreError`` where ``out`` holds another run.
+    Raises ``PredictionError`` for predictions that cannot be scored, ``DataError`` for missing ground truth,
+    ``ConfigError`` for an invalid request, ``StoreError`` if ``out`` contains another run.
 
     >>> import su3d_bench as su3d
     >>> run = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance", out="runs/mine")
@@ -195,7 +195,7 @@ def evaluate(
     place = None if out is None else Path(out)
     named = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
     if not named:
-        raise ConfigError("evaluate: no predictions were named; give a folder, files, or a table of methods")
+        raise ConfigError("evaluate: no predictions; pass a folder, files, or a mapping of methods")
     requests: dict[str, Request] = {
         str(method): Request(
             tuple(map(Path, [paths] if isinstance(paths, str | Path) else paths)),
@@ -226,4 +226,4 @@ def _path(place: Place | None) -> Path | None:
 
 def _check_known(name: str, value: str | None, known: Sequence[str]) -> None:
     if value is not None and value not in known:
-        raise ConfigError(f"evaluate({name}={value!r}): is none of its values{suggest(value, known)}")
+        raise ConfigError(f"evaluate({name}={value!r}): unknown value{suggest(value, known)}")

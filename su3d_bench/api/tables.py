@@ -1,4 +1,4 @@
-"""What comes of a run, an evaluation or a comparison, as tables of pandas and as what a terminal or notebook shows."""
+"""Results of a run, an evaluation or a comparison, as pandas tables and as text for a terminal or notebook."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ Names = str | Sequence[str]
 
 
 def several(names: Names) -> tuple[str, ...]:
-    """One name or several, as several."""
+    """One name or several, as a tuple."""
     return (names,) if isinstance(names, str) else tuple(map(str, names))
 
 
 class Printable(ABC):
-    """What prints as tables, in a terminal by ``print`` and in a notebook by itself; a line where it stands in code."""
+    """Base class of results that are shown as tables by ``print`` and in notebooks; ``repr`` is one line."""
 
     @abstractmethod
     def _line(self) -> str: ...
@@ -54,10 +54,10 @@ class Printable(ABC):
 
 
 class Scores(Printable):
-    """The numbers of methods under protocols, as ``evaluate`` forms them; those of a folder are a ``Run``.
+    """The numbers of methods under protocols, as returned by ``evaluate``; those in a folder are a ``Run``.
 
-    All values are fractions in full precision, ``n_...`` are numbers of things, NaN stands where a value is undefined.
-    ``remarks`` are lines that must be known beside the numbers: formats, scenes that are missing, partial runs.
+    All values are fractions in full precision, ``n_...`` are counts, NaN is an undefined value.
+    ``remarks`` are lines that must be reported with the numbers: formats, missing scenes, partial runs.
 
     >>> import su3d_bench as su3d
     >>> scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
@@ -73,11 +73,11 @@ class Scores(Printable):
 
     @property
     def metrics(self) -> pandas.DataFrame:
-        """Every value over all scenes, a row a method, protocol and metric: what ``metrics.json`` holds, to the bit.
+        """Every value over all scenes, one row per method, protocol and metric, bit-identical to ``metrics.json``.
 
         Columns: ``method``, ``protocol`` and ``metric`` (string); ``is_headline`` (bool), whether tables show it;
-        ``value``, ``low`` and ``high`` of its 95 % interval over scenes, ``ceiling``, what the truth itself scores
-        (float64, NaN for none); ``n_scenes`` (int64).
+        ``value``, ``low`` and ``high`` of its 95 % confidence interval over scenes, ``ceiling``, the ground-truth
+        ceiling (float64, NaN for none); ``n_scenes`` (int64).
 
         >>> import su3d_bench as su3d
         >>> metrics = su3d.load_run("runs/demo").metrics
@@ -88,7 +88,7 @@ class Scores(Printable):
 
     @property
     def scene_metrics(self) -> pandas.DataFrame:
-        """Every value of each scene alone, a row a method, protocol, scene and metric.
+        """Every value of each single scene, one row per method, protocol, scene and metric.
 
         Columns: ``method``, ``protocol``, ``scene``, ``metric`` (string), ``value`` (float64).
 
@@ -100,7 +100,7 @@ class Scores(Printable):
 
     @property
     def class_metrics(self) -> pandas.DataFrame:
-        """Every value of each class over all scenes, a row a method, protocol, class and metric.
+        """Every value of each class over all scenes, one row per method, protocol, class and metric.
 
         Columns: ``method``, ``protocol``, ``class_name``, ``metric`` (string), ``value`` (float64).
 
@@ -126,10 +126,10 @@ class Scores(Printable):
 
 
 class Run(Scores):
-    """A finished run: a folder that ``run``, or ``evaluate`` with ``out``, wrote; nothing in it is ever changed here.
+    """A finished run: a folder written by ``run``, or by ``evaluate`` with ``out``; it is read-only here.
 
-    ``path`` is the folder, ``scenes``, ``methods`` and ``protocols`` are their names, ``is_complete`` says that no
-    scene failed. ``print(run)`` shows the tables, a notebook shows them by itself.
+    ``path`` is the folder, ``scenes``, ``methods`` and ``protocols`` are their names, ``is_complete``: no scene failed.
+    ``print(run)`` and notebooks show the tables.
 
     >>> import su3d_bench as su3d
     >>> run = su3d.load_run("runs/demo")
@@ -158,11 +158,11 @@ class Run(Scores):
 
     @property
     def updates(self) -> pandas.DataFrame:
-        """What each update took, a row a method, scene and update, with every column of the ``updates.csv``.
+        """The cost of each update, one row per method, scene and update, with every column of the ``updates.csv``.
 
         Columns: ``method``, ``scene`` (string), ``update`` (int64), ``frame`` (Int64), then float64: sizes (``n_...``,
-        ``rss_bytes``), milliseconds of each stage (``..._ms``), of the method and in all; NaN where a method has no
-        such column. Methods that look at no frame have no row.
+        ``rss_bytes``), milliseconds of each stage (``..._ms``), of the method and in total; NaN if a method has no
+        such column. Methods that use no frames have no rows.
 
         >>> import su3d_bench as su3d
         >>> updates = su3d.load_run("runs/demo").updates
@@ -175,7 +175,7 @@ class Run(Scores):
 
     @property
     def instances(self) -> pandas.DataFrame:
-        """Every instance, predicted and true, under each protocol of masks or points; ``samples`` with no choice.
+        """Every predicted and ground-truth instance, for each protocol of masks or points; ``samples`` without filter.
 
         >>> import su3d_bench as su3d
         >>> instances = su3d.load_run("runs/demo").instances
@@ -193,9 +193,9 @@ class Run(Scores):
     def samples(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
         """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report samples``.
 
-        The ground truth is read again, so the scenes' data must be here (``SU3D_DATA``); else a ``DataError``. A
-        ``ConfigError`` for a name that the run does not have, or where nothing has instances. ``su3d-bench report
-        samples --columns`` says what each column holds; boxes are in metres.
+        The ground truth is read again: raises ``DataError`` if the scenes' data is missing (``SU3D_DATA``), and
+        ``ConfigError`` for a name that the run does not have, or if there are no instances. ``su3d-bench report
+        samples --columns`` describes the columns; boxes are in metres.
 
         >>> import su3d_bench as su3d
         >>> found = su3d.load_run("runs/demo").samples(methods="opensu3d", protocols="rooms-instance")
@@ -211,13 +211,13 @@ class Run(Scores):
 
     @property
     def errors(self) -> pandas.DataFrame:
-        """What each kind of error costs each method, as ``su3d-bench report attribution`` computes it.
+        """The cost of each kind of error for each method, as in ``su3d-bench report attribution``.
 
-        Columns: ``method``, ``protocol``, ``metric`` (string); ``value`` (float64), that of the run; ``part`` (string):
-        ``error``, ``overlap``, ``rest`` or ``stage``; ``kind`` (string) of the error or the stage; ``n`` (Int64), how
-        many of it; ``gain`` (float64), by how much the value rises when it alone is corrected. Of each metric the value
-        and the gains but those of stages add up to 1. Protocols of kind ``instance`` and ``semantic`` alone are
-        explained, and the scenes' data must be here, else a ``DataError``.
+        Columns: ``method``, ``protocol``, ``metric`` (string); ``value`` (float64), of the run; ``part`` (string):
+        ``error``, ``overlap``, ``rest`` or ``stage``; ``kind`` (string) of the error or the stage; ``n`` (Int64), their
+        number; ``gain`` (float64), the increase of the value if only these errors are fixed. For each metric, the value
+        and the gains, except those of stages, sum to 1. Only for protocols of kind ``instance`` and ``semantic``;
+        raises ``DataError`` if the scenes' data is missing.
 
         >>> import su3d_bench as su3d
         >>> errors = su3d.load_run("runs/demo").errors.query("method == 'opensu3d' and metric == 'AP'")
@@ -243,10 +243,10 @@ class Run(Scores):
         return [attribute(self.path, method=method, protocols=names) for method, names in wanted.items() if names]
 
     def prediction(self, scene: str, method: str | None = None) -> Prediction:
-        """The map of a scene, of the run's only method where none is named: ``Instances``, ``Partition`` or
-        ``DenseFeatures``, points in metres.
+        """The map of a scene (``Instances``, ``Partition`` or ``DenseFeatures``), points in metres.
 
-        A ``StoreError`` where the run has no such map, a ``ConfigError`` where a method must be named.
+        Raises ``StoreError`` if the run has no such map, and ``ConfigError`` if ``method`` is None and the run has
+        several methods.
 
         >>> import su3d_bench as su3d
         >>> prediction = su3d.load_run("runs/demo").prediction("rooms/bathroom7", "oracle")
@@ -256,7 +256,7 @@ class Run(Scores):
         from su3d_bench.runs.finished import map_of_scene
 
         if method is None and len(self.methods) > 1:
-            raise ConfigError(f"{self._run.name}: holds {', '.join(self.methods)}; name one of them")
+            raise ConfigError(f"{self._run.name}: has the methods {', '.join(self.methods)}; name one of them")
         return map_of_scene(scene, method or self.methods[0], self.path)[2]
 
     def compare(
@@ -268,10 +268,10 @@ class Run(Scores):
         protocols: Names = (),
         per_class: bool = False,
     ) -> Comparison:
-        """What ``other`` changes over this run, as ``su3d-bench compare`` tells it: differences are other - this.
+        """Compare this run with ``other``, as ``su3d-bench compare``: differences are other - this.
 
-        Methods of one name are compared, or ``method`` with ``other_method`` (default: the same). A ``ConfigError``
-        where the two cannot be compared, naming the first thing that differs.
+        Methods of the same name are compared, or ``method`` with ``other_method`` (default: the same). Raises
+        ``ConfigError`` if the two cannot be compared, with the first difference.
 
         >>> import su3d_bench as su3d
         >>> run = su3d.load_run("runs/demo")
@@ -296,7 +296,7 @@ class Run(Scores):
 
 
 class Comparison(Printable):
-    """Two runs side by side, as ``Run.compare`` gives them; ``remarks`` must be known beside the differences.
+    """The comparison of two runs, from ``Run.compare``; ``remarks`` must be reported with the differences.
 
     >>> import su3d_bench as su3d
     >>> run = su3d.load_run("runs/demo")
@@ -311,12 +311,12 @@ class Comparison(Printable):
 
     @property
     def differences(self) -> pandas.DataFrame:
-        """A row a protocol and metric, and a row a class where ``per_class`` asked for them.
+        """One row per protocol and metric, and with ``per_class`` one row per class.
 
         Columns: ``protocol``, ``left``, ``right``, the methods, ``class_name``, empty for all classes, ``metric``
         (string); ``value_left``, ``value_right``, ``difference``, right - left, ``low`` and ``high`` of its 95 %
-        interval, ``p`` of the exact test over scenes, ``p_of_all`` corrected for all that are compared (float64, NaN
-        for none); ``n_scenes`` in common (int64).
+        confidence interval, ``p`` of the exact test over scenes, ``p_of_all`` corrected for all comparisons (float64,
+        NaN for none); ``n_scenes`` in common (int64).
 
         >>> import su3d_bench as su3d
         >>> run = su3d.load_run("runs/demo")
@@ -345,9 +345,9 @@ def _state_of(run: FinishedRun) -> list[str]:
 
 
 def load_run(path: Place) -> Run:
-    """The finished run in the folder ``path``; nothing in it is changed.
+    """The finished run in the folder ``path``, which is not changed.
 
-    A ``StoreError`` where it holds none, or one that is not finished.
+    Raises ``StoreError`` if the folder has no run, or an unfinished one.
 
     >>> import su3d_bench as su3d
     >>> su3d.load_run("runs/demo").protocols

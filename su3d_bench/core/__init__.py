@@ -1,1 +1,1 @@
-"""What goes from room to room: types, interfaces, the registry, settings, errors, digests, devices, timing."""
+"""Shared by all packages: types, interfaces, the registry, settings, errors, digests, devices, timing."""

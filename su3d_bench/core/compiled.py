@@ -1,7 +1,7 @@
-"""Numba's ``njit`` for kernels kept on disk.
+"""Numba's ``njit`` with a safe kernel cache on disk.
 
-``numba.njit(cache=True)`` alone keeps a kernel whose imported kernels have changed, which gives numbers of old code,
-ends with a traceback where its files were damaged by a power cut, and refuses to import where no folder can be written.
+``numba.njit(cache=True)`` alone reuses a kernel whose imported kernels have changed, so numbers come from old code; it
+ends with a traceback if its files were damaged by a power cut, and fails on import if no folder is writable.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.files.atomic import DAMAGE
 
 _digest = remembered(digest_file)
-MAX_WAIT_S = 60.0  # for another process that compiles the same function; then it is compiled here too
+MAX_WAIT_S = 60.0  # wait for another process that compiles the same function; after that it is compiled here too
 UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 
 
 class RepairingCache(FunctionCache):
-    """Numba's own store of one function; what cannot be read is compiled again, what cannot be kept is used once.
+    """Numba's cache of one function; an unreadable entry is compiled again, one that cannot be stored is used once.
 
-    Numba renames what it writes, but does not wait for the disk: after a power cut its files may hold anything. And it
-    looks at the function's own file alone: here a change in one from which that imports compiled functions counts too.
-    Of processes that start together one compiles and the others wait for it: from a fresh clone that saves the demo a
-    tenth of its processor time.
+    Numba renames what it writes but does not sync the disk: after a power cut its files may contain anything. It also
+    checks only the function's own file; here a change in a file with imported compiled functions counts too.
+    If several processes start together, one compiles and the others wait: this saves 10 % of the demo's CPU time in a
+    fresh clone.
     """
 
     _turn: IO[bytes] | None = None
@@ -66,7 +66,7 @@ class RepairingCache(FunctionCache):
             return None
 
     def _wait_for_turn(self) -> bool:
-        """Waits until no other process compiles this function; whether the wait was worth a second look."""
+        """Wait until no other process compiles this function; whether the cache should be read again."""
         if self._turn is not None:
             return False
         end = monotonic() + MAX_WAIT_S
@@ -87,7 +87,7 @@ class RepairingCache(FunctionCache):
 
 
 def imported_sources(function: Callable[..., Any]) -> list[Path]:
-    """The files of the compiled functions that the file of ``function`` has imported, and of those that these have."""
+    """The files of the compiled functions that the file of ``function`` imports, directly or indirectly."""
     own = function.__code__.co_filename
     sources, waiting = {own}, [function]
     while waiting:
@@ -99,12 +99,12 @@ def imported_sources(function: Callable[..., Any]) -> list[Path]:
 
 
 def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` with such a store where ``cache``, and none where no folder can be written."""
+    """``numba.njit``, with this cache if ``cache`` is true and a folder is writable."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
         if cache:
-            with suppress(RuntimeError, OSError):  # no place for it, beside the module or elsewhere, or no source
+            with suppress(RuntimeError, OSError):  # no writable cache folder, or no source file
                 dispatcher._cache = RepairingCache(function)
         return dispatcher
 

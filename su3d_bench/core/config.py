@@ -1,7 +1,7 @@
-"""What a run is asked to do: defaults, then a TOML file, then the command line; every value knows where it came from.
+"""The configuration of a run: defaults, then a TOML file, then the command line; every value records its source.
 
-A configuration travels as *settings*: one entry a leaf, keyed by its path (``("method", "opensu3d", "top_m")``).
-``resolve`` turns the settings under a prefix into a strict model, and its errors name the file and line, or the flag.
+A configuration is a list of *settings*: one entry per leaf, keyed by its path (``("method", "opensu3d", "top_m")``).
+``resolve`` turns the settings under a prefix into a strict model; its errors name the file and line, or the flag.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def _split(dotted: str) -> tuple[str, ...]:
 
 
 def toml_key(key: str) -> str:
-    """``key`` as TOML writes it: bare where that is allowed, quoted otherwise."""
+    """``key`` in TOML: bare if allowed, otherwise quoted."""
     return key if BARE_KEY.match(key) else json.dumps(key, ensure_ascii=False)
 
 
 def toml_value(value: Any) -> str:
-    """``value`` as TOML writes it: bool, int, float, text, path, and lists of these."""
+    """``value`` in TOML: bool, int, float, text, path, and lists of these."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
@@ -58,7 +58,7 @@ def toml_value(value: Any) -> str:
     if isinstance(value, float):
         return repr(value) if math.isfinite(value) else {math.inf: "inf", -math.inf: "-inf"}.get(value, "nan")
     if isinstance(value, str | Path):
-        text = json.dumps(str(value), ensure_ascii=False)  # every text of JSON is one of TOML
+        text = json.dumps(str(value), ensure_ascii=False)  # every JSON string is a TOML string
         return text if text.isprintable() else "".join(map(_in_toml, text))
     if isinstance(value, list | tuple):
         return "[" + ", ".join(toml_value(item) for item in value) + "]"
@@ -66,14 +66,14 @@ def toml_value(value: Any) -> str:
 
 
 def _in_toml(character: str) -> str:
-    """A character of a text without what acts on a terminal that shows the file."""
+    """A character of a text, escaped if it would act on a terminal that shows the file."""
     if character.isprintable():
         return character
     return f"\\u{ord(character):04x}" if ord(character) <= 0xFFFF else f"\\U{ord(character):08x}"
 
 
 def write_toml(leaves: Sequence[tuple[tuple[str, ...], Any, str]]) -> str:
-    """TOML text of (path, value, remark) leaves, each remark as a comment behind its value; None as a comment only."""
+    """TOML text of (path, value, remark) leaves, each remark as a comment after its value; None as a comment only."""
     tables: dict[tuple[str, ...], list[str]] = {(): []}
     for path, value, remark in leaves:
         key, remark = toml_key(path[-1]), one_line(remark)
@@ -92,23 +92,23 @@ SECTIONS = ("method", "dataset", "perception")
 DEFAULT_SOURCE = "default"
 
 
-# Where scenes run and what is drawn of them: neither moves a number.
+# Where scenes run and whether pictures are drawn: this changes no number.
 NEUTRAL_SETTINGS = frozenset(
     {"jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
 )
 
 
 class RunConfig(BaseModel):
-    """The part of a run that belongs to no dataset, method or perception profile.
+    """The settings of a run that do not belong to a dataset, method or perception profile.
 
-    ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
-    CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
-    ``solver``: who answers the questions of reasoning protocols, geometry alone or the text model of
-    ``perception.language``; ``offline``: no language model is asked, replies that are stored with the run are used;
-    ``accept_poses``: recordings whose depth contradicts their poses are run all the same;
-    ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5;
-    ``executor`` auto: this process for one job, else processes; ``ray_address`` empty: that of ``RAY_ADDRESS``, or the
-    cluster on this machine; ``retries``: of a scene whose machine was lost; ``slurm``: KEY=VALUE of submitit.
+    ``protocols`` empty: those of each dataset; ``stride`` 0: the method's default; ``jobs`` 0: one per scene, at most
+    one per CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is
+    partial; ``solver``: how questions of reasoning protocols are answered, by geometry alone or by the text model of
+    ``perception.language``; ``offline``: no language model is called, replies stored with the run are used;
+    ``accept_poses``: also run recordings whose depth contradicts their poses;
+    ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
+    ``executor`` auto: this process for one job, otherwise processes; ``ray_address`` empty: ``RAY_ADDRESS``, or the
+    cluster on this machine; ``retries``: for a scene whose machine was lost; ``slurm``: KEY=VALUE for submitit.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -134,13 +134,13 @@ class RunConfig(BaseModel):
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """Those of ``anytime``, ascending, each once."""
+        """The fractions of ``anytime``, ascending, without duplicates."""
         return tuple(sorted(set(self.anytime)))
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One value that was asked for, and where: ``run.toml:3`` or ``--set opensu3d.top_m``."""
+    """One configured value and its source: ``run.toml:3`` or ``--set opensu3d.top_m``."""
 
     path: KeyPath
     value: Any
@@ -149,7 +149,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that was asked for, later entries winning over earlier ones of the same path."""
+    """All configured values; later entries override earlier ones with the same path."""
 
     entries: tuple[Setting, ...] = ()
 
@@ -163,7 +163,7 @@ class Settings:
         return [Setting(entry.path[n:], entry.value, entry.source) for entry in below]
 
     def source(self, path: KeyPath) -> str:
-        """Where the value at ``path`` came from; ``default`` where nobody asked."""
+        """The source of the value at ``path``; ``default`` if it is not set."""
         for entry in reversed(self.entries):
             if entry.path[: len(path)] == path or path[: len(entry.path)] == entry.path:
                 return entry.source
@@ -222,9 +222,9 @@ def nest(leaves: Sequence[tuple[KeyPath, Any]]) -> dict[str, Any]:
 
 def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Sequence[str]) -> Settings:
     """The settings of ``--set KEY=VALUE``: KEY is ``<method>.x``, ``<dataset>.x`` or ``perception.x``,
-    or as a file has it, ``method.<method>.x`` or ``dataset.<dataset>.x``.
+    or the form used in files, ``method.<method>.x`` or ``dataset.<dataset>.x``.
 
-    ``methods`` and ``datasets`` are the names that the run uses; VALUE is TOML, and plain text where it is not.
+    ``methods`` and ``datasets`` are the names that the run uses; VALUE is TOML, otherwise plain text.
     """
     entries = []
     for text in texts:
@@ -238,20 +238,20 @@ def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Seq
 
 def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Sequence[str]) -> KeyPath:
     if len(path) == 1 and path[0] in RunConfig.model_fields:
-        raise ConfigError(f"--set {text}: '{path[0]}' has a flag of its own: --{path[0].replace('_', '-')}")
+        raise ConfigError(f"--set {text}: '{path[0]}' has its own flag: --{path[0].replace('_', '-')}")
     for section, names in (("method", methods), ("dataset", datasets)):
         if path[0] == section and len(path) > 2 and path[1] in names:
-            return path  # as a file has it: [method.opensu3d]
+            return path  # the form used in files: [method.opensu3d]
         if path[0] in names and len(path) > 1:
             return (section, *path)
     if path[0] == "perception" and len(path) > 1:
         return path
     known = [*methods, *datasets, "perception"]
-    raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{suggest(path[0], known)}")
+    raise ConfigError(f"--set {text}: '{path[0]}' is not a method or dataset of this run{suggest(path[0], known)}")
 
 
 def parse_value(text: str) -> Any:
-    """A value in TOML, and plain text where it is not."""
+    """A TOML value, or plain text if it is not valid TOML."""
     try:
         return parse_toml(f"value = {text}")["value"]
     except ValueError:
@@ -259,7 +259,7 @@ def parse_value(text: str) -> Any:
 
 
 def check_keys(settings: Settings) -> None:
-    """Refuse a top-level key that is neither a value of ``RunConfig`` nor a section."""
+    """Raise ``ConfigError`` for a top-level key that is neither a field of ``RunConfig`` nor a section."""
     known = [*RunConfig.model_fields, *SECTIONS]
     for entry in settings.entries:
         if entry.path[0] not in known:
@@ -273,20 +273,20 @@ def check_keys(settings: Settings) -> None:
 
 
 def check_names(section: str, settings: Settings, known: Sequence[str]) -> None:
-    """Refuse ``[section.name]`` where ``name`` is not ``known``."""
+    """Raise ``ConfigError`` for ``[section.name]`` if ``name`` is not ``known``."""
     for entry in settings.under((section,)):
         if entry.path[0] not in known:
             raise ConfigError(f"{entry.source}: unknown {section} '{entry.path[0]}'{suggest(entry.path[0], known)}")
 
 
 def resolve(settings: Settings, prefix: KeyPath, model: type[Model]) -> Model:
-    """The strict ``model`` filled from the settings under ``prefix``; the first wrong value is a one-line error."""
+    """The strict ``model`` filled from the settings under ``prefix``; the first invalid value is a one-line error."""
     below = settings.under(prefix)
     if not prefix:
         below = [entry for entry in below if entry.path[0] not in SECTIONS]
     table = nest([(entry.path, entry.value) for entry in below])
     try:
-        # Through JSON, because strict models take a list for a tuple and a text for a path only there.
+        # Through JSON: only there do strict models accept a list as a tuple and a string as a path.
         return model.model_validate_json(json.dumps(table, default=str))
     except ValidationError as error:
         raise ConfigError(_explain(error, settings, prefix, model)) from error

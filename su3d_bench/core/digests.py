@@ -1,4 +1,4 @@
-"""Content keys: what a result was made from, as short hexadecimal texts."""
+"""Content keys: hexadecimal digests of everything that a result was made from."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import Any
 from su3d_bench.core.system.files import opened
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
-# What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
+# Packages that display numbers and change none; everything else in the package counts, in any folder.
 NON_SCORING_PACKAGES = ("analysis", "api", "cli", "fetching", "reports", "reproducing", "human_eval")
-# No part of the program: what Python and file managers leave, texts for people, what type checkers read.
+# Not part of the program: files of Python and file managers, documentation, type-checker markers.
 NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
 RECORDED_PACKAGES = ("su3d-bench", *NUMERIC_PACKAGES, "pandas", "pydantic", "torch", "transformers")
@@ -29,7 +29,7 @@ def digest_bytes(content: bytes) -> str:
 
 
 def digest_json(value: Any) -> str:
-    """A key of a JSON-like value; equal values give equal keys whatever the order of their keys."""
+    """A digest of a JSON-like value; it does not depend on the order of the value's keys."""
     return digest_bytes(json.dumps(value, sort_keys=True, ensure_ascii=False).encode())
 
 
@@ -41,29 +41,29 @@ def digest_file(path: Path) -> str:
 
 @cache
 def code_digest() -> str:
-    """A key of the installed code, rules, tables and weights that can move a number."""
+    """A digest of the installed code, rules, tables and weights that can change a number."""
     names = {path.relative_to(PACKAGE_ROOT).parts[0] for path in _sources(PACKAGE_ROOT)}
     return package_digest(*sorted(names - set(NON_SCORING_PACKAGES)))[:16]
 
 
 @cache
 def package_digest(*names: str) -> str:
-    """A key of parts of the package by their bytes: ``"metrics"``, all that lies in that folder and below, or one file.
+    """A digest of parts of the package: a folder with all files below it, such as ``"metrics"``, or one file.
 
-    Raises ``FileNotFoundError`` for a name under which no file lies: a key of nothing would fit any code.
+    Raises ``FileNotFoundError`` for a name without files: a digest of nothing would match any code.
     """
     total = hashlib.sha256()
     for name in names:
         paths = sorted(_sources(PACKAGE_ROOT / name))
         if not paths:
-            raise FileNotFoundError(f"{PACKAGE_ROOT / name}: holds no code of which a key could be made")
+            raise FileNotFoundError(f"{PACKAGE_ROOT / name}: contains no code to digest")
         for path in paths:
             total.update(f"{path.relative_to(PACKAGE_ROOT).as_posix()} {digest_file(path)}\n".encode())
     return total.hexdigest()
 
 
 def _sources(place: Path) -> Iterator[Path]:
-    """The files of ``place`` (a file, or a folder with all below) that belong to the program."""
+    """The files of ``place`` (a file, or a folder and everything below it) that belong to the program."""
     if place.is_file():
         yield place
     elif place.is_dir():
@@ -74,7 +74,7 @@ def _sources(place: Path) -> Iterator[Path]:
 
 @cache
 def package_versions(names: tuple[str, ...] = RECORDED_PACKAGES) -> dict[str, str]:
-    """Versions of the packages that a result depends on, and of Python; those not installed are left out."""
+    """Versions of the packages that a result depends on, and of Python; packages not installed are omitted."""
     versions = {"python": ".".join(str(part) for part in sys.version_info[:3])}
     for name in names:
         try:
@@ -85,7 +85,7 @@ def package_versions(names: tuple[str, ...] = RECORDED_PACKAGES) -> dict[str, st
 
 
 def git_state() -> dict[str, Any] | None:
-    """Commit and dirty flag of the checkout that the code runs from; None where it is installed without one."""
+    """Commit and dirty flag of the checkout that the code runs from; None if it is not a checkout."""
     commands = (["rev-parse", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
     answers = []
     for command in commands:

@@ -1,7 +1,7 @@
-"""English nouns in names, captions and questions: one and several of a thing, articles, heads, words to compare.
+"""English nouns in names, captions and questions: singular and plural, articles, head nouns, words to compare.
 
-The tokenizer of the embedded text tower reduces plurals too, but roughly, and its trained weights hold it to that; what
-is asked and understood goes by these words.
+The tokenizer of the embedded text tower also reduces plurals, but roughly, and its trained weights depend on that;
+questions and answers use this module.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ _WORD = re.compile(r"[a-z0-9]+")
 
 @cache
 def _known(kind: str) -> Any:
-    """The words of a kind in ``english.toml``; ``by_several`` is ``irregular`` the other way round."""
+    """The words of a kind in ``english.toml``; ``by_several`` is ``irregular`` inverted."""
     if kind == "by_several":
         return {several: one for one, several in _known("irregular").items()}
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))[kind]
 
 
 def words(text: str) -> tuple[str, ...]:
-    """The lower-case words of a name or noun phrase, without articles, each as one of the thing is called.
+    """The lower-case words of a name or noun phrase, without articles, each in the singular.
 
     >>> words("The two sofas"), words("indoor-plants"), words("a canvas")
     (('two', 'sofa'), ('indoor', 'plant'), ('canvas',))
@@ -35,12 +35,12 @@ def words(text: str) -> tuple[str, ...]:
 
 
 def last_word(name: str) -> str:
-    """The noun of a name, which says what it is: "paper towel" is a towel."""
+    """The head noun of a name: "paper towel" is a towel."""
     return (words(name) or ("",))[-1]
 
 
 def singular(word: str) -> str:
-    """What one of several is called; a word that means one stays.
+    """The singular of a word; a singular word is returned unchanged.
 
     >>> [singular(word) for word in ("sofas", "vases", "buses", "bookshelves", "stoves", "glass", "cookies", "candies")]
     ['sofa', 'vase', 'bus', 'bookshelf', 'stove', 'glass', 'cookie', 'candy']
@@ -61,7 +61,7 @@ def singular(word: str) -> str:
 
 
 def plural(name: str) -> str:
-    """What several things of a name are called; what is called as several are already stays.
+    """The plural of a name; a plural name is returned unchanged.
 
     >>> [plural(name) for name in ("sofa", "knife block", "bus", "case of water bottles", "blinds", "candy")]
     ['sofas', 'knife blocks', 'buses', 'cases of water bottles', 'blinds', 'candies']
@@ -83,18 +83,18 @@ def _plural_word(word: str) -> str:
 
 
 def is_countable(name: str) -> bool:
-    """Whether one asks how many there are."""
+    """Whether things of this name are counted."""
     return name not in _known("uncountable") and name.rpartition(" ")[2] not in _known("uncountable")
 
 
 def is_plural(name: str) -> bool:
-    """Whether one thing of this name is spoken of as of several: "which blinds are"."""
+    """Whether the name takes a plural verb even for one thing: "which blinds are"."""
     head = name.partition(" of ")[0].rpartition(" ")[2]
     return head in _known("always_plural") or singular(head) != head
 
 
 def with_article(noun: str) -> str:
-    """A noun after "a" or "an", as it is spoken; names that mean several, stuff, and what has an article stand alone.
+    """A noun with "a" or "an", by its sound; plural and uncountable nouns, and those with an article, are unchanged.
 
     >>> with_article("indoor-plant"), with_article("utensil holder"), with_article("blinds"), with_article("LCD screen")
     ('an indoor-plant', 'a utensil holder', 'blinds', 'an LCD screen')
@@ -121,7 +121,7 @@ def _begins_with_vowel(name: str) -> bool:
 
 
 def head_phrases(name: str) -> list[tuple[str, ...]]:
-    """Of each thing that a name joins, its words up to and with the noun that says what it is, each in the singular.
+    """For each thing in a joined name, its words up to and including the head noun, each in the singular.
 
     >>> head_phrases("the tile walls of a room"), head_phrases("wall and floor"), head_phrases("floor lamp")
     ([('tile', 'wall')], [('wall',), ('floor',)], [('floor', 'lamp')])

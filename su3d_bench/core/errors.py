@@ -1,7 +1,6 @@
-"""Everything that a user can cause, as typed errors: one line each, one exit code each.
+"""Typed errors for everything that a user can cause: one line each, one exit code each.
 
-The form of a message is *where: what is wrong, with the value; what would be right or what to do*,
-in lower case, without a full stop.
+The form of a message is *where: what is wrong (value); what to do*, in lower case, without a full stop.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from typing import Any
 from su3d_bench.core.english import plural
 from su3d_bench.core.safe_output import escaped, plain_value
 
-MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
+MESSAGE_CHARACTERS = 500  # of one message: a hostile file may contain a line of any length
 
 
 def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
-    """``text`` on one line, what cannot be printed (terminal escapes, direction marks) written as its escape.
+    """``text`` on one line, unprintable characters (terminal escapes, direction marks) escaped.
 
     >>> printable("room\\x1b[31m 0\\n")
     'room\\\\x1b[31m 0'
@@ -30,7 +29,7 @@ def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
 
 
 def counted(n: int, noun: str) -> str:
-    """A number of things.
+    """A number with its noun.
 
     >>> counted(1, "scene"), counted(2, "class")
     ('1 scene', '2 classes')
@@ -44,11 +43,11 @@ def shown(path: Path) -> str:
 
 
 def printable_json(value: Any) -> Any:
-    """A JSON-like value with every text in it made printable; paths become texts."""
+    """A JSON-like value with every string in it made printable; paths become strings."""
     return plain_value(value, printable)
 
 
-MAX_CHOICES = 30  # that a line lists; every verb is among so many
+MAX_CHOICES = 30  # listed on one line; enough for every command
 MAX_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
@@ -58,9 +57,9 @@ EXIT_INTERNAL = 4
 
 
 class Su3dError(Exception):
-    """Base of every error that a user can cause.
+    """Base class of every error that a user can cause.
 
-    Its text is one printable line of bounded length, whatever it quotes: it goes to terminals, records and pages.
+    Its text is one printable line of bounded length, because it is shown in terminals, records and pages.
 
     >>> import su3d_bench as su3d
     >>> try:
@@ -81,23 +80,23 @@ class ConfigError(Su3dError):
 
 
 class DataError(Su3dError):
-    """A dataset, scene or file that is missing, damaged or contradicts itself."""
+    """A dataset, scene or file that is missing, damaged or inconsistent."""
 
 
 class PlugInError(ConfigError):
-    """Somebody's own dataset or method that is not as it must be; the line begins with its file and line."""
+    """A user-defined dataset or method that is invalid; the message begins with its file and line."""
 
 
 class GroundTruthMissing(DataError):
-    """The scene has no ground truth in the form that a protocol needs: it runs, unscored."""
+    """The scene has no ground truth in the form that a protocol needs: it runs without a score."""
 
 
 class ScenesMissing(DataError):
-    """Nothing of a dataset is where it is looked for."""
+    """No scene of a dataset was found."""
 
 
 class FramesMissing(DataError):
-    """The scene has no frames here: its ground truth can be looked at, and nothing can be run on it."""
+    """The scene has no frames: its ground truth can be viewed, but no method can run on it."""
 
 
 class PredictionError(Su3dError):
@@ -105,11 +104,11 @@ class PredictionError(Su3dError):
 
 
 class ModelMissing(Su3dError):
-    """Weights or an optional package that a profile or method needs are not here."""
+    """Weights or an optional package that a profile or method needs are missing."""
 
 
 class StoreError(Su3dError):
-    """The run folder cannot be written, or holds another run."""
+    """The run folder cannot be written, or contains another run."""
 
 
 class RunIncomplete(Su3dError):
@@ -119,7 +118,7 @@ class RunIncomplete(Su3dError):
 
 
 class CheckFailed(Su3dError):
-    """A check that was asked for did not pass."""
+    """A requested check did not pass."""
 
     exit_code = EXIT_CHECK_FAILED
 
@@ -142,7 +141,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def suggest(word: str, known: Iterable[str], are: str = "known:") -> str:
-    """What follows a choice that is refused: the known word nearest to it, and what is known; nothing where nothing is.
+    """The end of a message on an unknown choice: the nearest known word and all choices; empty without choices.
 
     >>> suggest("tabel", ["table", "list"]), suggest("x", ["table", "list"], "it has")
     ("; did you mean 'table'? known: table, list", '; it has table, list')
@@ -154,7 +153,7 @@ def suggest(word: str, known: Iterable[str], are: str = "known:") -> str:
 
 @contextmanager
 def reading(where: str, error_class: type[Su3dError] = PredictionError) -> Iterator[None]:
-    """Files and folders that are missing or closed to us, in the block, as an ``error_class``."""
+    """Raise missing or unreadable files and folders in the block as ``error_class``."""
     try:
         yield
     except OSError as error:
@@ -163,7 +162,7 @@ def reading(where: str, error_class: type[Su3dError] = PredictionError) -> Itera
 
 @contextmanager
 def converted(known: type[Su3dError], wanted: type[Su3dError]) -> Iterator[None]:
-    """Errors of one class out of the block as errors of another, with the same text."""
+    """Raise errors of one class in the block as errors of another, with the same text."""
     try:
         yield
     except known as error:
@@ -172,7 +171,7 @@ def converted(known: type[Su3dError], wanted: type[Su3dError]) -> Iterator[None]
 
 @cache
 def _library_folders() -> tuple[str, ...]:
-    """Where the code of the program lies, and of what is installed; what lies elsewhere is somebody's own."""
+    """The folders of the program's code and of installed packages; code elsewhere is user-defined."""
     import sysconfig
 
     package = Path(__file__).resolve().parents[1]
@@ -182,7 +181,7 @@ def _library_folders() -> tuple[str, ...]:
 
 
 def user_code_line(error: BaseException) -> str:
-    """``my_method.py:12``: the deepest line of somebody's own file that ``error`` passed through; empty without one."""
+    """``my_method.py:12``: the deepest line of a user-defined file in the traceback of ``error``; empty without one."""
     import traceback
 
     if isinstance(error, SyntaxError) and error.filename and not error.filename.startswith(_library_folders()):
@@ -195,10 +194,10 @@ def user_code_line(error: BaseException) -> str:
 
 
 def error_line(error: BaseException) -> str:
-    """One line for any error; one that is not ours says its type, and where in somebody's own file it arose."""
+    """One line for any error; other than a ``Su3dError``, with its type and the line of the user-defined file."""
     text = printable(str(error), MAX_CHARACTERS)
     if isinstance(error, MemoryError):
-        return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
+        return f"out of memory ({text or 'no details'}); try fewer --jobs or a machine with more memory"
     if isinstance(error, Su3dError):
         return text
     place = user_code_line(error)

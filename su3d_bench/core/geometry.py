@@ -1,4 +1,4 @@
-"""Geometry that more than one part needs: back-projection, voxel grids, nearest neighbours."""
+"""Shared geometry: back-projection, voxel grids, rigid transforms."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UpAxis
 
-RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed matrices, not the digits that a text file left out
+RIGID_TOLERANCE = 1e-2  # finds scaled, mirrored and transposed matrices, but accepts the rounding of text files
 
 
 def valid_depth(depth_m: Float32Array, depth_min: float, depth_max: float) -> BoolArray:
@@ -32,7 +32,7 @@ def back_project(
     of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)
     points = np.empty((len(z), 3))
-    # No matrix product over the pixels: a threaded one waits for cores that others use.
+    # No matrix product over the pixels: a threaded one waits for cores that other processes use.
     for axis in range(3):
         ray = of_row[axis][:, None] + of_column[axis]
         points[:, axis] = ray[pixels] * z + camera_to_world[axis, 3]
@@ -42,7 +42,7 @@ def back_project(
 def ray_parts(
     intrinsics: Float64Array, camera_to_world: Float64Array, height: int, width: int
 ) -> tuple[Float64Array, Float64Array]:
-    """What rows (3, H) and columns (3, W) add to the rays of an image's pixels, in the world, to a depth of 1 m."""
+    """The row (3, H) and column (3, W) terms of the pixels' rays in the world, at a depth of 1 m."""
     if not np.linalg.det(intrinsics):
         raise DataError(f"back-projection: the intrinsics {intrinsics.tolist()} cannot be inverted")
     to_world = np.asarray(camera_to_world[:3, :3] @ np.linalg.inv(intrinsics), np.float64)
@@ -67,7 +67,7 @@ def are_rigid(matrices: Float64Array) -> BoolArray:
 
 
 def turn_to_z(axis: UpAxis) -> Float64Array:
-    """The quarter or half turn (3, 3) about x, or for x about y, that brings ``axis`` to z; exact for every number."""
+    """The rotation (3, 3) about x, or for an x axis about y, that maps ``axis`` to z; exact for every number."""
     rows = {
         "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
         "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),

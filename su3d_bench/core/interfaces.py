@@ -1,7 +1,7 @@
-"""What a dataset, a method and perception offer to the runner, and what it hands a method besides frames.
+"""The interfaces of datasets, methods and perception, and the tools that the runner passes to a method.
 
-``Dataset`` and ``Method`` are what each must have. An ability that it may have is a protocol of its own;
-``registry.load`` refuses a class with a misspelt one.
+``Dataset`` and ``Method`` are required. Each optional ability is a separate protocol; ``registry.load`` rejects a class
+with a misspelt one.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from su3d_bench.core.maps import Prediction, Proposals
 
 
 class DatasetAbility(Protocol):
-    """What a dataset may offer besides; each is a protocol of its own."""
+    """An optional ability of a dataset; each is a separate protocol."""
 
 
 class MethodAbility(Protocol):
-    """The same of a method."""
+    """An optional ability of a method."""
 
 
 class RegionPerception(Protocol):
-    """Perception on demand, for methods that choose themselves where in an image to look."""
+    """Perception on demand, for methods that choose their own image regions."""
 
     @property
     def dim(self) -> int: ...
 
     def mask_at(self, frame: types.Frame, points: types.Int64Array) -> tuple[types.BoolArray, float]:
-        """The mask (H, W) of what lies under the pixels ``points`` (P, 2), x y, and how sure the segmenter is of it."""
+        """The mask (H, W) of the object at the pixels ``points`` (P, 2), x y, and the segmenter's confidence."""
         ...
 
     def encode_regions(self, frame: types.Frame, mask: types.BoolArray, boxes: types.Int64Array) -> types.Float32Array:
@@ -40,10 +40,10 @@ class RegionPerception(Protocol):
 
 @dataclass(frozen=True)
 class SceneTools:
-    """What a method that works on the whole scene may use besides its detections; never ground truth.
+    """The additional inputs of a method that works on the whole scene; never ground truth.
 
-    ``frames`` are those of the updates, in their order, read anew at every access; ``surface`` raises ``DataError``
-    where the dataset has no mesh; ``true_proposals`` is there where ``PerceptionNeeds.true_proposals`` asks for it.
+    ``frames`` are those of the updates, in order, read again at every access; ``surface`` raises ``DataError`` if the
+    dataset has no mesh; ``true_proposals`` is set if ``PerceptionNeeds.true_proposals`` is.
     """
 
     frames: Sequence[types.Frame]
@@ -53,26 +53,26 @@ class SceneTools:
 
 
 class Dataset(Protocol):
-    """Where frames and ground truth come from; one file a dataset.
+    """A source of frames and ground truth; one file per dataset.
 
-    The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its truth uses, and
-    ``variants``, the forms of ground truth it can give, the fullest first; it is made as ``Cls(data_root, options)``.
-    Frames are read from several threads at once. Its world has z up: pictures from above, heights and spatial words go
-    by that.
+    The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its ground truth
+    uses, and ``variants``, its forms of ground truth, the most complete first; it is created as
+    ``Cls(data_root, options)``. Frames are read from several threads at once. z points up in its world: top views,
+    heights and spatial relations depend on that.
     """
 
     name: str
 
     def scenes(self) -> Sequence[str]:
-        """Scene names, the default ones first."""
+        """Scene names, the default scenes first."""
         ...
 
     def files(self, scene: str) -> Sequence[Path]:
-        """What the scene is read from, for checks and digests; empty where the scene is made on demand."""
+        """The files of the scene, for checks and digests; empty if the scene is generated on demand."""
         ...
 
     def digest(self, scene: str) -> str:
-        """A content key: equal only where frames and ground truth are equal."""
+        """A content key: equal only if frames and ground truth are equal."""
         ...
 
     def info(self, scene: str, stride: int) -> types.SceneInfo: ...
@@ -82,22 +82,22 @@ class Dataset(Protocol):
         ...
 
     def ground_truth(self, scene: str, variant: str) -> types.GroundTruth:
-        """The truth in the form that a protocol names; raises ``GroundTruthMissing`` where there is none."""
+        """The ground truth in the form that a protocol names; raises ``GroundTruthMissing`` if there is none."""
         ...
 
     def instance_mesh(self, scene: str) -> types.InstanceMesh:
-        """The annotated mesh, for the oracle profile; raises ``GroundTruthMissing`` where there is none."""
+        """The annotated mesh, for the oracle profile; raises ``GroundTruthMissing`` if there is none."""
         ...
 
 
 class DatasetFacts(DatasetAbility, Protocol):
-    """Values that the class may have; without one it is empty, or False.
+    """Optional values of the class; the default is empty or False.
 
-    ``extra_ground_truths``: ground truths with labels of other label spaces than its own: label space -> the one of
-    ``ground_truth``; ``renders_frames``: frames are computed and not read, so that none is made ahead, since the
-    pipeline's timed stages would wait for the interpreter; ``reads_made_rooms``: rooms that the program makes are
-    written in its layout, which are not its scenes; ``scene_names``: the regular expression of names that only its
-    scenes have, by which files of predictions are known.
+    ``extra_ground_truths``: ground truths with labels of other label spaces: label space -> variant of ``ground_truth``;
+    ``renders_frames``: frames are computed, not read, so none is prepared ahead, because the pipeline's timed stages
+    would wait for the interpreter; ``reads_made_rooms``: rooms generated by the program can be written in its layout,
+    although they are not its scenes; ``scene_names``: a regular expression that matches only names of its scenes, used
+    to recognise files of predictions.
     """
 
     extra_ground_truths: Mapping[str, str]
@@ -115,29 +115,29 @@ class ListsFolders(DatasetAbility, Protocol):
 
 @runtime_checkable
 class HasStatus(DatasetAbility, Protocol):
-    """A word on a scene, from a quick look."""
+    """A short status of a scene, from a quick check."""
 
     def status(self, scene: str) -> str: ...
 
 
 @runtime_checkable
 class HasGroups(DatasetAbility, Protocol):
-    """Names for sets of scenes, such as official splits."""
+    """Named sets of scenes, such as official splits."""
 
     def groups(self) -> Mapping[str, Sequence[str]]: ...
 
 
 @runtime_checkable
 class ReportsProblems(DatasetAbility, Protocol):
-    """Every fault of a scene's files, a line each."""
+    """Every problem with a scene's files, one line per problem."""
 
     def problems(self, scene: str) -> Sequence[str]: ...
 
 
 @runtime_checkable
 class HasReadingCorrections(DatasetAbility, Protocol):
-    """Its files are read as a description says: whether depth shall be held against poses, and what to change in the
-    description where another reading, a ``Finding`` of ``pose_convention``, agrees better."""
+    """Its files are read by a description: whether depth is compared with poses, and what to change in the description
+    if another reading, a ``Finding`` of ``pose_convention``, agrees better."""
 
     def is_reading_checked(self, scene: str) -> bool: ...
 
@@ -146,7 +146,7 @@ class HasReadingCorrections(DatasetAbility, Protocol):
 
 @runtime_checkable
 class ProvidesUpAxis(DatasetAbility, Protocol):
-    """Its files may have any world: which axis of it points up."""
+    """Its files may use any world frame: which axis points up."""
 
     def up(self, scene: str) -> types.WorldUp: ...
 
@@ -160,42 +160,42 @@ class HasSurface(DatasetAbility, Protocol):
 
 @runtime_checkable
 class HasCompleteObjects(DatasetAbility, Protocol):
-    """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
+    """The complete objects of a scene; the ground truth may contain only the part seen in a recording."""
 
     def whole_objects(self, scene: str) -> Sequence[types.WholeObject]: ...
 
 
 @runtime_checkable
 class NamesCategories(Protocol):
-    """The class of NYU40 that the dataset's table gives what an annotator typed; None where it is not there."""
+    """The NYU40 class of an annotator's category in the dataset's table; None if the table lacks it."""
 
     def nyu40_class(self, category: str) -> str | None: ...
 
 
 @runtime_checkable
 class IsAligned(Protocol):
-    """The rigid motion (4, 4) from the frame of the truth to one whose axes are the walls."""
+    """The rigid transform (4, 4) from the ground truth's coordinates to axes aligned with the walls."""
 
     def axis_alignment(self, scene: str) -> types.Float64Array: ...
 
 
 @runtime_checkable
 class HasQueries(DatasetAbility, Protocol):
-    """Texts with ``kind`` and ``answers``, the ids of all objects that answer them."""
+    """Queries with ``kind`` and ``answers``, the ids of all matching objects."""
 
     def queries(self, scene: str) -> Sequence[Any]: ...
 
 
 @runtime_checkable
 class HasSceneQuery(DatasetAbility, Protocol):
-    """The one text that a scene is searched for, known without its truth; its mesh has the vertices of the answer."""
+    """The one text query of a scene, known without its ground truth; the answer refers to the mesh's vertices."""
 
     def asked_text(self, scene: str) -> str: ...
 
 
 @runtime_checkable
 class HasPreviews(DatasetAbility, Protocol):
-    """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
+    """A frame ``width`` pixels wide, made much faster than the full one; ``index`` counts all frames."""
 
     def sketch(self, scene: str, index: int, width: int) -> types.Frame: ...
 
@@ -207,9 +207,9 @@ class StageTimer(Protocol):
 
 
 class Method(Protocol):
-    """A system under test: fed frame by frame, asked for a map at the end or midway.
+    """A system under test: it gets one frame at a time and returns a map at the end or midway.
 
-    The class also has ``Config``, a strict model of its settings; it is made as ``Cls(config)``.
+    The class also has ``Config``, a strict model of its settings; it is created as ``Cls(config)``.
     """
 
     name: str
@@ -227,11 +227,10 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class MethodAbout:
-    """What a list of methods says of one: where it comes from and how far it has been shown to equal its original.
+    """A method's entry in the list of methods: its origin and how far it is shown to match the original.
 
     ``paper``: authors, title, venue; ``source``: the original's repository, with the commit that was read; ``licence``
-    of that repository; ``needs``: proposals, weights, extras, one entry each; ``status``: what has been shown, and no
-    more.
+    of that repository; ``needs``: proposals, weights, extras, one entry each; ``status``: what has been verified.
     """
 
     paper: str
@@ -242,14 +241,14 @@ class MethodAbout:
 
 
 class MethodFacts(MethodAbility, Protocol):
-    """Values that the class may have; without one it is empty, or False, ``is_system`` True.
+    """Optional values of the class; the default is empty or False, for ``is_system`` True.
 
-    ``presets``: settings under a name, ``METHOD@PRESET`` is a method of its own; ``short_names``: other names of
-    settings for sweeps, the setting and what a value written there comes to; ``is_system`` False: ``all`` methods are
-    not meant to hold it, as the truth itself or a program that must be named; ``warms_up``: its first frames wait for
-    compilers or imports, so that a scratch of its kind, without tools, is fed a made-up frame before the clock runs;
-    ``needs_surface``: it cannot do without the scan's mesh, as it is set; ``has_own_perception``: it finds masks
-    itself, so that the caveat of the run's perception is not its.
+    ``presets``: named settings, ``METHOD@PRESET`` is a separate method; ``short_names``: short names of settings for
+    sweeps, with the setting and a function of the value; ``is_system`` False: not part of ``all`` methods, such as the
+    ground truth itself or a program that must be named; ``warms_up``: its first frames wait for compilers or imports,
+    so a temporary object of the class, without tools, gets a synthetic frame before timing starts;
+    ``needs_surface``: it needs the scan's mesh with its present settings; ``has_own_perception``: it finds masks
+    itself, so the caveat of the run's perception does not apply.
     """
 
     about: MethodAbout
@@ -262,10 +261,9 @@ class MethodFacts(MethodAbility, Protocol):
 
 
 class MethodFigures(MethodAbility, Protocol):
-    """Properties that an object may have: the points, instances and bytes of memory of its map after an update, what
-    the last update left out by the name of its column in ``updates.csv``, numbers on the last ``finish`` that stand
-    beside its time, digests by name of files outside the configuration that move its numbers, and what must be said
-    beside these."""
+    """Optional properties of a method object: points, instances and bytes of its map after an update; what the last
+    update discarded, by column of ``updates.csv``; numbers on the last ``finish``, reported with its time; digests by
+    name of files outside the configuration that change its numbers; and a caveat to report with these."""
 
     @property
     def n_points(self) -> int: ...
@@ -298,14 +296,14 @@ class UsesSceneTools(MethodAbility, Protocol):
 
 @runtime_checkable
 class UsesGroundTruth(MethodAbility, Method, Protocol):
-    """Is told the ground truth, and is a ceiling."""
+    """Uses ground truth, and is a ground-truth ceiling."""
 
     def receive_ground_truth(self, truth: types.GroundTruth) -> None: ...
 
 
 @runtime_checkable
 class Closable(MethodAbility, Protocol):
-    """Gives back what it holds, called when the prediction is written or could not be."""
+    """Releases its resources; called after the prediction is written or has failed."""
 
     def close(self) -> None: ...
 
@@ -319,9 +317,9 @@ ABILITIES: dict[str, Sequence[type]] = {
 
 @runtime_checkable
 class Encoder(Protocol):
-    """Two towers into one space of ``dim`` dimensions; all outputs L2-normalised float32.
+    """An image and a text encoder into one space of ``dim`` dimensions; all outputs L2-normalised float32.
 
-    It may have ``device``, where it runs, ``cpu`` or a device of torch: its features are compared there too.
+    Optional: ``device``, ``cpu`` or a device of torch, where it runs and where its features are compared.
     """
 
     name: str
@@ -329,7 +327,7 @@ class Encoder(Protocol):
 
     @property
     def digest(self) -> str:
-        """A key that moves with the weights and with everything else that moves a feature."""
+        """A digest of the weights and of everything else that changes a feature."""
         ...
 
     def encode_images(self, images: Sequence[types.UInt8Array]) -> types.Float32Array:
@@ -343,7 +341,7 @@ class Encoder(Protocol):
 
 @runtime_checkable
 class TrainedOnRelativeTexts(Protocol):
-    """An encoder that was trained on texts of the form of the relative queries; ``relative_remark`` says so."""
+    """An encoder trained on texts in the form of the relative queries; ``relative_remark`` reports that."""
 
     @property
     def relative_remark(self) -> str: ...
@@ -351,12 +349,12 @@ class TrainedOnRelativeTexts(Protocol):
 
 @runtime_checkable
 class HasTrainingVocabulary(Protocol):
-    """An encoder that was trained on a vocabulary that is known."""
+    """An encoder with a known training vocabulary."""
 
     name: str
 
     def unseen_words(self, text: str) -> tuple[str, ...]:
-        """The words of a text that stood in none that it was trained on."""
+        """The words of a text that its training texts do not contain."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""What a method makes: the map of a scene, as masks, as one instance a point, or as one feature a point."""
+"""The map of a scene that a method returns: masks, one instance per point, or one feature per point."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from su3d_bench.core.types import (
 
 
 def starts_of(sizes: Iterable[int]) -> Int64Array:
-    """Where parts of these sizes begin in a list of all, and where the last ends.
+    """The start offsets of parts of these sizes in a concatenated list, and the end of the last.
 
     >>> starts_of([2, 0, 3]).tolist()
     [0, 2, 2, 5]
@@ -47,7 +47,7 @@ class Masks:
 
     @staticmethod
     def of_sets(sets: Sequence[IntArray]) -> Masks:
-        """The masks that hold these points, each list ascending."""
+        """The masks of these point indices, each list ascending."""
         indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
         return Masks(starts_of(map(len, sets)), indices)
 
@@ -66,7 +66,7 @@ class Masks:
 
     @property
     def is_whole(self) -> bool:
-        """Whether ``indptr`` describes a list of the length of ``indices``."""
+        """Whether ``indptr`` fits the length of ``indices``."""
         ends = self.indptr[0] == 0 and self.indptr[-1] == len(self.indices)
         return bool(ends and (self.sizes >= 0).all())
 
@@ -87,7 +87,7 @@ class Masks:
 class Proposals(Masks):
     """Class-agnostic masks over N points.
 
-    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, the best first is not implied; ``source`` says who made them.
+    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, in any order; ``source`` names their origin.
     """
 
     points: Float32Array
@@ -97,18 +97,17 @@ class Proposals(Masks):
 
 @dataclass(frozen=True, kw_only=True)
 class Instances(Masks):
-    """A map of K instances over M shared points, one mask an instance.
+    """A map of K instances over M shared points, one mask per instance.
 
-    ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features,
-    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature, and
-    ``further_labels`` equally many each, what else it may be, the likeliest first and '' for no more; ``boxes`` (K, 2,
-    3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
-    (frame index, row of the file or image that the detection came from), those of instance k at
-    ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
-    are the names and prediction scores that perception gave in those views. Where the method makes a scene graph,
-    ``edges`` (E, 2) int32 are rows of subject and object and ``edge_scores`` (E, P) float64 how well each of
-    ``predicates`` fits.
-    ``places``: floors and rooms, which files may have; they are not kept with a run.
+    ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 if the method has features;
+    ``labels``: one class name per instance if the method itself decides, '' to decide by the feature;
+    ``further_labels``: alternative labels, the same number per instance, the most likely first and '' for no more;
+    ``boxes`` (K, 2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2)
+    int32 rows (frame index, row of the detection in its file or image), those of instance k at
+    ``view_indptr[k]:view_indptr[k + 1]``; ``view_names`` and ``view_scores`` (V,) float64: names and prediction scores
+    from perception in those views, if the method stores them. If the method makes a scene graph, ``edges`` (E, 2) int32
+    are rows of subject and object, and ``edge_scores`` (E, P) float64 rate each of ``predicates``.
+    ``places``: floors and rooms, which files may have; they are not stored with a run.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> points = np.array([[0, 0, 0], [1, 0, 0], [5, 5, 1]], np.float32)
@@ -169,7 +168,7 @@ class Instances(Masks):
         if len(set(predicates)) != len(predicates) or not np.isfinite(scores).all():
             raise PredictionError("instances: predicates must differ and edge_scores be finite")
         if len(edges) and not 0 <= int(edges.min()) <= int(edges.max()) < k:
-            raise PredictionError(f"instances: an edge names the instance {int(edges.max())} of {k} (0..{k - 1})")
+            raise PredictionError(f"instances: an edge names instance {int(edges.max())} of {k} (0..{k - 1})")
 
     @classmethod
     def of(
@@ -189,12 +188,12 @@ class Instances(Masks):
         view_scores: Float64Array | None = None,
         ids: Sequence[int] | IntArray = (),
     ) -> Instances:
-        """The map of ``masks`` over ``points`` (M, 3); ``views`` are those of each instance.
+        """The map of ``masks`` over ``points`` (M, 3); ``views`` has one entry per instance.
 
-        ``masks``: of each instance the indices of its points, or a bool for each point; or of each point the number
-        (M,) of its instance, from 0 without gaps, -1 for none. Scores are 1, names and captions empty where none are
-        given; boxes and centroids are those of the points, zeros for an empty mask. A ``PredictionError`` where
-        something has another shape or other values.
+        ``masks``: for each instance its point indices, or one bool per point; or (M,) for each point its instance
+        number, from 0 without gaps, -1 for none. By default scores are 1, names and captions empty; boxes and
+        centroids are those of the points, zeros for an empty mask. Raises ``PredictionError`` for wrong shapes or
+        values.
 
         >>> points = np.zeros((4, 3), np.float32)
         >>> whole = Instances.of(points, [np.array([True, True, False, False]), np.array([3])], [0.9, 0.4])
@@ -231,15 +230,15 @@ class Instances(Masks):
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...], kinds: str, expected: str) -> NDArray[Any]:
-    """``value`` as an array of this shape, None for any length, and of values of these kinds."""
+    """``value`` as an array of this shape (None: any length) and one of these dtype kinds."""
     try:
         array = np.asarray(value)
-    except (ValueError, TypeError) as error:  # rows of several lengths
-        raise PredictionError(f"instances: {name}: is no array: {error}") from error
+    except (ValueError, TypeError) as error:  # rows of different lengths
+        raise PredictionError(f"instances: {name}: not an array: {error}") from error
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
     if not fits or (array.size and array.dtype.kind not in kinds):
         found = {"U": "texts", "O": "objects"}.get(array.dtype.kind, array.dtype.name)
-        raise PredictionError(f"instances: {name} is {found} {array.shape}; {expected} is expected")
+        raise PredictionError(f"instances: {name} is {found} {array.shape}; expected {expected}")
     return array
 
 
@@ -251,7 +250,7 @@ def _scores(scores: Any, k: int) -> Float64Array:
 def _features(features: Any, k: int) -> Float32Array | None:
     if not k and np.ndim(features) == 1:
         return None
-    return _array("features", features, (k, None), "f", f"floats ({k}, D), one row per mask,")
+    return _array("features", features, (k, None), "f", f"floats ({k}, D), one row per mask")
 
 
 def _views(views: Sequence[Sequence[tuple[int, int]]], k: int) -> Int32Array:
@@ -259,14 +258,14 @@ def _views(views: Sequence[Sequence[tuple[int, int]]], k: int) -> Int32Array:
     if len(views) != k:
         raise PredictionError(f"instances: views of {len(views)} instances for {k} masks")
     rows = [view for of_instance in views for view in of_instance] or np.zeros((0, 2), np.int32)
-    return _array("views", rows, (None, 2), "iu", "pairs of integers, frame index and row,").astype(np.int32)
+    return _array("views", rows, (None, 2), "iu", "pairs of integers, frame index and row").astype(np.int32)
 
 
 def _sets(masks: Any, n_points: int) -> list[NDArray[Any]]:
-    """The points of each mask, ascending and each once; ``Instances.of`` says what ``masks`` may be."""
+    """The points of each mask, ascending and without duplicates; for ``masks`` see ``Instances.of``."""
     if not isinstance(masks, Iterable):
         raise PredictionError(
-            f"instances: masks is {masks!r:.40}; a list of point indices or bools of each instance is expected"
+            f"instances: masks is {masks!r:.40}; expected a list of point indices or bools per instance"
         )
     if isinstance(masks, np.ndarray) and masks.ndim == 1:
         return _sets_of_owners(masks, n_points)
@@ -274,28 +273,26 @@ def _sets(masks: Any, n_points: int) -> list[NDArray[Any]]:
 
 
 def _sets_of_owners(masks: NDArray[Any], n_points: int) -> list[NDArray[Any]]:
-    owners = _array(
-        "masks", masks, (n_points,), "iu", f"a list of masks, or the instance of each of {n_points} points,"
-    )
+    owners = _array("masks", masks, (n_points,), "iu", f"a list of masks, or the instance of each of {n_points} points")
     if not len(owners):
         return []
     if owners.min() < -1 or owners.max() >= n_points:
         raise PredictionError(
-            f"instances: masks holds numbers {owners.min()} to {owners.max()}; instances are numbered from 0 on "
-            f"without gaps, -1 is none, and there are {n_points} points"
+            f"instances: masks has numbers {owners.min()} to {owners.max()} for {n_points} points; number instances "
+            "from 0 without gaps, with -1 for none"
         )
     owners = owners.astype(np.int64)
     order = np.argsort(owners, kind="stable")
     sets: list[NDArray[Any]] = np.split(order, np.cumsum(np.bincount(owners + 1, minlength=1)))[1:-1]
     if empty := [k for k, members in enumerate(sets) if not len(members)]:
         raise PredictionError(
-            f"instances: masks numbers no point {empty[0]}, but higher ones; number them without gaps"
+            f"instances: masks has no point of instance {empty[0]}, but higher numbers; number them without gaps"
         )
     return sets
 
 
 def _set(name: str, mask: Any, n_points: int) -> NDArray[Any]:
-    array = _array(name, mask, (None,), "iub", f"indices of points, or a bool for each of {n_points} points,")
+    array = _array(name, mask, (None,), "iub", f"indices of points, or a bool for each of {n_points} points")
     if array.size and array.dtype.kind == "b":
         return np.flatnonzero(_array(name, array, (n_points,), "b", f"a bool for each of {n_points} points"))
     array = array if array.size else np.zeros(0, np.int32)
@@ -309,14 +306,14 @@ def _check_masks(masks: Masks, n_points: int) -> None:
     if len(indices) and (indices.min() < 0 or indices.max() >= n_points):
         worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
         raise PredictionError(
-            f"instance {masks.owner_at(worst)}: mask holds index {int(indices[worst])}, the map has {n_points} points "
+            f"instance {masks.owner_at(worst)}: mask has index {int(indices[worst])}, the map has {n_points} points "
             f"(0..{n_points - 1})"
         )
 
 
 @dataclass(frozen=True)
 class Partition:
-    """One instance a point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none.
+    """One instance per point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> points, features = np.zeros((3, 3), np.float32), np.eye(2, 4, dtype=np.float32)
@@ -331,7 +328,7 @@ class Partition:
 
 @dataclass(frozen=True)
 class DenseFeatures:
-    """One feature a point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature.
+    """One feature per point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> su3d.DenseFeatures(np.zeros((3, 3), np.float32), np.ones((3, 4), np.float16)).features.shape

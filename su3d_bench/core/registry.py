@@ -1,7 +1,7 @@
-"""Names to classes: the built-in table first, then entry points, then ``file.py:Class``.
+"""Find classes by name: first built-in ones, then entry points, then ``file.py:Class``.
 
-A plug-in may not take a built-in's name. A class is checked when it is loaded: it has what it must have, and no name
-that is almost one of what it may have.
+A plug-in cannot use a built-in name. A class is checked when it is loaded: it has all required members, and no member
+whose name is almost that of an optional one.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ METHODS = {
     "oracle": "su3d_bench.baselines.oracle:Oracle",
     "command": "su3d_bench.baselines.command.method:Command",
 }
-CEILING_METHOD = "oracle"  # is told the truth: what it scores stands beside every number, and is no bound
-GROUND_TRUTH_FILES = "ground-truth"  # before scenes whose truth are files of a dataset that is not known
+CEILING_METHOD = "oracle"  # uses ground truth: its score is reported with every number, and is not a bound
+GROUND_TRUTH_FILES = "ground-truth"  # prefix of scenes with ground-truth files of an unknown dataset
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
 REQUIRED_CLASS_ATTRS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
 TEXT_CLASS_ATTRS: dict[str, type] = {"name": str, "label_space": str, "variants": tuple}
-MIN_SIMILARITY = 0.84  # of a name to the one that was meant: a letter missing, added, changed or in the wrong place
+MIN_SIMILARITY = 0.84  # of a name to the intended one: a letter missing, added, changed or in the wrong place
 
 
 def names(kind: str) -> list[str]:
-    """Every name of ``kind`` (``dataset`` or ``method``) that can be used without a path."""
+    """All names of ``kind`` (``dataset`` or ``method``) that can be used without a path."""
     known = list(BUILT_IN[kind])
     for entry in entry_points(group=GROUPS[kind]):
         if entry.name in BUILT_IN[kind]:
-            raise ConfigError(f"plug-in {entry.value}: the {kind} name '{entry.name}' is built in; choose another name")
+            raise ConfigError(f"plug-in {entry.value}: the {kind} name '{entry.name}' is built in; use another name")
         known.append(entry.name)
     return known
 
 
 def load(kind: str, name: str) -> Any:
-    """The class behind ``name``; ``name`` may be a built-in, an entry point or ``path/to/file.py:Class``."""
+    """The class with this ``name``: a built-in, an entry point or ``path/to/file.py:Class``."""
     return checked(kind, name, _found(kind, name))
 
 
@@ -82,7 +82,7 @@ def _found(kind: str, name: str) -> Any:
 def _from_file(kind: str, target: str) -> Any:
     path, _, attribute = target.rpartition(":")
     if not Path(path).is_file():
-        raise ConfigError(f"{kind} '{target}': there is no file {path}")
+        raise ConfigError(f"{kind} '{target}': no file {path}")
     state = os.stat(path)
     module = _module_of(Path(path).resolve(), (state.st_mtime_ns, state.st_size))
     if not hasattr(module, attribute):
@@ -97,9 +97,9 @@ def _from_file(kind: str, target: str) -> Any:
 
 @cache
 def _module_of(path: Path, state: tuple[int, int]) -> Any:
-    """The module in a file of somebody's own, read once for each ``state`` of the file.
+    """The module in a user-defined file, read once for each ``state`` of the file.
 
-    It is listed among the modules under a name that is nobody's, since dataclasses look theirs up there.
+    It is registered in ``sys.modules`` under a unique name, because dataclasses look up their module there.
     """
     name = f"su3d_own_{path.stem}_{digest_json([str(path), state])[:12]}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -111,13 +111,13 @@ def _module_of(path: Path, state: tuple[int, int]) -> Any:
         del sys.modules[name]
         if isinstance(error, SystemExit):
             place = user_code_line(error) or path.name
-            raise PlugInError(f"{place}: ends the program when it is imported; put that under __main__") from error
+            raise PlugInError(f"{place}: exits the program on import; put that code under __main__") from error
         raise
     return module
 
 
 def _line_of(plug_in: Any, file: str) -> str:
-    """``my_method.py:12``, where a class or function is written."""
+    """``my_method.py:12``, where a class or function is defined."""
     try:
         return f"{file}:{inspect.getsourcelines(plug_in)[1]}"
     except (OSError, TypeError):
@@ -126,8 +126,8 @@ def _line_of(plug_in: Any, file: str) -> str:
 
 @cache
 def checked(kind: str, target: str, plug_in: Any) -> Any:
-    """``plug_in``; ``ConfigError`` where it is a class that lacks what ``kind`` must have or misspells an ability."""
-    from su3d_bench.core.interfaces import ABILITIES, INTERFACES  # with numpy: not for a line of help
+    """``plug_in``; ``ConfigError`` for a class that lacks a required member of ``kind`` or misspells an ability."""
+    from su3d_bench.core.interfaces import ABILITIES, INTERFACES  # imports numpy: not needed for help texts
 
     if not isinstance(plug_in, type):
         return plug_in
@@ -141,20 +141,20 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
     for name, called in sorted(own.items()):
         absent = [other for other in known if other not in own and known[other] == called]
         meant = difflib.get_close_matches(name, absent, 1, MIN_SIMILARITY)
-        # ``points`` is a name of its own beside ``n_points``, and a value ``closed`` beside a function ``close``
+        # ``points`` is not a misspelt ``n_points``, nor a value ``closed`` a misspelt function ``close``
         if meant and meant[0].count("_") == name.count("_"):
             raise PlugInError(f"{where}: a {kind} has no '{name}'; did you mean '{meant[0]}'?")
     if missing := sorted(required - set(own)):
-        raise PlugInError(f"{where}: lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
+        raise PlugInError(f"{where}: '{missing[0]}' is missing; a {kind} has {', '.join(sorted(required))}")
     for name, wanted in TEXT_CLASS_ATTRS.items():
         value = getattr(plug_in, name, wanted())
         if name in required and not isinstance(value, wanted):
-            raise PlugInError(f"{where}: its {name} is {value!r}; a {wanted.__name__} is expected")
+            raise PlugInError(f"{where}: its {name} is {value!r}; expected a {wanted.__name__}")
     return plug_in
 
 
 def _members(plug_in: type) -> dict[str, bool]:
-    """The public members of a class, without those of its bases, and whether each is called."""
+    """The public members of a class, without those of its bases, and whether each is a function."""
     members = dict.fromkeys(vars(plug_in).get("__annotations__", ()), False)
     for name in vars(plug_in):
         value = getattr(plug_in, name)

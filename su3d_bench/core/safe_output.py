@@ -1,8 +1,8 @@
-"""The one door to terminals and logs: nothing of a file's or a program's text acts on what it is printed to.
+"""Safe output to terminals and logs: text from files and programs is never interpreted as control sequences.
 
-What cannot be printed (terminal escapes, returns, direction marks, invisible characters) is written as its escape, and
-so is what a machine that runs a job would take for a command to itself: ``::stop-commands::`` at the beginning of a
-line, ``##[error]`` and ``##vso[...]`` anywhere in it.
+Unprintable characters (terminal escapes, returns, direction marks, invisible characters) are escaped, and so is text
+that a CI runner would execute as a command: ``::stop-commands::`` at the beginning of a line, ``##[error]`` and
+``##vso[...]`` anywhere in it.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from typing import Any, TextIO
 _COMMAND_FIRST = re.compile(r"^( *):(?=:)")
 _COMMAND_ANYWHERE = re.compile(r"##(?=\w*\[)")
 
-MIN_WIDTH = 40  # below which nothing is folded any more
+MIN_WIDTH = 40  # narrower terminals do not wrap text
 
 
 def one_line(text: str) -> str:
-    """``text`` on one line, blanks as they are, what acts on a terminal or a log written as its escape.
+    """``text`` on one line, spaces unchanged, everything that acts on a terminal or a log escaped.
 
     >>> one_line("room\\x1b[31m  0\\n::stop-commands::x"), one_line("::error::x"), one_line("a ##[group]")
     ('room\\\\x1b[31m  0\\\\n::stop-commands::x', '\\\\x3a:error::x', 'a #\\\\x23[group]')
@@ -36,21 +36,21 @@ def one_line(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """``text`` with what cannot be printed (also every blank but the common one) written as its escape, and what is a
-    command wherever it stands.
+    """``text`` with unprintable characters (including all blanks except the space) escaped, and commands that work
+    anywhere in a line.
     """
     plain = text if text.isprintable() else "".join(map(_shown, text))
     return _COMMAND_ANYWHERE.sub(r"#\\x23", plain) if "##" in plain else plain
 
 
 def plain_text(text: str) -> str:
-    """Lines of ``text``, each as ``one_line`` has it; for a text whose new lines are its own."""
+    """Lines of ``text``, each escaped as by ``one_line``; line breaks stay."""
     return "\n".join(map(one_line, text.split("\n")))
 
 
 def plain_value(value: Any, plain: Callable[[str], str] | None = None) -> Any:
-    """A JSON-like value with every text in it as ``plain`` makes it, else ``escaped`` but for its new lines; paths
-    become texts."""
+    """A JSON-like value with ``plain`` applied to every string, by default ``escaped`` except line breaks; paths become
+    strings."""
     plain = plain or (lambda text: "\n".join(map(escaped, text.split("\n"))))
     if isinstance(value, Mapping):
         return {plain(str(key)): plain_value(item, plain) for key, item in value.items()}
@@ -60,14 +60,14 @@ def plain_value(value: Any, plain: Callable[[str], str] | None = None) -> Any:
 
 
 def escaped_json(value: Any, **form: Any) -> str:
-    """JSON that reads back to just ``value`` and holds no character that acts on a terminal; ``form``: as ``dumps``.
+    """JSON that reads back as ``value`` and has no character that acts on a terminal; ``form``: options of ``dumps``.
 
     >>> escaped_json({"name": "caf\\u00e9\\u202e\\x9b"})
     '{"name": "café\\\\u202e\\\\u009b"}'
     """
     text = json.dumps(value, ensure_ascii=False, **form)
     if not text.isprintable():
-        # Outside its strings JSON holds no such character but the new lines of ours.
+        # Outside its strings, the only such characters in JSON are the line breaks from ``indent``.
         text = "\n".join(line if line.isprintable() else "".join(map(_in_json, line)) for line in text.split("\n"))
     return _COMMAND_ANYWHERE.sub(r"#\\u0023", text)
 
@@ -81,9 +81,9 @@ def _in_json(character: str) -> str:
 
 
 class SafeStream(io.TextIOBase):
-    """A stream that hands on whole lines, plain; what cannot be written is dropped, and never an error of the writer.
+    """A stream that passes on whole lines, escaped; what cannot be written is dropped without an error.
 
-    ``refused`` is why, None where all was written or the reader has gone, as ``head`` does. ``stream`` is None where
+    ``refused`` is the reason, None if all was written or the reader has closed, as ``head`` does. ``stream`` is None if
     the process was started without one.
     """
 
@@ -91,7 +91,7 @@ class SafeStream(io.TextIOBase):
         self.stream = stream
         self.refused: OSError | None = None
         self._is_open = stream is not None
-        self._begun = ""  # of a line
+        self._begun = ""  # an incomplete line
         self._sink: Callable[[str], object] = self._put
         self._lock = threading.RLock()
 
@@ -125,19 +125,19 @@ class SafeStream(io.TextIOBase):
             self._trying(lambda stream: stream.flush())
 
     def write_command(self, line: str) -> None:
-        """A line of ours that is meant as a command to the machine that runs the job; what it quotes is escaped."""
+        """Write one of our own lines as a command to the CI runner; the caller escapes what it quotes."""
         with self._lock:
             self.flush()
             self._sink(line + "\n")
 
     def end(self) -> None:
-        """Hand on what is left, and drop what a library that keeps this stream writes when the interpreter ends."""
+        """Pass on the rest, and drop what a library that holds this stream writes when the interpreter exits."""
         self.flush()
         self._is_open = False
 
     @contextmanager
     def through(self, sink: Callable[[str], object]) -> Iterator[None]:
-        """Give what is written in the block to ``sink``, as where bars are drawn on the same terminal."""
+        """Pass what is written in the block to ``sink``, for example while progress bars use the same terminal."""
         before, self._sink = self._sink, sink
         try:
             yield
@@ -154,22 +154,21 @@ class SafeStream(io.TextIOBase):
             return
         try:
             act(self.stream)
-        except (BrokenPipeError, ValueError):  # the reader has gone, or somebody closed the stream
+        except (BrokenPipeError, ValueError):  # the reader has gone, or the stream was closed
             self._shut()
         except OSError as error:
             self.refused = error
             self._shut()
 
     def _shut(self) -> None:
-        """Drop all from here on, and what the interpreter would still write at its end."""
+        """Drop all further output, including what the interpreter would write on exit."""
         self._is_open = False
         with suppress(OSError, ValueError), Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), self.fileno())
 
 
 def terminal_width() -> int | None:
-    """How many characters a line of stdout may have: what ``COLUMNS`` says, else as wide as its terminal is; None where
-    it is none."""
+    """The width of stdout in characters: ``COLUMNS``, otherwise that of its terminal; None if it is not a terminal."""
     said = os.environ.get("COLUMNS", "")[:6]
     if not sys.stdout.isatty() and not (said.isdecimal() and int(said)):
         return None
@@ -178,7 +177,7 @@ def terminal_width() -> int | None:
 
 @contextmanager
 def doors() -> Iterator[SafeStream]:
-    """Everything that is printed in the block goes through doors, tracebacks and warnings too; that of stdout."""
+    """Escape everything printed in the block, including tracebacks and warnings; yields the stream of stdout."""
     for number in range(3):
         _occupy(number)
     before = sys.stdout, sys.stderr
@@ -193,7 +192,7 @@ def doors() -> Iterator[SafeStream]:
 
 
 def _occupy(number: int) -> None:
-    """Keep a file that is opened later from taking the place of a standard stream that was closed at the start."""
+    """Keep a file that is opened later from replacing a standard stream that was closed at the start."""
     try:
         os.fstat(number)
     except OSError:
@@ -201,5 +200,5 @@ def _occupy(number: int) -> None:
 
 
 def stream_behind(stream: Any) -> Any:
-    """The stream itself, for what draws on a terminal and cleans its texts before."""
+    """The underlying stream, for code that draws on a terminal and escapes its own text."""
     return stream.stream if isinstance(stream, SafeStream) else stream

@@ -1,6 +1,6 @@
-"""What travels between the parts: frozen dataclasses, checked once at the border.
+"""The data types passed between packages: frozen dataclasses, checked once on creation.
 
-Coordinates are metres in the world frame unless a name says otherwise, and z points up there; camera axes are OpenCV's
+Coordinates are metres in the world frame, with z up, unless a name states otherwise; camera axes are OpenCV's
 (x right, y down, z forward).
 """
 
@@ -26,7 +26,7 @@ FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
 Interval = tuple[float, float]
-UP = 1  # the axis of heights in buildings' graphs, as Habitat has it
+UP = 1  # the vertical axis in building graphs, as in Habitat
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 
@@ -36,7 +36,7 @@ class Frame:
 
     ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) float32, along the optical axis, 0 where invalid;
     ``camera_to_world`` (4, 4) float64; ``intrinsics`` (3, 3) float64 in pixels.
-    ``index`` counts in the sequence at full rate.
+    ``index`` is the position in the full sequence.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> camera = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
@@ -45,7 +45,7 @@ class Frame:
     (24, 32)
     >>> su3d.Frame(7, 0.0, black, two_metres[1:], np.eye(4), camera)
     Traceback (most recent call last):
-    su3d_bench.core.errors.DataError: frame 7: depth is 32x23 and colour is 32x24; both must have one size
+    su3d_bench.core.errors.DataError: frame 7: depth is 32x23 and colour is 32x24; both must have the same size
     """
 
     index: int
@@ -62,14 +62,12 @@ class Frame:
             raise DataError(f"{where}: colour is {self.rgb.shape} {self.rgb.dtype}; expected (height, width, 3) uint8")
         if self.depth_m.shape != self.rgb.shape[:2]:
             raise DataError(
-                f"{where}: depth is {_size(self.depth_m)} and colour is {_size(self.rgb)}; both must have one size"
+                f"{where}: depth is {_size(self.depth_m)} and colour is {_size(self.rgb)}; both must have the same size"
             )
         if self.depth_m.dtype.kind != "f":
-            raise DataError(
-                f"{where}: depth is {self.depth_m.dtype.name}; expected float32 metres, 0 where there is none"
-            )
+            raise DataError(f"{where}: depth is {self.depth_m.dtype.name}; expected float32 metres, 0 for no depth")
         if self.camera_to_world.shape != (4, 4) or not np.isfinite(self.camera_to_world).all():
-            raise DataError(f"{where}: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory")
+            raise DataError(f"{where}: the pose is not a finite 4x4 matrix; drop the frame or fix the trajectory")
         if self.intrinsics.shape != (3, 3) or not np.isfinite(self.intrinsics).all():
             raise DataError(f"{where}: the intrinsics are not a finite 3x3 matrix")
         for name, kind in (("depth_m", np.float32), ("camera_to_world", np.float64), ("intrinsics", np.float64)):
@@ -82,7 +80,7 @@ def _size(image: NDArray[Any]) -> str:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What a method may know of a scene before its first frame; never ground truth.
+    """What a method knows of a scene before its first frame; never ground truth.
 
     >>> import su3d_bench as su3d
     >>> su3d.SceneInfo("rooms", "living0", n_frames=25, stride=40, image_domain="rendered-rooms").seed
@@ -99,10 +97,10 @@ class SceneInfo:
 
 @dataclass(frozen=True)
 class WorldUp:
-    """Which axis of the world of a recording's files points up; ``axis`` None where nobody can tell.
+    """The axis that points up in the world of a recording's files; ``axis`` None if unknown.
 
-    ``is_turned``: its description says so, and its frames come out in a world that is turned until z points up. Else
-    frames are as the files have them, and the axis is a guess for ``reason``; ``remedy``: what to do where it is right.
+    ``is_turned``: its description states the axis, and its frames are rotated so that z points up. Otherwise frames are
+    as in the files, and the axis is a guess based on ``reason``; ``remedy``: what to do if the guess is right.
     """
 
     axis: UpAxis | None
@@ -112,15 +110,15 @@ class WorldUp:
 
     @property
     def doubt(self) -> str | None:
-        """What is to be said where the guess is another axis than z, which whatever goes by heights takes."""
+        """A warning if the guess is another axis than z, because everything that uses heights assumes z; or None."""
         if self.is_turned or self.axis in (None, "z"):
             return None
-        return f"z is taken to be up, but {self.axis} seems to be ({self.reason}); {self.remedy}"
+        return f"z is assumed to be up, but {self.axis} seems to be ({self.reason}); {self.remedy}"
 
 
 @dataclass(frozen=True)
 class LabelSet:
-    """Class ids and their names in a label space, most often named as its dataset; id 0 is never a class.
+    """Class ids and their names in a label space, usually named after its dataset; id 0 is never a class.
 
     >>> import su3d_bench as su3d
     >>> su3d.LabelSet("mine", (3, 7), ("chair", "table")).name_of(7)
@@ -141,10 +139,10 @@ class LabelSet:
 
 @dataclass(frozen=True)
 class WholeObject:
-    """An object of a scene as it is, whether or not a recording saw all of it.
+    """A complete object of a scene, including parts not seen in a recording.
 
-    ``id``: its instance in the ground truth; ``name`` as people say it; ``box`` (2, 3), lowest and highest corner in
-    metres; ``adjectives``: what any picture of it shows; ``colour``: what it was made in, empty where nobody knows.
+    ``id``: its instance in the ground truth; ``name`` in everyday language; ``box`` (2, 3), minimum and maximum corner
+    in metres; ``adjectives``: properties visible in any picture of it; ``colour``: its colour, empty if unknown.
     """
 
     id: int
@@ -156,8 +154,8 @@ class WholeObject:
 
 @dataclass(frozen=True)
 class TrueGraph:
-    """A scene graph that people made: the class id of each object, by its instance id, whether or not it has points,
-    and relations as instance id of the subject, predicate, instance id of the object."""
+    """An annotated scene graph: the class id of each object by instance id, with or without points, and relations as
+    instance id of the subject, predicate, instance id of the object."""
 
     class_of_object: Mapping[int, int]
     relations: tuple[tuple[int, str, int], ...]
@@ -166,7 +164,7 @@ class TrueGraph:
         for relation in self.relations:
             for object_id in relation[::2]:
                 if object_id not in self.class_of_object:
-                    raise DataError(f"scene graph: a relation names object {object_id}, which is none of the graph")
+                    raise DataError(f"scene graph: a relation names object {object_id}, which is not in the graph")
 
 
 @dataclass(frozen=True)
@@ -179,9 +177,9 @@ class Floor:
 
 @dataclass(frozen=True)
 class Room:
-    """A room: ``points`` (K, 3) m that lie in it, its heights, and the mean of these or of its points.
+    """A room: ``points`` (K, 3) m inside it, its heights, and the mean of these or of its points.
 
-    ``category`` is its name, '' where it has none.
+    ``category`` is its name, '' if it has none.
     """
 
     points: Float64Array
@@ -193,7 +191,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Places:
-    """Floors and rooms; of a truth also ``object_boxes``: instance id -> centre and sides (2, 3) m."""
+    """Floors and rooms; for ground truth also ``object_boxes``: instance id -> centre and sides (2, 3) m."""
 
     floors: tuple[Floor, ...]
     rooms: tuple[Room, ...]
@@ -204,14 +202,14 @@ class Places:
 class GroundTruth:
     """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, ...).
 
-    ``points`` (N, 3) float32 m; ``semantic`` (N,) int32 class ids of ``labels``, 0 where unannotated;
-    ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.
-    ``evaluation_points`` (P, 3) float32 where a protocol scores points of another cloud than the labelled one.
-    ``boxes`` where the objects are known by their boxes alone; the points lie on these.
-    ``every_semantic`` (N, K) int32 where points may have several classes: all of them in the order of the annotation,
-    then 0; ``semantic`` and ``instance`` are of the one object that stands for the point. ``semantic`` -1 marks points
-    that evaluations leave out, in the truth and in predictions; only truths whose protocols ask for it have such.
-    ``graph`` where people annotated how objects lie to one another, ``places`` where floors and rooms are known.
+    ``points`` (N, 3) float32 m; ``semantic`` (N,) int32 class ids of ``labels``, 0 if unannotated;
+    ``instance`` (N,) int32 ids unique in the scene, 0 for none; ``source`` describes how it was made.
+    ``evaluation_points`` (P, 3) float32 if a protocol scores points of another cloud than the labelled one.
+    ``boxes`` if only the boxes of the objects are known; the points lie on these.
+    ``every_semantic`` (N, K) int32 if points may have several classes: all of them in the order of the annotation,
+    then 0; ``semantic`` and ``instance`` are those of the one object chosen for the point. ``semantic`` -1 marks points
+    that evaluations ignore, in ground truth and predictions; it occurs only if a protocol requires it.
+    ``graph`` if relations between objects are annotated, ``places`` if floors and rooms are known.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
@@ -245,8 +243,8 @@ class GroundTruth:
             check_arrays(self, f"ground truth '{self.variant}'", ("every_semantic",), DataError)
             if self.every_semantic.ndim != 2 or len(self.every_semantic) != n:
                 raise DataError(
-                    f"ground truth '{self.variant}': every_semantic {self.every_semantic.shape} has no row for each of "
-                    f"{n} points"
+                    f"ground truth '{self.variant}': every_semantic {self.every_semantic.shape}; expected one row "
+                    f"for each of {n} points"
                 )
 
 
@@ -288,7 +286,7 @@ class OrientedBox:
         return corners
 
     def distance_outside(self, points: Float64Array) -> Float64Array:
-        """How far (N,) each of ``points`` (N, 3) lies beyond the nearest face plane, the worst axis; 0 inside."""
+        """The distance (N,) of ``points`` (N, 3) beyond the face planes, the maximum over the axes; 0 inside."""
         along_axes = np.abs((points - self.centre) @ self.rotation)
         distance: Float64Array = np.maximum(along_axes - self.sizes / 2, 0.0).max(axis=1, initial=0.0)
         return distance
@@ -296,15 +294,15 @@ class OrientedBox:
 
 @dataclass(frozen=True)
 class ObjectBoxes:
-    """Objects of which only their boxes are known: ``boxes`` and class ids of ``labels``, both by instance id."""
+    """Objects with known boxes only: ``boxes`` and class ids of ``labels``, both by instance id."""
 
     boxes: Mapping[int, OrientedBox]
     class_of_instance: Mapping[int, int]
     labels: LabelSet
 
     def instance_at(self, points: Float64Array, slack_m: float) -> Int32Array:
-        """For each of ``points`` (N, 3) the instance (N,) of the smallest box, grown by ``slack_m`` on every side, that
-        holds it; 0 where none does."""
+        """For each of ``points`` (N, 3) the instance (N,) of the smallest box, grown by ``slack_m`` on every side,
+        that contains it; 0 for none."""
         found = np.zeros(len(points), np.int32)
         left = np.arange(len(points))
         by_size = sorted(self.boxes.items(), key=lambda pair: (float(np.prod(pair[1].sizes + 2 * slack_m)), pair[0]))
@@ -317,16 +315,16 @@ class ObjectBoxes:
 
 @dataclass(frozen=True)
 class Detections:
-    """What perception found in one frame: K regions, strongest evidence first is not implied.
+    """The detections of one frame: K regions in any order.
 
     ``masks`` (K, H, W) bool, may overlap; ``boxes`` (K, 4) float32 x0 y0 x1 y1 in pixels, right and bottom exclusive,
     but a detector's may reach beyond the image, and those of SAM's automatic masks end at the last pixel;
-    ``scores`` (K,) float32 in 0..1; ``names`` and ``captions`` one text each;
+    ``scores`` (K,) float32 in 0..1; ``names`` and ``captions``: one text per region;
     ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
-    ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, of the names as texts, where
-    the method asked for them. ``score_scale``: ``published`` where scores mean what published thresholds were set for
-    (SAM's predicted IoU, a detector's confidence), ``own`` where they only order regions. ``rows`` (K,): which row of
-    the file, or of all that was found in the image, each region is, where some were left out.
+    ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, text features of the names,
+    if the method asks for them. ``score_scale``: ``published`` if published thresholds apply to the scores (SAM's
+    predicted IoU, a detector's confidence), ``own`` if they only rank regions. ``rows`` (K,): the row of each region in
+    the file, or among all regions of the image, if some were excluded.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> masks, boxes = np.ones((1, 24, 32), bool), np.array([[0, 0, 32, 24]], np.float32)
@@ -374,7 +372,7 @@ class Detections:
         return k if self.rows is None else int(self.rows[k])
 
     def check_of(self, frame: Frame) -> None:
-        """Raises ``DataError`` where these are the detections of another frame, or their masks of another size."""
+        """Raise ``DataError`` if these are the detections of another frame, or the masks have another size."""
         if self.frame_index != frame.index:
             raise DataError(f"frame {frame.index}: the detections are those of frame {self.frame_index}")
         if len(self) and self.masks.shape[1:] != frame.depth_m.shape:
@@ -388,12 +386,12 @@ class PerceptionNeeds:
 
     ``masks``: ``grounded`` (named objects), ``class-agnostic`` (every region) or ``none``; regions whose name is in
     ``background_names`` (or, with ``background_by_head``, whose head noun is: "brick walls" are a wall) or whose box
-    covers more than ``max_box_fraction`` of the image are left out before any feature is computed. A crop is the
+    covers more than ``max_box_fraction`` of the image are excluded before any feature is computed. A crop is the
     region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio about its centre, then clipped.
-    ``name_features``: the names' text features too. ``true_proposals``: masks in 3D made from the ground truth, which
-    makes every number of the method a ceiling. ``automatic`` and ``grounding`` name the settings with which the
-    method's own program makes class-agnostic and grounded masks, for profiles that have its models; others pay them no
-    heed.
+    ``name_features``: also the names' text features. ``true_proposals``: masks in 3D made from the ground truth; every
+    number of the method is then a ground-truth ceiling. ``automatic`` and ``grounding`` name the settings with which
+    the method's original code makes class-agnostic and grounded masks, for profiles that have its models; other
+    profiles ignore them.
 
     >>> import su3d_bench as su3d
     >>> su3d.PerceptionNeeds(masks="class-agnostic", crop_ratios=(1.0, 1.5)).frames
@@ -417,7 +415,7 @@ class PerceptionNeeds:
 class Surface:
     """The scan's mesh without labels: ``vertices`` (V, 3) float32 m, ``triangles`` (T, 3) int32.
 
-    ``segments`` (V,) int32 numbers the vertices' segments where the dataset publishes an over-segmentation.
+    ``segments`` (V,) int32: the segment of each vertex if the dataset publishes an over-segmentation.
     """
 
     vertices: Float32Array
@@ -427,9 +425,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class Regions:
-    """A segmenter's answer: masks, boxes and scores as in ``Detections``; names where the segmenter itself names.
+    """A segmenter's output: masks, boxes and scores as in ``Detections``; names if the segmenter provides them.
 
-    ``rows`` (K,): which rows of a file they are, where some of its rows are no regions.
+    ``rows`` (K,): their rows in a file, if some of its rows are not regions.
     """
 
     masks: BoolArray
@@ -443,4 +441,4 @@ class Regions:
 def check_arrays(value: Any, where: str, names: Sequence[str], error: type[Su3dError]) -> None:
     for name in names:
         if not isinstance(array := getattr(value, name), np.ndarray):
-            raise error(f"{where}: {name} is a {type(array).__name__}; an array is expected")
+            raise error(f"{where}: {name} is a {type(array).__name__}; expected an array")

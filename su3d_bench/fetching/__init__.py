@@ -1,1 +1,1 @@
-"""Published weights and data brought to this machine: what is asked for, from where it was said to come, checked."""
+"""Download published weights and data from their stated sources, with checksums."""

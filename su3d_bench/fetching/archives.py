@@ -1,7 +1,7 @@
-"""Members of published archives, unpacked into a folder: no more than is wanted, nowhere else, no further than bounded.
+"""Unpack selected members of published archives into a folder, safely and within size limits.
 
-A member goes where ``goes_to`` says, a path relative to the folder, or nowhere (None). One that would leave the
-folder, a link in the place of a wanted file, and an archive that unpacks to far more than it is, end it.
+``goes_to`` maps a member to a path relative to the folder, or None to skip it. A member that would leave the folder, a
+link in the place of a wanted file, and a decompression bomb are errors.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PIECE = 1 << 20
 MAX_HEADER_BYTES = 1 << 20  # of the long name or extended header before a member of a tar archive
 MAX_MEMBERS = 1_000_000
 LONG_HEADERS = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE)
-# RuntimeError is of zipfile: a password, a way of packing.
+# RuntimeError is raised by zipfile for a password or an unknown compression.
 FAULTS = (DataError, zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, OSError, ValueError, RuntimeError)
 GoesTo = Callable[[PurePosixPath], PurePosixPath | None]
 
@@ -39,7 +39,7 @@ def members(archive: Path) -> list[tuple[str, int]]:
 
 
 def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Progress) -> int:
-    """Bring the wanted members of a zip archive below ``folder``; how many. What is there whole is passed over."""
+    """Unpack the wanted members of a zip archive into ``folder``; their number. Complete existing files are skipped."""
     with _reading(archive), opened(archive) as stream, zipfile.ZipFile(stream) as file:
         allowance, targets = allowance_of(file), _Targets(folder, goes_to)
         wanted = []
@@ -57,45 +57,45 @@ def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Progress) ->
 
 
 def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: GoesTo, watch: Progress) -> int:
-    """As ``unpack_zip``, of a packed tar archive in ``parts``, which are read one after another as one stream."""
+    """As ``unpack_zip``, for a compressed tar archive in ``parts``, which are read as one stream."""
     with _reading(parts[0]), ExitStack() as stack:
         joined = stack.enter_context(closing(_Joined(parts, watch)))
-        packed: Any = joined  # all that is asked of it is to be read
+        packed: Any = joined  # only its ``read`` is used
         plain = _Bounded(stack.enter_context(gzip.GzipFile(fileobj=packed, mode="rb")), Allowance(joined.n_bytes))
         targets, n_found = _Targets(folder, goes_to), 0
         with tarfile.open(fileobj=plain, mode="r|", tarinfo=_BoundedMember) as archive:  # type: ignore[call-overload]
             for n, info in enumerate(archive):
                 if n >= MAX_MEMBERS:
-                    raise DataError(f"holds more than {MAX_MEMBERS:,} members")
+                    raise DataError(f"has more than {MAX_MEMBERS:,} members")
                 place = None if info.isdir() else targets.place(info.name, is_file=info.isreg() and not info.sparse)
                 if place is not None:
                     _write(archive.extractfile(info), place, info.size)
                     n_found += 1
-        while plain.read(PIECE):  # to the checksum of the whole
+        while plain.read(PIECE):  # to the checksum at the end
             pass
     return n_found
 
 
 class _Targets:
-    """Where the members of an archive go below a folder, each to a place of its own."""
+    """The target paths of an archive's members in a folder, each used once."""
 
     def __init__(self, folder: Path, goes_to: GoesTo) -> None:
         self._folder, self._goes_to, self._known = folder, goes_to, set[PurePosixPath]()
 
     def place(self, name: str, *, is_file: bool) -> Path | None:
-        """Where the member called ``name`` goes; None where it is not wanted."""
+        """The target path of the member ``name``; None if it is not wanted."""
         path, shown = PurePosixPath(name), printable(name, 120)
         if not path.parts:
-            raise DataError("holds a file without a name")
+            raise DataError("contains a file without a name")
         if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name or name[1:2] == ":":
             raise DataError(f"'{shown}' leads out of the folder")
         target = self._goes_to(path)
         if target is None:
             return None
         if not is_file:
-            raise DataError(f"'{shown}' is no plain file")
+            raise DataError(f"'{shown}' is not a regular file")
         if target in self._known:
-            raise DataError(f"holds '{shown}' twice")
+            raise DataError(f"contains '{shown}' twice")
         self._known.add(target)
         return self._folder / target
 
@@ -111,7 +111,7 @@ def _write(source: IO[bytes] | None, place: Path, size: int) -> None:
     with replacing(place) as stream:
         shutil.copyfileobj(source, stream, PIECE)
         if stream.tell() != size:
-            raise EOFError("ends in the middle of a member")
+            raise EOFError("ends within a member")
 
 
 @contextmanager
@@ -122,24 +122,24 @@ def _reading(archive: Path) -> Iterator[None]:
         raise
     except FAULTS as error:
         reason = printable(str(error), 200) or type(error).__name__
-        raise DataError(f"{archive}: {reason}; nothing of it was put in place: delete it and fetch it again") from error
+        raise DataError(f"{archive}: {reason}; nothing was installed: delete it and fetch it again") from error
 
 
 class _BoundedMember(tarfile.TarInfo):
-    """A header that ``tarfile`` believes only where what it announces can be held in memory."""
+    """A tar header that is only accepted if its declared size fits in memory."""
 
     @classmethod
     def frombuf(cls, buf: Any, encoding: Any, errors: Any) -> Self:
         info = super().frombuf(buf, encoding, errors)
         if info.size < 0 or info.type == tarfile.GNUTYPE_SPARSE:
-            raise DataError("a member written in an unusual way")
+            raise DataError("a member has a negative size or is a sparse file")
         if info.type in LONG_HEADERS and info.size > MAX_HEADER_BYTES:
             raise DataError(f"a member's name of {info.size:,} bytes")
         return info
 
 
 class _Joined:
-    """Files read one after another as one."""
+    """Several files read as one stream."""
 
     def __init__(self, parts: Sequence[Path], watch: Progress) -> None:
         self._left, self._watch, self._stream = list(parts), watch, io.BytesIO()
@@ -158,7 +158,7 @@ class _Joined:
 
 
 class _Bounded:
-    """A stream of which each byte is counted against an allowance before it is made."""
+    """A stream that counts each byte against an allowance before unpacking it."""
 
     def __init__(self, stream: gzip.GzipFile, allowance: Allowance) -> None:
         self._stream, self._allowance = stream, allowance

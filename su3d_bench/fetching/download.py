@@ -1,7 +1,7 @@
-"""One file downloaded whole or not at all: resumed where it broke off, bounded, checked against its checksums.
+"""Download one file atomically: resumable, limited in size, verified against its checksums.
 
-What has arrived lies beside its place as ``NAME.part``. No library does this: pooch 1.9 begins a broken download again,
-and huggingface_hub resumes files of its own hub alone and leaves their SHA-256 unchecked.
+An incomplete download is next to its place as ``NAME.part``. No library does this: pooch 1.9 restarts an interrupted
+download, and huggingface_hub resumes only files of its own hub and does not check their SHA-256.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from su3d_bench.fetching.sources import MAX_BYTES, Source, check_address
 PIECE = 1 << 20
 MAX_REDIRECTS = 5
 STATUS_TO_RETRY = (408, 425, 429)
-N_RETRIES = 3  # of a broken download, counted again whenever bytes came
+N_RETRIES = 3  # of an interrupted download, counted from 0 again after any progress
 FIRST_PAUSE_S = 1.0  # before the first of them
 TIMEOUT_S = 30.0  # without a byte
 Progress = Callable[[str, int, int | None], None]
@@ -35,9 +35,9 @@ Progress = Callable[[str, int, int | None], None]
 
 @dataclass(frozen=True)
 class ExpectedContent:
-    """What is said of a file's content: ``git_blob`` is git's SHA-1 of it, ``recorded`` the SHA-256 of an earlier one.
+    """Known checksums of a file: ``git_blob`` is git's SHA-1, ``recorded`` the SHA-256 of an earlier download.
 
-    ``md5_prefix``: how the MD5 begins. Bytes are hexadecimal digits in lower case.
+    ``md5_prefix``: the beginning of the MD5. All are hexadecimal digits in lower case.
     """
 
     sha256: str | None = None
@@ -51,7 +51,7 @@ class ExpectedContent:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What a file is checked against, in words."""
+        """The names of the known checksums."""
         kinds = (
             (self.sha256, "published SHA-256"),
             (self.md5_prefix, f"published beginning of the MD5 ({self.md5_prefix})"),
@@ -62,7 +62,7 @@ class ExpectedContent:
 
 
 def checked(path: Path, stated: ExpectedContent) -> tuple[str, str | None]:
-    """The SHA-256 of a file, and what of ``stated`` it contradicts, in words; None where it agrees with all."""
+    """The SHA-256 of a file, and a message on the first mismatch with ``stated``; None if all agree."""
     sha256, md5 = hashlib.sha256(), hashlib.md5(usedforsecurity=False)
     blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
     wanted = [sha256, *([md5] if stated.md5_prefix else []), *([blob] if stated.git_blob else [])]
@@ -73,10 +73,10 @@ def checked(path: Path, stated: ExpectedContent) -> tuple[str, str | None]:
     found, git_blob = sha256.hexdigest(), blob.hexdigest()
     beginning = md5.hexdigest()[: len(stated.md5_prefix or "")]
     facts = (
-        ("SHA-256", found, "published is", stated.sha256),
-        ("MD5 begins with", beginning, "published is", stated.md5_prefix),
-        ("git's SHA-1", git_blob, "published is", stated.git_blob),
-        ("SHA-256", found, "that of the first download was", stated.recorded),
+        ("SHA-256", found, "published:", stated.sha256),
+        ("MD5 begins with", beginning, "published:", stated.md5_prefix),
+        ("git's SHA-1", git_blob, "published:", stated.git_blob),
+        ("SHA-256", found, "first download:", stated.recorded),
     )
     wrong = (f"{name} {value}, {said} {fact}" for name, value, said, fact in facts if fact not in (None, value))
     return found, next(wrong, None)
@@ -84,7 +84,7 @@ def checked(path: Path, stated: ExpectedContent) -> tuple[str, str | None]:
 
 @dataclass(frozen=True)
 class Download:
-    """A file of a server: from ``hosts`` alone; ``n_bytes`` and ``stated`` as far as anybody states them."""
+    """A remote file: only from ``hosts``; ``n_bytes`` and ``stated`` if published."""
 
     name: str
     address: str
@@ -94,24 +94,24 @@ class Download:
 
 
 class _Broken(Exception):
-    """The connection failed or broke off; the next attempt may do better."""
+    """The connection failed or was interrupted; a retry may succeed."""
 
 
 def part_of(place: Path) -> Path:
-    """Where the file that is to lie at ``place`` lies until it is whole."""
+    """The path of the incomplete download for ``place``."""
     return place.with_name(f"{place.name}.part")
 
 
 def size_of(path: Path) -> int:
-    """The bytes of a file; 0 where there is none."""
+    """The size of a file in bytes; 0 if it does not exist."""
     return path.stat().st_size if path.is_file() else 0
 
 
 def download_file(wanted: Download, place: Path, watch: Progress, n_retries: int = N_RETRIES) -> str:
-    """Put the file at ``place``, where nothing is, and give its SHA-256; ``watch`` hears how much has come.
+    """Download the file to the free path ``place`` and return its SHA-256; ``watch`` is called with the progress.
 
-    Raises ``StoreError`` where the disk refuses, and ``DataError`` where the server does not give the file that was
-    stated; what has come of it by then is kept, unless it is known to be wrong. One process at a time.
+    Raises ``StoreError`` for a disk error, and ``DataError`` if the server does not return the stated file; a partial
+    download is kept, unless it is known to be wrong. One process at a time.
     """
     part, n_idle = part_of(place), 0
     while True:
@@ -123,9 +123,9 @@ def download_file(wanted: Download, place: Path, watch: Progress, n_retries: int
             n_held = size_of(part)
             n_idle = 1 if n_held > n_before else n_idle + 1
             if n_idle > n_retries:
-                come = f"{n_held:,} bytes of it are here" if n_held else "nothing of it is here"
+                come = f"{n_held:,} bytes were downloaded" if n_held else "nothing was downloaded"
                 raise DataError(
-                    f"{wanted.address}: {printable(str(error), 200)}; {come}, and the same command goes on from there"
+                    f"{wanted.address}: {printable(str(error), 200)}; {come}; run the same command again to resume"
                 ) from None
             time.sleep(min(FIRST_PAUSE_S * 2 ** (n_idle - 1), 60.0))
     sha256, wrong = checked(part, wanted.stated)
@@ -135,22 +135,22 @@ def download_file(wanted: Download, place: Path, watch: Progress, n_retries: int
     _state_of(part).unlink(missing_ok=True)
     if wrong is not None:
         raise DataError(
-            f"{place.name} from {wanted.address}: {wrong}; it was thrown away: run the same command again, or name "
-            "a mirror with --mirror"
+            f"{place.name} from {wanted.address}: {wrong}; it was deleted: run the same command again, or give a "
+            "mirror with --mirror"
         )
     return sha256
 
 
 def _state_of(part: Path) -> Path:
-    """Where the address and the entity tag are kept of the file whose beginning ``part`` is."""
+    """The file with the address and entity tag of the partial download ``part``."""
     return part.with_name(f"{part.name}.state")
 
 
 def _receive(wanted: Download, part: Path, watch: Progress) -> None:
-    """Append to ``part`` what is missing of the file.
+    """Append the missing rest of the file to ``part``.
 
-    Without a published checksum only the rest of a file of the same entity tag or time of change is taken (RFC 9110,
-    13.1.5); otherwise the file is read from its beginning.
+    Without a published checksum, a download is only resumed if the entity tag or modification time is unchanged
+    (RFC 9110, 13.1.5); otherwise the file is read from its beginning.
     """
     n_held, state = size_of(part), _state_of(part)
     if n_held and n_held == wanted.n_bytes:
@@ -168,7 +168,7 @@ def _receive(wanted: Download, part: Path, watch: Progress) -> None:
         if (error.headers.get("Content-Range") or "").endswith(f"/{n_held}"):
             return
         part.unlink()
-        raise _Broken("the server has another file by now") from None
+        raise _Broken("the file on the server has changed") from None
     with response:
         is_rest = response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {n_held}-")
         start = n_held if is_rest else 0
@@ -180,7 +180,7 @@ def _receive(wanted: Download, part: Path, watch: Progress) -> None:
 
 
 def _append(response: Any, part: Path, start: int, n_bytes: int, watch: Callable[[int], None]) -> None:
-    """Write the answer into ``part`` from byte ``start`` on, which makes it ``n_bytes`` long."""
+    """Write the response into ``part`` from byte ``start`` up to ``n_bytes``."""
     n_held = start
     try:
         stream = part.open("ab")
@@ -207,22 +207,22 @@ def _append(response: Any, part: Path, start: int, n_bytes: int, watch: Callable
 
 
 def _size_stated(wanted: Download, response: Any, start: int) -> int:
-    """The size of the whole file of which the answer holds what comes from byte ``start`` on."""
+    """The size of the whole file, for a response that starts at byte ``start``."""
     if response.status not in (200, 206) or (response.status == 206) != (start > 0):
-        raise DataError(f"{wanted.address}: answers with another part than was asked for; name a mirror with --mirror")
+        raise DataError(f"{wanted.address}: returns another part than requested; give a mirror with --mirror")
     if (response.headers.get("Content-Encoding") or "identity").lower() != "identity":
-        raise DataError(f"{wanted.address}: comes compressed, which was not asked for; name a mirror with --mirror")
+        raise DataError(f"{wanted.address}: is sent compressed, which was not requested; give a mirror with --mirror")
     length = response.headers.get("Content-Length") or ""
     size = start + int(length) if length.isdecimal() and len(length) < 20 else wanted.n_bytes
     if size is None:
-        raise DataError(f"{wanted.address}: nobody says how large it is; name a mirror with --mirror")
+        raise DataError(f"{wanted.address}: its size is unknown; give a mirror with --mirror")
     if wanted.n_bytes not in (None, size):
         raise DataError(
-            f"{wanted.address}: has {size:,} bytes, stated are {wanted.n_bytes:,}: it is another file by now; name "
-            "a mirror with --mirror, or its facts with --sources"
+            f"{wanted.address}: has {size:,} bytes, expected {wanted.n_bytes:,}: the file has changed; give a mirror "
+            "with --mirror, or its new facts with --sources"
         )
     if not 0 < size <= MAX_BYTES:
-        raise DataError(f"{wanted.address}: has {size:,} bytes, which is no file of this kind")
+        raise DataError(f"{wanted.address}: has {size:,} bytes; expected 1 to {MAX_BYTES:,}")
     return size
 
 
@@ -236,7 +236,7 @@ class _NamedHostsOnly(urllib.request.HTTPRedirectHandler):
         try:
             check_address(newurl, self._hosts)
         except ValueError as error:
-            raise DataError(f"{req.full_url}: is redirected, which is refused: {error}") from error
+            raise DataError(f"{req.full_url}: redirect refused: {error}") from error
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
@@ -256,19 +256,17 @@ def _refusal(address: str, error: urllib.error.HTTPError) -> Exception:
         reason = f"status {error.code} ({printable(str(error.reason), 80)})"
     if error.code in STATUS_TO_RETRY or error.code >= 500:
         return _Broken(reason)
-    return DataError(
-        f"{address}: {reason}: it is not given to everybody, or lies elsewhere; name a mirror with --mirror"
-    )
+    return DataError(f"{address}: {reason}: access is restricted or the file has moved; give a mirror with --mirror")
 
 
 HUB = "https://huggingface.co"
 
 
 def hub_files(source: Source) -> list[Download]:
-    """The files that ``source`` names, of the revision that ``main`` stands for just now, the weights last.
+    """The files of ``source`` at the current revision of ``main``, the weights last.
 
-    Raises ``ModelMissing`` without ``huggingface_hub``, ``ConfigError`` where the user keeps it from asking, and
-    ``DataError`` where the hub does not answer or lacks a file.
+    Raises ``ModelMissing`` without ``huggingface_hub``, ``ConfigError`` if the user has set it offline, and
+    ``DataError`` if the hub does not answer or lacks a file.
     """
     assert source.hub is not None
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
@@ -281,7 +279,7 @@ def hub_files(source: Source) -> list[Download]:
     except ValueError as error:
         raise ConfigError(f"HF_ENDPOINT: {error}") from error
     if constants.HF_HUB_OFFLINE:
-        raise ConfigError(f"fetch {source.name}: HF_HUB_OFFLINE is set, so nobody is asked; unset it to fetch")
+        raise ConfigError(f"fetch {source.name}: HF_HUB_OFFLINE is set; unset it to fetch")
     repository = source.hub.repository
     info = _info(hub, endpoint, repository)
     stated = {file.rfilename: file for file in info.siblings or ()}
@@ -293,8 +291,8 @@ def hub_files(source: Source) -> list[Download]:
         sha256 = None if file.lfs is None else str(file.lfs.sha256)
         if ours is not None and None not in (ours.sha256, sha256) and ours.sha256 != sha256:
             raise DataError(
-                f"{endpoint}/{repository}: states SHA-256 {printable(str(sha256), 80)} of {name}, known is "
-                f"{ours.sha256}: the file was changed; name its facts with --sources if that is as it should be"
+                f"{endpoint}/{repository}: states SHA-256 {printable(str(sha256), 80)} for {name}, expected "
+                f"{ours.sha256}: the file has changed; if that is intended, give its new facts with --sources"
             )
         n_bytes = file.size if ours is None or file.size is not None else ours.n_bytes
         checksums = ExpectedContent(sha256=sha256, git_blob=None if sha256 else file.blob_id)
@@ -306,18 +304,18 @@ def hub_files(source: Source) -> list[Download]:
 def _info(hub: Any, endpoint: str, repository: str) -> Any:
     try:
         info = hub.HfApi(endpoint=endpoint, token=False).model_info(repository, files_metadata=True, timeout=TIMEOUT_S)
-    except Exception as error:  # of HTTP, of JSON, of what a server left out: the library gives them no class in common
+    except Exception as error:  # HTTP, JSON and missing-field errors: the library has no common class
         if isinstance(error, MemoryError):
             raise
         reason = printable(str(error).split("\n")[0], 200) or type(error).__name__
-        raise DataError(f"{endpoint}/{repository}: the hub does not say what is there: {reason}") from error
+        raise DataError(f"{endpoint}/{repository}: the hub does not list its files: {reason}") from error
     if not isinstance(info.sha, str) or not info.sha.isalnum():
-        raise DataError(f"{endpoint}/{repository}: the hub names no revision; name another with --mirror")
+        raise DataError(f"{endpoint}/{repository}: the hub states no revision; give another hub with --mirror")
     return info
 
 
 def _names(source: Source, stated: Any) -> list[str]:
-    """What is to be brought: of each requirement the first alternative that is there whole, weights last."""
+    """The files to download: for each requirement the first alternative with all its files, weights last."""
     assert source.hub is not None
     chosen: list[str] = []
     for requirement in source.hub.files:
@@ -325,14 +323,14 @@ def _names(source: Source, stated: Any) -> list[str]:
         there = next((names for names in parts if all(name in stated for name in names)), None)
         if there is None:
             said = requirement.replace(" | ", " or ").replace(" + ", " and ")
-            raise DataError(f"hub repository {source.hub.repository}: has no {said}; name another with --mirror")
+            raise DataError(f"hub repository {source.hub.repository}: has no {said}; give another hub with --mirror")
         chosen += there
     settings = [*chosen[1:], *(name for name in source.hub.optional if name in stated)]
     return [*dict.fromkeys(name for name in settings if name != chosen[0]), chosen[0]]
 
 
 def hub_addresses(source: Source) -> list[str]:
-    """Where the files lie, as far as that can be said without asking which of the alternatives are there."""
+    """The addresses of the files, assuming the first alternatives, without contacting the hub."""
     assert source.hub is not None
     first = [name.strip() for requirement in source.hub.files for name in requirement.split("|")[0].split("+")]
     names = dict.fromkeys((*first, *source.hub.optional))

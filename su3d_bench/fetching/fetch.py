@@ -1,7 +1,7 @@
-"""What is asked for, what of it is missing here, and how it comes to its place: downloaded, checked, unpacked, moved.
+"""Fetch sources: plan what is missing, download, check, unpack and move it to its place.
 
-Below the root (of models, of data) lies ``.fetched``: what is under way, and the record. Into the place where datasets
-and models are looked for goes only what is whole: scenes and files of models are moved there by their names.
+The folder ``.fetched`` in the root (of models, of data) contains unfinished downloads and the record. Only complete
+scenes and model files are moved from there to the places where datasets and models are searched.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
 
-RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, as the archives' own names have them
+RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, named as in the archives
 FETCHED, UNPACKED = ".fetched", "unpacked"
 
 
 @dataclass(frozen=True)
 class FetchedFile:
-    """One file as it came; ``verified_against`` names what its content agreed with, empty where nobody states anything."""
+    """One downloaded file; ``verified_against`` names the checksums that its content matched, empty if none is known."""
 
     source: str
     name: str
@@ -53,7 +53,7 @@ class FetchedFile:
 
 
 class Record(BaseModel):
-    """``record.json`` below ``.fetched``: files by ``source/name``, and what an archive was unpacked to by source."""
+    """``record.json`` in ``.fetched``: files by ``source/name``, and the unpacked content of archives by source."""
 
     files: dict[str, FetchedFile] = {}
     unpacked: dict[str, tuple[str, ...]] = {}
@@ -64,16 +64,16 @@ def record_path(root: Path) -> Path:
 
 
 def read_record(root: Path) -> Record:
-    """What was brought below ``root``."""
+    """The record of files fetched into ``root``."""
     path = record_path(root)
     try:
         return Record.model_validate_json(file_bytes(path)) if path.exists() else Record()
     except (OSError, ValidationError) as error:
-        raise StoreError(f"{path}: is no record of what was fetched; move it away to begin another") from error
+        raise StoreError(f"{path}: is not a record of fetched files; move it away to start a new one") from error
 
 
 def write_arrival(root: Path, arrived: FetchedFile) -> None:
-    """Keep what is known of a file; the entry of an earlier one of its name is replaced."""
+    """Record a downloaded file; an earlier entry of the same name is replaced."""
     record = read_record(root)
     record.files[f"{arrived.source}/{arrived.name}"] = arrived
     write_json(record_path(root), record.model_dump())
@@ -81,7 +81,7 @@ def write_arrival(root: Path, arrived: FetchedFile) -> None:
 
 @dataclass(frozen=True)
 class Planned:
-    """A source that was asked for: its ``root`` here, and where it lies already, None where it is to be fetched."""
+    """A requested source: its local ``root``, and ``here``, where it exists already; None if it must be fetched."""
 
     source: Source
     root: Path
@@ -89,13 +89,13 @@ class Planned:
 
     @property
     def state(self) -> Path:
-        """Where it lies until it is whole."""
+        """The folder of the unfinished download."""
         return self.root / FETCHED / self.source.name
 
 
 @dataclass(frozen=True)
 class FetchResult:
-    """What came of a source: where it lies, its files as they came, and what is to be said of it."""
+    """A fetched source: its place, its downloaded files, and remarks for the user."""
 
     source: Source
     place: Path
@@ -104,14 +104,14 @@ class FetchResult:
 
 
 def plan_models(sources: Sources, names: Sequence[str], profile: str | None, root: Path) -> list[Planned]:
-    """The models ``names`` and those of a profile's experiments, each with where it lies already."""
+    """The plan for the models ``names`` and those of a profile, each with its existing place."""
     if profile is not None and profile not in PROFILE_MODELS:
         known = ", ".join(PROFILE_MODELS)
-        raise ConfigError(f"fetch models --for {profile}: that profile loads none of these models; known: {known}")
+        raise ConfigError(f"fetch models --for {profile}: no models for this profile; known: {known}")
     wanted = [*names, *(PROFILE_MODELS[profile] if profile is not None else ())]
     wanted += PAPERS_ENCODERS if profile == "paper" else ()
     if not wanted:
-        raise ConfigError("fetch models: name models, or the profile that needs them: --for paper")
+        raise ConfigError("fetch models: no models given; name models, or the profile that needs them: --for paper")
     return [_planned_model(sources.named(name, "models"), root) for name in dict.fromkeys(wanted)]
 
 
@@ -124,14 +124,14 @@ def _planned_model(source: Source, root: Path) -> Planned:
 
 
 def plan_replica(sources: Sources, names: Sequence[str], root: Path) -> list[Planned]:
-    """The two parts of Replica, or those of ``names`` (``frames``, ``meshes``)."""
+    """The plan for the two parts of Replica, or for those in ``names`` (``frames``, ``meshes``)."""
     wanted = [name if name.startswith("replica-") else f"replica-{name}" for name in names]
     chosen = [sources.named(name, "replica") for name in dict.fromkeys(wanted)] or sources.of("replica")
     return [Planned(source, root, _replica_here(source, root)) for source in chosen]
 
 
 def _replica_here(source: Source, root: Path) -> Path | None:
-    """Where it lies: all that an earlier call unpacked, or the official scenes, however they came."""
+    """The existing place: with everything that an earlier call unpacked, or with all official scenes of any origin."""
     place = root / (RENDER if source.archive == "zip" else ORIGINAL)
     names = read_record(root).unpacked.get(source.name, ())
     if names and all((place / name).exists() for name in names):
@@ -146,9 +146,9 @@ def _replica_here(source: Source, root: Path) -> Path | None:
 
 
 def fetch(planned: Planned, watch: Progress, n_retries: int = N_RETRIES, *, keep_archives: bool = False) -> FetchResult:
-    """Bring a source to its place; raises ``ConfigError``, ``DataError`` or ``StoreError`` where it does not get there.
+    """Fetch a source to its place; raises ``ConfigError``, ``DataError`` or ``StoreError`` on failure.
 
-    A second call goes on where the first one ended.
+    A second call resumes the first one.
     """
     assert planned.here is None
     source, root = planned.source, planned.root
@@ -159,7 +159,7 @@ def fetch(planned: Planned, watch: Progress, n_retries: int = N_RETRIES, *, keep
     with locked_state(planned):
         arrived = tuple(fetch_file(planned, file, watch, n_retries) for file in missing)
         left: list[str] = []
-        if source.archive is None:  # the weights last, without which nothing takes the folder for a model
+        if source.archive is None:  # the weights last: without them the folder is not recognised as a model
             move([planned.state / file.name for file in missing], place)
         else:
             place, left = _unpack(planned, watch)
@@ -169,12 +169,12 @@ def fetch(planned: Planned, watch: Progress, n_retries: int = N_RETRIES, *, keep
 
 @contextmanager
 def locked_state(planned: Planned) -> Iterator[None]:
-    """Keep other processes from fetching the same source meanwhile."""
+    """Lock the source against other processes in the block."""
     make_folder(planned.state)
     try:
         handle = hold_folder(planned.state)
     except BlockingIOError:
-        raise StoreError(f"{planned.state}: another process fetches it; wait for its end and try again") from None
+        raise StoreError(f"{planned.state}: another process is fetching it; wait until it ends and try again") from None
     except OSError as error:
         raise write_error(planned.state, error) from error
     try:
@@ -184,7 +184,7 @@ def locked_state(planned: Planned) -> Iterator[None]:
 
 
 def plain_files(source: Source) -> list[Download]:
-    """The files of a source that lie on servers of their own."""
+    """The files of a source with their own addresses, not from the hub."""
     return [
         Download(file.name, file.address, source.hosts, file.n_bytes, ExpectedContent(file.sha256, file.md5_prefix))
         for file in source.files
@@ -192,7 +192,7 @@ def plain_files(source: Source) -> list[Download]:
 
 
 def fetch_file(planned: Planned, wanted: Download, watch: Progress, n_retries: int = N_RETRIES) -> FetchedFile:
-    """Bring one file into the state of ``planned``, where it may lie already, and record it."""
+    """Download one file into the state folder of ``planned``, unless it exists there, and record it."""
     place, known = planned.state / wanted.name, None
     if not wanted.stated.is_published:
         first = read_record(planned.root).files.get(f"{planned.source.name}/{wanted.name}")
@@ -201,7 +201,7 @@ def fetch_file(planned: Planned, wanted: Download, watch: Progress, n_retries: i
     if place.is_file():
         sha256, wrong = checked(place, wanted.stated)
         if wrong is not None or wanted.n_bytes not in (None, place.stat().st_size):
-            raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch it again")
+            raise DataError(f"{place}: {wrong or 'its size is not the published one'}; delete it and fetch it again")
     else:
         try:
             sha256 = download_file(wanted, place, watch, n_retries)
@@ -217,7 +217,7 @@ def fetch_file(planned: Planned, wanted: Download, watch: Progress, n_retries: i
 
 
 def check_space(planned: Planned, files: Sequence[Download]) -> None:
-    """``StoreError`` where the disk lacks the room for what is still to come; a zip archive needs it twice."""
+    """Raise ``StoreError`` if the disk lacks space for the remaining download; a zip archive needs it twice."""
     sizes = [file.n_bytes for file in files]
     total = sum(size for size in sizes if size is not None) if None not in sizes else planned.source.n_bytes or 0
     places = [planned.state / file.name for file in files]
@@ -227,13 +227,13 @@ def check_space(planned: Planned, files: Sequence[Download]) -> None:
 
 
 def check_room(root: Path, needed: int, what: str) -> None:
-    """``StoreError`` where the disk of ``root`` has fewer than ``needed`` bytes free."""
+    """Raise ``StoreError`` if the disk of ``root`` has fewer than ``needed`` bytes free."""
     above = next(folder for folder in (root, *root.parents) if folder.is_dir())
     free = shutil.disk_usage(above).free
     if needed > free:
         raise StoreError(
-            f"{what}: takes {needed:,} bytes more below {root}, and its disk has {free:,} free; free some space, or "
-            "name a folder on another disk"
+            f"{what}: needs {needed:,} more bytes in {root}, but its disk has {free:,} free; free some space, or "
+            "use a folder on another disk"
         )
 
 
@@ -243,12 +243,12 @@ def _is_there(wanted: Download, place: Path) -> bool:
         return False
     _, wrong = checked(path, wanted.stated)
     if wrong is not None:
-        raise DataError(f"{path}: is another file than the published one: {wrong}; move it away and fetch again")
+        raise DataError(f"{path}: differs from the published file: {wrong}; move it away and fetch again")
     return True
 
 
 def move(paths: Sequence[Path], folder: Path) -> None:
-    """Move files and folders into ``folder``, one after another."""
+    """Move files and folders into ``folder``."""
     make_folder(folder)
     for path in paths:
         try:
@@ -258,7 +258,7 @@ def move(paths: Sequence[Path], folder: Path) -> None:
 
 
 def _unpack(planned: Planned, watch: Progress) -> tuple[Path, list[str]]:
-    """Unpack what lies in the state, and move each scene to its place; where the scenes lie, and what is to be said."""
+    """Unpack the archives in the state folder and move each scene to its place; returns the place and remarks."""
     source = planned.source
     archives = [planned.state / file.name for file in source.files]
     folder = planned.state / UNPACKED
@@ -272,30 +272,30 @@ def _unpack(planned: Planned, watch: Progress) -> tuple[Path, list[str]]:
         else:
             n, top = unpack_tar_gz(archives, folder, _annotated, watch), ORIGINAL
         if not n:
-            raise DataError(f"{archives[0]}: holds nothing of {source.what}; name the right one with --mirror")
+            raise DataError(f"{archives[0]}: contains nothing of {source.what}; give the right archive with --mirror")
     except DataError:
-        shutil.rmtree(folder, ignore_errors=True)  # what came out of a damaged archive is not to be kept
+        shutil.rmtree(folder, ignore_errors=True)  # do not keep the content of a damaged archive
         raise
     place = planned.root / top
     for above, _, _ in os.walk(folder):
         clear_unfinished(Path(above))
-    # Loose files (cam_params.json) first: with a scene's folder a dataset is there.
+    # Single files (cam_params.json) first: the dataset exists as soon as a scene's folder does.
     unpacked = sorted((folder / top).iterdir(), key=lambda path: (path.is_dir(), path.name))
     left = [path.name for path in unpacked if (place / path.name).exists()]
     move([path for path in unpacked if path.name not in left], place)
     record = read_record(planned.root)
     record.unpacked[source.name] = tuple(sorted(path.name for path in unpacked))
     write_json(record_path(planned.root), record.model_dump())
-    return place, [f"{name} was there already and is left as it is" for name in left]
+    return place, [f"{name} exists already and was not changed" for name in left]
 
 
 def _rendered(path: PurePosixPath) -> PurePosixPath | None:
-    """Where a member of NICE-SLAM's archive goes: everything of its folder, as datasets/replica reads it."""
+    """The target of a member of NICE-SLAM's archive: everything in its folder, as datasets/replica reads it."""
     return path if path.parts[:1] == (RENDER,) and not path.name.startswith(".") else None
 
 
 def _annotated(path: PurePosixPath) -> PurePosixPath | None:
-    """Where a member of the release goes: the two files of a scene that datasets/replica reads, whatever is above."""
+    """The target of a member of the release: the two files per scene that datasets/replica reads, in any parent."""
     if len(path.parts) < 3 or path.parts[-2] != "habitat" or path.name not in folders.ORIGINAL_FILES:
         return None
     return PurePosixPath(ORIGINAL, *path.parts[-3:])
@@ -307,8 +307,8 @@ def _remarks(planned: Planned, arrived: Sequence[FetchedFile]) -> tuple[str, ...
         first = unstated[0] + (f" and {len(unstated) - 1} more" if len(unstated) > 1 else "")
         remarks.append(
             f"the publisher states no checksum of {first}: that of this first download is recorded in "
-            f"{record_path(planned.root)}, and the next one is compared with it"
+            f"{record_path(planned.root)}, and later downloads are compared with it"
         )
     if planned.source.name == "ram-plus":
-        remarks.append("RAM++ runs through its own package or an export of it; see docs/methods/models.md")
+        remarks.append("RAM++ needs its own package or an exported model; see docs/methods/models.md")
     return tuple(remarks)

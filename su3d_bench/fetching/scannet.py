@@ -1,10 +1,10 @@
-"""Scans of ScanNet, which are given to whoever signed its terms: by their own script, or out of their own link.
+"""Fetch ScanNet scans, which require signed terms of use: with the user's own script or link.
 
-What the official script takes and writes was read in a public copy of it (download-scannet.py of
+The options and output of the official script are from a public copy (download-scannet.py of
 HungnotDumb/DenseMultimodalAlignment-DMA at 0240b72, in dataset/scannet): ``-o DIR --id SCAN --type SUFFIX`` writes
 ``DIR/scans/SCAN/SCAN+SUFFIX`` (``scans_test`` for scans of the test split), ``-o DIR --label_map`` the table of labels;
-it waits for a key by which the terms are confirmed, and passes over what is there. On the server recordings lie in
-``v1/scans``, all else in ``v2/scans`` and ``v2/tasks``.
+it waits for a key that confirms the terms, and skips existing files. On the server, recordings are in ``v1/scans``,
+everything else in ``v2/scans`` and ``v2/tasks``.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from su3d_bench.fetching.sources import Source, check_address
 
 RECORDING = ".sens"
 TEST_SUFFIXES = (".txt", "_vh_clean_2.ply", RECORDING)
-# What datasets/scannet reads of a scan, the recording last: it is what makes a folder a scan with frames.
+# The files of a scan that datasets/scannet reads, the recording last: it makes a folder a scan with frames.
 SUFFIXES = (".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.labels.ply", *TEST_SUFFIXES)
-KEYS = b"\n" * 8  # for the script's questions: the terms were confirmed here, and nothing is left out
+KEYS = b"\n" * 8  # answers to the script's questions: the terms were confirmed here, and nothing is excluded
 LAST_WORDS = 4000
 
 
 @dataclass(frozen=True)
 class Scans:
-    """Scans that were asked for, and those of their files that are not here; ``label_table`` whether it is wanted."""
+    """Requested scans with their missing files; ``label_table``: whether that table is missing too."""
 
     root: Path
     missing: dict[str, tuple[str, ...]]
@@ -60,7 +60,7 @@ class Scans:
 
 
 def plan_scans(names: Sequence[str], root: Path) -> Scans:
-    """What is missing of the scans or splits ``names``: ``paper`` (the default), ``train``, ``val``, ``test``."""
+    """The missing files of the scans or splits ``names``: ``paper`` (the default), ``train``, ``val``, ``test``."""
     scans: list[str] = []
     for name in names or ("paper",):
         if name in SPLITS:
@@ -70,7 +70,9 @@ def plan_scans(names: Sequence[str], root: Path) -> Scans:
         elif SCAN_NAME.fullmatch(name):
             scans.append(name)
         else:
-            raise ConfigError(f"fetch scannet: '{name}' is no scan{suggest(name, ('paper', *SPLITS, 'scene0000_00'))}")
+            raise ConfigError(
+                f"fetch scannet: unknown scan '{name}'{suggest(name, ('paper', *SPLITS, 'scene0000_00'))}"
+            )
     found = find_scans(root)
     missing = {}
     for scan in dict.fromkeys(scans):
@@ -86,18 +88,18 @@ def _suffixes(scan: str) -> tuple[str, ...]:
 
 
 def how_to_sign(source: Source) -> ConfigError:
-    """What to say to whoever has neither script nor link yet."""
+    """The error for users without script and link, with the steps to get one."""
     return ConfigError(
-        f"scannet: is given to whoever signed its terms: fill in {source.licence.address} and send it to "
-        f"{source.licence.signed_with}; then run this again with --script FILE, the download script that the answer "
-        "names, or with --from URL"
+        f"scannet: requires signed terms of use: fill in {source.licence.address} and send it to "
+        f"{source.licence.signed_with}; then run this again with --script FILE, the download script named in the "
+        "reply, or with --from URL"
     )
 
 
 def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Progress) -> FetchResult:
-    """Let the user's own script bring what is missing, a file at a time, and move each whole scan to its place."""
+    """Fetch missing files one by one with the user's own script, and move each complete scan to its place."""
     if not script.is_file():
-        raise ConfigError(f"--script {script}: there is no such file; name the script that ScanNet's answer led to")
+        raise ConfigError(f"--script {script}: no such file; give the script named in ScanNet's reply")
     n_done = itertools.count()
 
     def fetch_one(planned: Planned, scan: str, name: str) -> tuple[Path, FetchedFile]:
@@ -114,7 +116,7 @@ def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Progress)
 
 
 def fetch_from(source: Source, scans: Scans, address: str, watch: Progress, n_retries: int = N_RETRIES) -> FetchResult:
-    """Bring what is missing out of the user's own link, the folder in which ``v1`` and ``v2`` lie."""
+    """Fetch missing files from the user's own link, the folder that contains ``v1`` and ``v2``."""
     try:
         check_address(address)
     except ValueError as error:
@@ -132,7 +134,7 @@ def fetch_from(source: Source, scans: Scans, address: str, watch: Progress, n_re
 def _fetch(
     source: Source, scans: Scans, fetch_one: Callable[[Planned, str, str], tuple[Path, FetchedFile]]
 ) -> FetchResult:
-    """Bring each missing file and move each whole scan to its place, the table of labels (of no scan) at last."""
+    """Fetch each missing file and move each complete scan to its place, the table of labels (of no scan) last."""
     planned, files = Planned(source, scans.root), list[FetchedFile]()
     with locked_state(planned):
         for scan, names in (scans.missing | ({"": (TABLE_NAME,)} if scans.label_table else {})).items():
@@ -143,12 +145,12 @@ def _fetch(
 
 
 def _folder(scan: str) -> Path:
-    """Where a scan lies below the root, which is the folder of what belongs to no scan."""
+    """The folder of a scan, relative to the root; the root itself for files of no scan."""
     return Path("scans_test" if scan in split_scenes("test") else "scans", scan) if scan else Path()
 
 
 def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None:
-    """Run the script for one file, unless that is there; ``DataError`` with its last word where it did not write it."""
+    """Run the script for one file, unless it exists; ``DataError`` with the last output line if it was not written."""
     if result.is_file():
         return
     command = [sys.executable, str(script.absolute()), "-o", str(folder.absolute()), *words]
@@ -162,6 +164,6 @@ def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None
     if done.returncode != 0 or not result.is_file() or not result.stat().st_size:
         last = printable(lines[-1], 200) if lines else "nothing"
         raise DataError(
-            f"{script}: did not bring {result.name} (exit code {done.returncode}); it said last: {last}; run the same "
-            "command again to go on"
+            f"{script}: did not download {result.name} (exit code {done.returncode}); its last output: {last}; run the "
+            "same command again to resume"
         )

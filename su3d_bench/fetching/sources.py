@@ -1,4 +1,4 @@
-"""The table of what can be fetched: addresses, sizes, checksums, licences, and where each of these was read."""
+"""The table of sources: addresses, sizes, checksums and licences, each with its reference."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Bytes = Annotated[int, Field(ge=0, le=MAX_BYTES)]
 
 
 def check_address(address: str, hosts: Sequence[str] | None = None) -> None:
-    """``ValueError`` where bytes of ``address`` could be changed on their way, or its host is none of ``hosts``.
+    """Raise ``ValueError`` if ``address`` is not encrypted or otherwise unsafe, or its host is not in ``hosts``.
 
-    ``*.hf.co`` among ``hosts`` stands for every host whose name ends so.
+    ``*.hf.co`` in ``hosts`` matches every host with this ending.
 
     >>> check_address("http://127.0.0.1:8000/a"), check_address("https://us.cdn.hf.co/a", ["*.hf.co"])
     (None, None)
@@ -36,15 +36,15 @@ def check_address(address: str, hosts: Sequence[str] | None = None) -> None:
         parts = urlsplit(address)
         host, _ = parts.hostname or "", parts.port
     except ValueError as error:
-        raise ValueError(f"'{address}' is no address: {error}") from error
+        raise ValueError(f"'{address}' is not an address: {error}") from error
     if not host or parts.scheme not in ("http", "https") or not address.isascii() or not address.isprintable():
-        raise ValueError(f"'{address}' is no address; expected https://HOST/...")
+        raise ValueError(f"'{address}' is not an address; expected https://HOST/...")
     if parts.username or parts.password:
-        raise ValueError(f"an address with a name or password in it: '{host}'; leave them out")
+        raise ValueError(f"the address of '{host}' contains a user name or password; remove them")
     if parts.scheme == "http" and host not in LOOPBACK:
-        raise ValueError(f"'{address}' is not encrypted, so anybody on the way may change what comes; use https")
+        raise ValueError(f"'{address}' is not encrypted, so data may be changed in transit; use https")
     if hosts is not None and not any(host == name or (name[:2] == "*." and host.endswith(name[1:])) for name in hosts):
-        raise ValueError(f"host '{host}' is not named for it ({', '.join(hosts) or 'none is'})")
+        raise ValueError(f"host '{host}' is not allowed for it (allowed: {', '.join(hosts) or 'none'})")
 
 
 class _Strict(BaseModel):
@@ -52,7 +52,7 @@ class _Strict(BaseModel):
 
 
 class Licence(_Strict):
-    """The terms that come with a source; ``signed_with``: to whom they must be sent signed before anything is given."""
+    """The terms of a source; ``signed_with``: the address to which they must be sent signed before any access."""
 
     name: Text
     address: Text
@@ -61,7 +61,7 @@ class Licence(_Strict):
 
 
 class RemoteFile(_Strict):
-    """One file; ``md5_prefix`` is what a publisher writes of an MD5 into the file's name. Sizes in bytes."""
+    """One file; ``md5_prefix`` is the beginning of the MD5 in the published file name. Sizes in bytes."""
 
     name: FileName
     address: Text
@@ -78,7 +78,7 @@ class RemoteFile(_Strict):
 
 
 class HubWeights(_Strict):
-    """What is known beforehand of a file of weights on the hub; the hub itself states both when it is asked."""
+    """Known facts on a weights file on the hub; the hub also states size and checksum."""
 
     name: FileName
     n_bytes: Bytes
@@ -89,8 +89,8 @@ class HubWeights(_Strict):
 class HubFiles(_Strict):
     """Files of a repository on Hugging Face's hub.
 
-    An entry of ``files`` such as ``tokenizer.json | vocab.json + merges.txt`` names alternatives, the preferred one
-    first; ``optional`` are taken where they are there.
+    An entry of ``files`` such as ``tokenizer.json | vocab.json + merges.txt`` lists alternatives, the preferred one
+    first; ``optional`` files are downloaded if they exist.
     """
 
     repository: Annotated[str, Field(pattern=r"^[\w.-]+/[\w.-]+$")]
@@ -101,7 +101,7 @@ class HubFiles(_Strict):
 
 
 class SceneCounts(_Strict):
-    """How many scenes and frames a source of recordings has in all."""
+    """The total number of scenes and frames in a source of recordings."""
 
     n_scenes: Annotated[int, Field(ge=1, le=1_000_000)]
     n_frames: Annotated[int, Field(ge=1, le=MAX_BYTES)]
@@ -109,10 +109,10 @@ class SceneCounts(_Strict):
 
 
 class Source(_Strict):
-    """One thing that can be fetched: ``files`` or a repository of the ``hub``, from ``hosts`` alone.
+    """One source: ``files`` or a repository of the ``hub``, only from ``hosts``.
 
-    ``about_bytes`` is a size that was told in round numbers; ``archive`` what the files are, one after another;
-    ``scenes`` what recordings there are in it.
+    ``about_bytes`` is an approximate size; ``archive`` the form of the concatenated files; ``scenes`` the number of
+    recordings in it.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,59}$")]
@@ -126,7 +126,7 @@ class Source(_Strict):
     files: tuple[RemoteFile, ...] = ()
     hub: HubFiles | None = None
     scenes: SceneCounts | None = None
-    endpoint: Text | None = None  # of the hub, where a mirror was named
+    endpoint: Text | None = None  # of the hub, if a mirror is given
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
@@ -135,14 +135,14 @@ class Source(_Strict):
         if self.archive == "zip" and len(self.files) != 1:
             raise ValueError(f"{self.name}: a zip archive is one file")
         if len({file.name for file in self.files}) < len(self.files):
-            raise ValueError(f"{self.name}: two files of one name")
+            raise ValueError(f"{self.name}: two files with the same name")
         for file in self.files:
             check_address(file.address, self.hosts)
         return self
 
     @property
     def n_bytes(self) -> int | None:
-        """What is to be brought here, as far as it is known without asking; None where nobody states it."""
+        """The download size, if it is known without contacting a server; otherwise None."""
         if self.hub is not None:
             return sum(file.n_bytes for file in self.hub.weights) or self.about_bytes
         sizes = [file.n_bytes for file in self.files if file.n_bytes is not None]
@@ -150,14 +150,14 @@ class Source(_Strict):
 
     @property
     def is_exact(self) -> bool:
-        """Whether ``n_bytes`` holds to the byte."""
+        """Whether ``n_bytes`` is exact."""
         return bool(self.files) and all(file.n_bytes is not None for file in self.files)
 
     def mirrored(self, address: str) -> Source:
-        """The same files out of the folder ``address`` of another server; for the hub, another endpoint."""
+        """The same files from the folder ``address`` of another server; for the hub, another endpoint."""
         check_address(address)
         hosts = (urlsplit(address).hostname or "",)
-        if self.hub is not None:  # mirrors of the hub leave large files in its own store
+        if self.hub is not None:  # mirrors of the hub redirect to its own store for large files
             return self.model_copy(update={"endpoint": address.rstrip("/"), "hosts": (*self.hosts, *hosts)})
         files = tuple(file.model_copy(update={"address": f"{address.rstrip('/')}/{file.name}"}) for file in self.files)
         return self.model_copy(update={"files": files, "hosts": hosts})
@@ -170,13 +170,13 @@ class _Table(_Strict):
     def _names_differ(self) -> Self:
         names = [source.name for source in self.sources]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(f"two sources are called '{twice}'")
+            raise ValueError(f"two sources are named '{twice}'")
         return self
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Every source by its name."""
+    """All sources by name."""
 
     entries: dict[str, Source]
 
@@ -184,23 +184,23 @@ class Sources:
         return tuple(source for source in self.entries.values() if source.group == group)
 
     def named(self, name: str, group: Group | None = None) -> Source:
-        """The source called ``name``; ``ConfigError`` for any other name."""
+        """The source ``name``; ``ConfigError`` for an unknown name."""
         known = [source.name for source in self.entries.values() if group in (None, source.group)]
         if name not in known:
-            raise ConfigError(f"nothing called '{name}' can be fetched{suggest(name, known)}")
+            raise ConfigError(f"unknown source '{name}'{suggest(name, known)}")
         return self.entries[name]
 
 
 @cache
 def built_in() -> Sources:
-    """The table that comes with the program."""
+    """The built-in table."""
     return Sources({source.name: source for source in _read(TABLE)})
 
 
 def load_sources(own: Path | None = None, mirrors: Sequence[str] = ()) -> Sources:
-    """The table with the entries of the file ``own`` in place of those of their names, and ``NAME=URL`` of ``mirrors``.
+    """The built-in table with entries replaced by those of the file ``own`` and by ``NAME=URL`` of ``mirrors``.
 
-    Raises ``ConfigError`` for a name that is none of the table's, and for an address that cannot be trusted.
+    Raises ``ConfigError`` for an unknown name, and for an unsafe address.
     """
     sources = dict(built_in().entries)
     for source in _read(own) if own is not None else ():
@@ -230,4 +230,4 @@ def _read(path: Path) -> tuple[Source, ...]:
         where = ".".join(map(str, first["loc"]))
         raise ConfigError(f"{path}: {where}: {str(first['msg']).removeprefix('Value error, ')}") from error
     except ValueError as error:
-        raise ConfigError(f"{path}: is no TOML: {error}") from error
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error

@@ -1,1 +1,1 @@
-"""Files of others, read as plain data: nothing in them runs, no size in them is believed."""
+"""Readers for untrusted files: no code in them is executed, and their declared sizes are checked."""

@@ -1,4 +1,4 @@
-"""Arrays out of files, checked before they are used: masks as matrices and run lengths, points, features, scores."""
+"""Arrays from files, checked before use: masks as matrices and run lengths, points, features, scores."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 from su3d_bench.formats.images import read_bytes
 
-MAX_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
-MAX_MASKS = 100_000  # of one scene; methods give some hundred
-MAX_MEMBERS = 50_000_000  # points of all masks of a scene together; 600 of a large ScanNet scene have 10 million
+MAX_POINTS = 100_000_000  # points of one scene; the largest room scans have a few million
+MAX_MASKS = 100_000  # of one scene; methods return a few hundred
+MAX_MEMBERS = 50_000_000  # points of all masks of a scene; 600 masks of a large ScanNet scene have 10 million
 ROWS_AT_ONCE, VALUES_AT_ONCE = 1 << 16, 1 << 25  # 600 masks of 55,000 points
 NOT_EMPTY = -1
 
 
 def array_of(value: object, found: str, expected: str, kinds: str, *shape: int | None) -> NDArray[Any]:
-    """``value``, an array of these kinds of numbers and of this ``shape``: None is any size, ``NOT_EMPTY`` any but 0.
+    """``value``, an array of these dtype kinds and this ``shape``: None is any size, ``NOT_EMPTY`` any but 0.
 
-    ``found`` begins the message, up to what the value is.
+    ``found`` begins the error message, which continues with the value.
     """
     if isinstance(value, np.ndarray) and value.dtype.kind in kinds and _has_shape(value, shape):
         return value
@@ -37,13 +37,13 @@ def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
 
 
 def as_float32(values: NDArray[Any]) -> Float32Array:
-    """``values`` in single precision; what it cannot hold becomes infinite."""
+    """``values`` in single precision; values out of range become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return values.astype(np.float32)
 
 
 def check_memory(n_bytes: int, file: Path) -> None:
-    """Refuses what takes far more memory than its file: values that share what they hold cost the file a few bytes."""
+    """Raise ``PredictionError`` if the data takes far more memory than its file, for example with shared values."""
     try:
         Allowance(file.stat().st_size).spend(n_bytes)
     except UnpackingError as error:
@@ -51,7 +51,7 @@ def check_memory(n_bytes: int, file: Path) -> None:
 
 
 def matrix_of(value: object, where: str) -> NDArray[Any]:
-    """``value`` as a matrix of numbers of which none is NaN or infinite."""
+    """``value`` as a matrix of finite numbers."""
     matrix = array_of(value, f"{where}: the masks are", "a matrix of numbers", "biuf", None, None)
     if matrix.dtype.kind == "f" and not np.isfinite(matrix).all():
         raise PredictionError(f"{where}: the masks have values that are NaN or infinite; expected 0 and 1")
@@ -59,19 +59,19 @@ def matrix_of(value: object, where: str) -> NDArray[Any]:
 
 
 def check_sizes(n_points: int, n_masks: int, where: str) -> None:
-    """Refuses more points or masks than any scene has, which cost memory even where the masks are empty."""
+    """Raise ``PredictionError`` for more points or masks than any scene has; even empty masks take memory."""
     if n_points > MAX_POINTS or n_masks > MAX_MASKS:
         raise PredictionError(f"{where}: {n_masks} masks of {n_points} points; is it damaged?")
 
 
 def check_members(n: int, where: str) -> None:
-    """Refuses masks that hold more points together than those of any scene, before they take memory."""
+    """Raise ``PredictionError`` for masks with more points in total than in any scene, before allocating memory."""
     if n > MAX_MEMBERS:
-        raise PredictionError(f"{where}: the masks hold more than {MAX_MEMBERS} points together; is it damaged?")
+        raise PredictionError(f"{where}: the masks have more than {MAX_MEMBERS} points in total; is it damaged?")
 
 
 def column_members(matrix: NDArray[Any], where: str) -> list[Int32Array]:
-    """The rows that are not zero in each column of (points, masks)."""
+    """The nonzero rows of each column of a matrix (points, masks)."""
     n_points, n_masks = matrix.shape
     check_sizes(n_points, n_masks, where)
     parts: list[list[Int32Array]] = [[] for _ in range(n_masks)]
@@ -86,9 +86,9 @@ def column_members(matrix: NDArray[Any], where: str) -> list[Int32Array]:
 
 
 def run_members(length: object, counts: object, where: str) -> Int32Array:
-    """The points of a run-length mask: ``counts`` are start, length, start, length, ... with starts from 1 on.
+    """The points of a run-length mask: ``counts`` are start, length, start, length, ... with starts counted from 1.
 
-    ``counts`` may be a text, a list or an array, as the programs write it.
+    ``counts`` may be a string, a list or an array.
     """
     if isinstance(length, bool) or not isinstance(length, int | np.integer) or not 0 <= length <= MAX_POINTS:
         raise PredictionError(f"{where}: 'length' is {kind_of(length)}; expected the number of points")
@@ -99,7 +99,7 @@ def run_members(length: object, counts: object, where: str) -> Int32Array:
     if is_wrong.any():
         start, size = (int(number) for number in runs[int(np.argmax(is_wrong))])
         raise PredictionError(
-            f"{where}: run of {size} points from {start} on, of {length} points; runs count from 1 and ascend"
+            f"{where}: run of {size} points from {start} in {length} points; starts must count from 1 and ascend"
         )
     check_members(int(sizes.sum()), where)
     before = np.cumsum(sizes) - sizes
@@ -114,26 +114,26 @@ def _run_numbers(counts: object, where: str) -> NDArray[np.int64]:
         if isinstance(values, list | tuple) and all(type(value) is int for value in values):
             values = np.array(values, np.int64)
     except (ValueError, OverflowError) as error:
-        raise PredictionError(f"{where}: the runs are no numbers") from error
+        raise PredictionError(f"{where}: the runs are not numbers") from error
     numbers = values if isinstance(values, np.ndarray) else np.array("")
     if not numbers.size:
         return np.zeros(0, np.int64)
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) % 2:
         raise PredictionError(f"{where}: the runs are {kind_of(counts)}; expected pairs of start and length")
     if int(numbers.max()) > MAX_POINTS or int(numbers.min()) < 0:
-        raise PredictionError(f"{where}: a run with {int(numbers.max())}; is it damaged?")
+        raise PredictionError(f"{where}: run value {int(numbers.max())} is out of range; is it damaged?")
     return numbers.astype(np.int64)
 
 
 def scores_of(value: object, n_masks: int, where: str) -> Float64Array:
-    """Scores, one a mask."""
+    """Scores, one per mask."""
     found = f"{where}: {n_masks} masks, but the scores are"
-    return array_of(value, found, "one a mask", "biuf", n_masks).astype(np.float64)
+    return array_of(value, found, "one per mask", "biuf", n_masks).astype(np.float64)
 
 
 def classes_of(value: object, n_masks: int, where: str) -> Int32Array:
-    """Class numbers, one a mask, from an array of integers or of floats without a fraction."""
-    classes = array_of(value, f"{where}: {n_masks} masks, but the classes are", "one a mask", "iuf", n_masks)
+    """Class numbers, one per mask, from an array of integers or of integral floats."""
+    classes = array_of(value, f"{where}: {n_masks} masks, but the classes are", "one per mask", "iuf", n_masks)
     numbers = classes.astype(np.float64)
     is_whole = (np.abs(numbers) < 1 << 31) & (numbers == np.floor(numbers))
     if not is_whole.all():
@@ -143,15 +143,15 @@ def classes_of(value: object, n_masks: int, where: str) -> Int32Array:
 
 
 def kind_of(value: object) -> str:
-    """What a value out of a file is, for messages."""
+    """A description of a value from a file, for messages."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} {value.dtype.name}"
     return printable(str(value), 40) if isinstance(value, int | float) else f"a {type(value).__name__}"
 
 
 def checked_points(values: object, where: str) -> Float32Array:
-    """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
-    table = array_of(values, f"{where}: the points are", "three coordinates a point", "fiu", None, 3)
+    """Points (N, 3) as float32; ``PredictionError`` for another shape, and for values not finite in float32."""
+    table = array_of(values, f"{where}: the points are", "three coordinates per point", "fiu", None, 3)
     if len(table) > MAX_POINTS:
         raise PredictionError(f"{where}: has {len(table)} points; is it damaged?")
     points = as_float32(table)
@@ -163,14 +163,14 @@ def checked_points(values: object, where: str) -> Float32Array:
 
 
 def feature_table(value: object, file: Path) -> Float32Array:
-    """A row of features an object, as float32."""
-    found = f"{shown(file)}: holds"
-    table = array_of(value, found, "a row of features an object", "f", None, NOT_EMPTY)
+    """Features, one row per object, as float32."""
+    found = f"{shown(file)}: contains"
+    table = array_of(value, found, "one row of features per object", "f", None, NOT_EMPTY)
     return table if table.dtype == np.float32 else as_float32(table)
 
 
 def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, tuple[str, ...]]:
-    """``features`` with rows of zeros in place of rows that hold NaN or infinity, and how many rows have no feature."""
+    """``features`` with non-finite rows set to zero, and a remark on the number of rows without a feature."""
     is_bad = ~np.isfinite(features).all(axis=1)
     if is_bad.any():
         features = features.copy()
@@ -180,7 +180,7 @@ def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, 
 
 
 def half_rows(table: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
-    """``table`` (N, D) in float16, rows of zeros in place of those that hold what it cannot."""
+    """``table`` (N, D) in float16; rows with values out of range are set to zero."""
     with np.errstate(over="ignore", invalid="ignore"):
         rows = table.astype(np.float16)
     rows[~np.isfinite(rows).all(axis=1)] = 0
@@ -189,13 +189,13 @@ def half_rows(table: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
 
 IntegerArray = NDArray[np.integer[Any]]
 DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
-MAX_DIGITS = 18  # of a number that int64 surely holds
+MAX_DIGITS = 18  # of a number that certainly fits int64
 LIMIT, MAX_CHARACTERS = 1 << 62, 40  # of a number
-LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how the file begins that stands for one not fetched
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the beginning of a file that Git LFS has not fetched
 
 
 def integer_lines(content: bytes, where: str) -> IntegerArray:
-    """The integer of each line; the last line may lack its end. ``PredictionError`` names the first line without one.
+    """The integer of each line; the last newline is optional. ``PredictionError`` names the first line without one.
 
     >>> integer_lines(b"0\\n1\\n0\\n", "mask.txt").tolist()
     [0, 1, 0]
@@ -204,7 +204,7 @@ def integer_lines(content: bytes, where: str) -> IntegerArray:
     """
     if b"\r" in content:
         if b"\r" in content.replace(b"\r\n", b""):
-            return _any_numbers(content, where)  # a carriage return alone ends a line, too
+            return _any_numbers(content, where)  # a single carriage return also ends a line
         content = content.replace(b"\r\n", b"\n")
     if content and not content.endswith(b"\n"):
         content += b"\n"
@@ -215,7 +215,7 @@ def integer_lines(content: bytes, where: str) -> IntegerArray:
 
 
 def _single_digits(content: bytes) -> IntegerArray | None:
-    """The values where every line is one digit; None where one is not."""
+    """The values if every line is one digit; otherwise None."""
     if len(content) % 2:
         return None
     values = np.frombuffer(content, "<u2") - np.uint16(DIGIT_AND_NEWLINE)  # wraps around for everything else
@@ -223,8 +223,8 @@ def _single_digits(content: bytes) -> IntegerArray | None:
 
 
 def _plain_numbers(content: bytes) -> IntegerArray | None:
-    """The values where every line is some digits; None where one is not."""
-    digits = np.frombuffer(content, np.uint8) - np.uint8(ord("0"))  # wraps around: all else is above 9
+    """The values if every line consists of digits; otherwise None."""
+    digits = np.frombuffer(content, np.uint8) - np.uint8(ord("0"))  # wraps around: everything else is above 9
     ends = np.flatnonzero(digits == np.uint8(0x100 + ord("\n") - ord("0")))
     starts = np.concatenate([[0], ends[:-1] + 1])
     lengths = ends - starts
@@ -236,7 +236,7 @@ def _plain_numbers(content: bytes) -> IntegerArray | None:
 def _any_numbers(content: bytes, where: str) -> IntegerArray:
     """The values of lines with signs or blanks around them."""
     if content.startswith(LFS_POINTER):
-        raise PredictionError(f"{where}: is a pointer of Git LFS, not the file; run git lfs pull in its repository")
+        raise PredictionError(f"{where}: is a Git LFS pointer, not the file; run git lfs pull in its repository")
     values: list[int] = []
     for number, line in enumerate(content.splitlines(), 1):
         try:
@@ -245,15 +245,15 @@ def _any_numbers(content: bytes, where: str) -> IntegerArray:
             values.append(LIMIT)
         if not -LIMIT < values[-1] < LIMIT:
             text = printable(line[:MAX_CHARACTERS].decode("latin1"))
-            raise PredictionError(f"{where}:{number}: '{text}' is not an integer of 64 bits; expected one a line")
+            raise PredictionError(f"{where}:{number}: '{text}' is not a 64-bit integer; expected one per line")
     return np.array(values, np.int64)
 
 
-MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB
+MAX_TEXT_BYTES = 64 << 20  # a trajectory with 100 poses per second for one hour has 30 MB
 
 
 def read_text(path: Path, where: str, advice: str = "copy the file again", max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """The text of a file; ``where`` names it and begins each message."""
+    """The text of a file; ``where`` names it in messages."""
     try:
         return read_bytes(path, where, advice, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -261,7 +261,7 @@ def read_text(path: Path, where: str, advice: str = "copy the file again", max_b
 
 
 def parsed_json(content: bytes | str, where: str, advice: str = "copy the file again") -> Any:
-    """What a JSON file holds."""
+    """The value of a JSON text."""
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:

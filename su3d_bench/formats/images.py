@@ -1,7 +1,7 @@
-"""Colour and depth images out of the bytes of a file: JPEG, PNG, and the portable maps PPM and PGM.
+"""Colour and depth images from the bytes of a file: JPEG, PNG, PPM and PGM.
 
-What a header promises is checked before anything is decoded: a decoder would allocate it, and would speak of damage on
-stderr. Every fault is a ``DataError`` that begins with ``where``.
+The header is checked before anything is decoded: a decoder would allocate the declared size and report damage on
+stderr. Every problem is a ``DataError`` that begins with ``where``.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from su3d_bench.formats.ply import ListColumn
 UInt16Array = NDArray[np.uint16]
 Image = TypeVar("Image", UInt8Array, UInt16Array)
 Size = tuple[int, int]  # width, height in pixels
-MAX_PIXELS = 50_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
+MAX_PIXELS = 50_000_000  # no RGB-D camera has more; a damaged header may declare 4 billion
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_BYTES = 1 << 30  # of one file; 50 million pixels of 16-bit RGB take 300 MB
 JPEG_START, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
-JPEG_END_WITHIN = 1024  # some writers put a little behind the end of the image
-JPEG_SCAN, MAX_SCANS = b"\xff\xda", 100  # a progressive JPEG has some ten; each goes over the whole image
-JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that carry the size
+JPEG_END_WITHIN = 1024  # some writers add data after the end of the image
+JPEG_SCAN, MAX_SCANS = b"\xff\xda", 100  # a progressive JPEG has about ten; each covers the whole image
+JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that contain the size
 PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s")
 
 
 def read_bytes(path: Path, where: str, advice: str = "copy the file again", most: int = MAX_BYTES) -> bytes:
-    """The content of a file of at most ``most`` bytes; ``advice`` says what to do where it is missing."""
+    """The content of a file of at most ``most`` bytes; ``advice``: what to do if it is missing."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise DataError(f"{where} is not a file and cannot be read; {advice}")
         if status.st_size > most:
-            raise DataError(f"{where} has {status.st_size} bytes; no such file has more than {most >> 20} MiB")
+            raise DataError(f"{where} has {status.st_size} bytes; expected at most {most >> 20} MiB")
         return file_bytes(path)
     except FileNotFoundError as error:
         raise DataError(f"{where} is missing; {advice}") from error
@@ -50,7 +50,7 @@ def read_bytes(path: Path, where: str, advice: str = "copy the file again", most
 
 
 def image_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height as the header of a JPEG, PNG, PPM or PGM says them; None where there is no such header."""
+    """Width and height from the header of a JPEG, PNG, PPM or PGM; None if there is no such header."""
     if content.startswith(PNG_SIGNATURE) and content[12:16] == b"IHDR" and len(content) >= 33:
         return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
     if match := PORTABLE_MAP.match(content[:4096]):
@@ -65,7 +65,7 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
     if content.startswith(b"P6"):
         return _portable_map(content, b"P6", where)
     is_png = content.startswith(PNG_SIGNATURE)
-    # Some decoders fill what a cut JPEG lacks with grey.
+    # Some decoders fill the missing part of a truncated JPEG with grey.
     is_whole_jpeg = JPEG_END in content[-JPEG_END_WITHIN:] and content.count(JPEG_SCAN) <= MAX_SCANS
     is_whole = whole_png_header(content) is not None if is_png else is_whole_jpeg
     size, image = image_size(content), None
@@ -77,7 +77,7 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
 
 
 def decode_depth(content: bytes, where: str) -> UInt16Array:
-    """Values (H, W) uint16 of a PNG with one channel of 16 bits, or of a PGM of 16 bits (big-endian, as the format)."""
+    """Values (H, W) uint16 of a PNG with one 16-bit channel, or of a 16-bit PGM (big-endian by definition)."""
     import cv2
 
     if content.startswith(b"P5"):
@@ -92,7 +92,7 @@ def decode_depth(content: bytes, where: str) -> UInt16Array:
 
 
 def sized(decode: Callable[[bytes, str], Image], content: bytes, size: Size, where: str, reason: str) -> Image:
-    """What ``decode`` gives, which must have the width and height ``size``; ``reason`` says why in the message."""
+    """The result of ``decode``, which must have the width and height ``size``; ``reason`` explains why in messages."""
     _check_size(image_size(content), size, where, reason)
     image = decode(content, where)
     _check_size((image.shape[1], image.shape[0]), size, where, reason)
@@ -100,7 +100,7 @@ def sized(decode: Callable[[bytes, str], Image], content: bytes, size: Size, whe
 
 
 def _check_size(actual: Size | None, size: Size, where: str, reason: str) -> None:
-    """Nothing where no size was found: the decoder says what is wrong with such an image."""
+    """No error if no size was found: then the decoder reports what is wrong."""
     if actual is not None and actual != size:
         raise DataError(f"{where} is {actual[0]}x{actual[1]}; expected {size[0]}x{size[1]}, {reason}")
 
@@ -118,14 +118,14 @@ def _portable_map(content: bytes, magic: bytes, where: str) -> NDArray[Any]:
     if len(content) - match.end() != n * dtype.itemsize:
         raise DataError(
             f"{where}: {name} of {width}x{height} needs {n * dtype.itemsize} bytes of pixels, "
-            f"{len(content) - match.end()} are there; copy the file again"
+            f"but has {len(content) - match.end()}; copy the file again"
         )
     pixels = np.frombuffer(content, dtype, n, match.end()).astype(dtype.newbyteorder("="))
     return pixels.reshape((height, width, 3) if n_channels == 3 else (height, width))
 
 
 def decoded(content: bytes, flags: int) -> Any:
-    """The image, or None where it cannot be decoded."""
+    """The image, or None if it cannot be decoded."""
     import cv2
 
     try:
@@ -135,7 +135,7 @@ def decoded(content: bytes, flags: int) -> Any:
 
 
 def whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
-    """Width, height, bits and colour type of a PNG; None unless every chunk is there with its checksum right."""
+    """Width, height, bits and colour type of a PNG; None unless all chunks are present with correct checksums."""
     if not content.startswith(PNG_SIGNATURE) or len(content) < 33 or content[12:16] != b"IHDR":
         return None
     at, kind = len(PNG_SIGNATURE), b""
@@ -172,7 +172,7 @@ def jpeg_bytes(rgb: UInt8Array, quality: int = JPEG_QUALITY) -> bytes:
 
 
 def png_bytes(image: UInt8Array | UInt16Array) -> bytes:
-    """A PNG of an image (H, W, 3) RGB of 8 bits, or (H, W) grey of 16."""
+    """A PNG of an image (H, W, 3) 8-bit RGB, or (H, W) 16-bit grey."""
     import cv2
 
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
@@ -180,16 +180,16 @@ def png_bytes(image: UInt8Array | UInt16Array) -> bytes:
 
 
 def depth_in_units(depth_m: Float32Array, units_per_metre: float) -> UInt16Array:
-    """Depth in whole units, rounded; what 16 bits cannot hold becomes 0, no reading."""
+    """Depth in integer units, rounded; values beyond 16 bits become 0, which means no reading."""
     values = np.rint(depth_m.astype(np.float64) * units_per_metre)
     return np.where(values > np.iinfo(np.uint16).max, 0, values).astype(np.uint16)
 
 
 def list_column(rows: Int32Array) -> ListColumn:
-    """Rows (N, k) as lists of k in a PLY file."""
+    """Rows (N, k) as list properties of length k for a PLY file."""
     return ListColumn(np.arange(len(rows) + 1) * rows.shape[1], rows.reshape(-1).astype(np.int32))
 
 
 def triangles_of(quads: Int32Array) -> Int32Array:
-    """Quads (F, 4) as triangles (2F, 3), split from the first corner to the third as habitat does."""
+    """Quads (F, 4) as triangles (2F, 3), split from the first corner to the third, as in habitat."""
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""JSON files of other programs: one pydantic model for each format, and one form of message for what does not fit."""
+"""JSON files of other programs: one pydantic model per format, and one form of message for validation errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from su3d_bench.formats.images import read_bytes
 
 Content = TypeVar("Content")
 MAX_ID, MAX_SEGMENT_ID, MAX_M = 2**31 - 2, 2**32 - 1, 1e6
-# Numbers that some programs write as text.
+# Numbers that some programs write as strings.
 WholeNumber = Annotated[int, Strict(False), Field(ge=0, le=MAX_ID)]
 SegmentIds = Annotated[list[Annotated[int, Strict(False), Field(ge=0, le=MAX_SEGMENT_ID)]], FailFast()]
 Metres = Annotated[float, Field(ge=-MAX_M, le=MAX_M)]
@@ -22,13 +22,13 @@ Point = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 
 
 class FileModel(BaseModel):
-    """Base of models of files: the keys that are read, each of its type; others are passed over."""
+    """Base class of file models: strict types for the keys that are read; other keys are ignored."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 
 
 def checked_json(content: Any, where: str, kind: type[Content], advice: str = "copy the file again") -> Content:
-    """``content`` as a ``kind``; a ``DataError`` names the first place that does not fit."""
+    """``content`` as a ``kind``; raises ``DataError`` with the first invalid key."""
     try:
         value: Content = TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
@@ -41,5 +41,5 @@ def checked_json(content: Any, where: str, kind: type[Content], advice: str = "c
 
 
 def read_json(path: Path, where: str, kind: type[Content], advice: str = "copy the file again") -> Content:
-    """The content of a JSON file as a ``kind``; ``where`` names the file and begins each message."""
+    """The content of a JSON file as a ``kind``; ``where`` names the file in messages."""
     return checked_json(parsed_json(read_bytes(path, where, advice), where, advice), where, kind, advice)

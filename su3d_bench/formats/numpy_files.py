@@ -1,4 +1,4 @@
-"""Arrays of numbers and texts out of .npy and .npz files: sizes are compared with the file, nothing is unpickled."""
+"""Arrays of numbers and strings from .npy and .npz files: sizes are compared with the file, nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.core.files.atomic import Allowance, UnpackingError, allowance_of, member_bytes
 from su3d_bench.core.system.files import file_bytes, opened, regular
 
-# What zipfile raises on a damaged archive; RuntimeError is its answer to a compression that it does not know.
+# What zipfile raises for a damaged archive; RuntimeError for an unknown compression.
 ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)
-# What NumPy raises on a damaged header, which it parses as a Python literal.
+# What NumPy raises for a damaged header, which it parses as a Python literal.
 NPY_DAMAGE = (
     ValueError, TypeError, LookupError, SyntaxError, RecursionError, MemoryError, OverflowError, tokenize.TokenError,
 )  # fmt: skip
@@ -35,18 +35,18 @@ MAX_CHARACTER = 0x10FFFF  # the end of Unicode
 
 @contextmanager
 def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive at ``path``; damage, inside the block too, is a ``PredictionError`` that names the file."""
+    """The archive at ``path``; damage, also inside the block, is a ``PredictionError`` that names the file."""
     try:
         with opened(path) as stream, zipfile.ZipFile(stream) as archive:
             yield archive
     except OSError as error:
         raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or 'wrong offsets'}") from error
     except ZIP_DAMAGE as error:
-        raise PredictionError(f"{shown(path)}: not a whole zip archive; copy the file again") from error
+        raise PredictionError(f"{shown(path)}: not a complete zip archive; copy the file again") from error
 
 
 def read_member(archive: zipfile.ZipFile, name: str, where: str, allowance: Allowance) -> bytes:
-    """The content of a member, stored or deflated, whose checksum is right."""
+    """The content of a stored or deflated member with a correct checksum."""
     try:
         info = archive.getinfo(name)
         content = member_bytes(archive, info, allowance)
@@ -55,19 +55,19 @@ def read_member(archive: zipfile.ZipFile, name: str, where: str, allowance: Allo
     except UnpackingError as error:
         raise PredictionError(f"{where}: {error}") from error
     if len(content) != info.file_size:
-        raise PredictionError(f"{where}: '{printable(name, 80)}' is cut short; copy the file again")
+        raise PredictionError(f"{where}: '{printable(name, 80)}' is truncated; copy the file again")
     return content
 
 
 def plain_type(code: object) -> np.dtype[Any]:
-    """The dtype of a code such as ``<f2``; ``ValueError`` for everything but numbers and texts."""
+    """The dtype of a code such as ``<f2``; ``ValueError`` for everything except numbers and strings."""
     if not isinstance(code, str) or PLAIN_TYPE.fullmatch(code) is None:
         raise ValueError(f"an array of type {printable(str(code), 40)}")
     return np.dtype(code)
 
 
 def checked_shape(shape: object) -> tuple[int, ...]:
-    """``shape`` as a tuple of sizes; ``ValueError`` where it is none."""
+    """``shape`` as a tuple of sizes; ``ValueError`` if it is not one."""
     sizes = tuple(shape) if isinstance(shape, tuple | list) and len(shape) <= MAX_DIMENSIONS else (-1,)
     if not all(type(size) is int and 0 <= size < 1 << 62 for size in sizes):
         raise ValueError("an array without a valid shape")
@@ -75,26 +75,26 @@ def checked_shape(shape: object) -> tuple[int, ...]:
 
 
 def plain_array(content: bytes, kind: np.dtype[Any], shape: object, is_fortran: bool, start: int = 0) -> NDArray[Any]:
-    """The array over ``content`` from ``start`` to its end, read-only; ``ValueError`` where it has another size."""
+    """The read-only array over ``content`` from ``start`` to its end; ``ValueError`` if the size does not match."""
     sizes, n_bytes = checked_shape(shape), len(content) - start
     n = math.prod(sizes)
     if n * kind.itemsize != n_bytes or kind.itemsize == 0:
-        raise ValueError(f"an array of shape {sizes} {kind.name} needs {n * kind.itemsize} bytes, {n_bytes} are there")
+        raise ValueError(f"an array of shape {sizes} {kind.name} needs {n * kind.itemsize} bytes, but has {n_bytes}")
     array: NDArray[Any] = np.frombuffer(content, kind, n, start)
     if kind.kind == "U" and n and int(array.view(f"{kind.str[0]}u4").max()) > MAX_CHARACTER:
-        raise ValueError("a text with a character that does not exist")
+        raise ValueError("a string with an invalid character")
     return array.reshape(sizes, order="F" if is_fortran else "C")
 
 
 def read_npy(path: Path) -> NDArray[Any]:
-    """The array of a .npy file of numbers or texts."""
+    """The array of a .npy file of numbers or strings."""
     with reading(shown(path)):
         content = file_bytes(path)
     return npy_array(content, shown(path))
 
 
 def map_npy(path: Path) -> NDArray[Any]:
-    """The array of a .npy file, mapped and not read."""
+    """The array of a .npy file, memory-mapped."""
     try:
         array: NDArray[Any] = np.load(regular(path), mmap_mode="r", allow_pickle=False)
         plain_type(array.dtype.str)
@@ -103,24 +103,24 @@ def map_npy(path: Path) -> NDArray[Any]:
         raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
     except (*NPY_DAMAGE, EOFError) as error:
         raise PredictionError(
-            f"{shown(path)}: not a whole .npy array of plain numbers ({printable(str(error), 80)}); copy the file again"
+            f"{shown(path)}: not a complete .npy array of numbers ({printable(str(error), 80)}); copy the file again"
         ) from error
 
 
 def npy_array(content: bytes, where: str) -> NDArray[Any]:
-    """The array in the bytes of a .npy file, read-only over them."""
+    """The array in the bytes of a .npy file, a read-only view."""
     stream = io.BytesIO(content)
     try:
         shape, is_fortran, kind = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
         return plain_array(content, plain_type(kind.str), shape, is_fortran, stream.tell())
     except NPY_DAMAGE as error:
         raise PredictionError(
-            f"{where}: not a whole .npy array of plain numbers ({printable(str(error), 120)}); copy the file again"
+            f"{where}: not a complete .npy array of numbers ({printable(str(error), 120)}); copy the file again"
         ) from error
 
 
 def npz_names(path: Path) -> tuple[str, ...]:
-    """The names of the arrays in a .npz file; none where it is not a readable archive."""
+    """The names of the arrays in a .npz file; empty if it is not a readable archive."""
     try:
         with opened_zip(path) as archive:
             return _names(archive)
@@ -133,7 +133,7 @@ def _names(archive: zipfile.ZipFile) -> tuple[str, ...]:
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of a .npz file, those in ``names`` that are there, or all."""
+    """The arrays of a .npz file: all, or those in ``names`` that exist."""
     where = shown(path)
     with opened_zip(path) as archive:
         allowance = allowance_of(archive)

@@ -1,7 +1,7 @@
-"""The points of a PCD file, whatever its form (ascii, binary or binary_compressed), and such a file of points.
+"""Read the points of a PCD file (ascii, binary or binary_compressed), and write points as a PCD file.
 
-Source: The PCD file format, version 0.7, of the Point Cloud Library. What the header promises is compared with the
-size of the file before anything is allocated; what is compressed, Open3D unpacks.
+Source: The PCD file format, version 0.7, of the Point Cloud Library. The size in the header is compared with the size
+of the file before anything is allocated; Open3D unpacks compressed points.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from su3d_bench.core.files.atomic import Allowance, UnpackingError, write_bytes
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array
 
-MAX_HEADER_BYTES = 1 << 16  # headers have some hundred
-MAX_FIELDS, MAX_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values
-MAX_EXPANSION = 88  # of LZF: three bytes stand for at most 264
+MAX_HEADER_BYTES = 1 << 16  # headers have a few hundred bytes
+MAX_FIELDS, MAX_VALUES = 256, 1 << 16  # per point; histograms of features have a few hundred values
+MAX_EXPANSION = 88  # of LZF: three bytes encode at most 264
 FORMS = ("ascii", "binary", "binary_compressed")
 AXES = ("x", "y", "z")
 KEYS = {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
@@ -29,9 +29,9 @@ BLANKS = b"\0\r\n\t "
 
 
 def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
-    """Coordinates (N, 3) of every point, NaN where an organised cloud has none; ``where`` begins each message.
+    """Coordinates (N, 3) of every point, NaN for missing points of an organised cloud; ``where`` names the file.
 
-    Raises ``DataError`` for a file that is missing, damaged, cut short or longer than its header says.
+    Raises ``DataError`` for a file that is missing, damaged, truncated or longer than its header states.
     """
     where = where or str(path)
     with reading(where, DataError):
@@ -49,8 +49,8 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
         is_whole &= n_plain == n_bytes <= n_packed * MAX_EXPANSION
     if not is_whole:
         raise DataError(
-            f"{where}: the header promises {n} points of {row.itemsize} bytes, the file has {there} bytes of "
-            f"{form} behind it; it is cut short or damaged"
+            f"{where}: the header declares {n} points of {row.itemsize} bytes, but {there} bytes of {form} data "
+            "follow; the file is truncated or damaged"
         )
     if not n:
         return np.zeros((0, 3))
@@ -62,20 +62,20 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
 
 
 def _read_header(content: bytes, where: str) -> tuple[np.dtype[Any], int, str, int]:
-    """The type of a point, how many there are, in which form, and where they begin."""
+    """The dtype of a point, the number of points, their form, and the offset of the first."""
     lines: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in lines:
         end = content.find(b"\n", at, MAX_HEADER_BYTES)
         if end < 0:
-            raise DataError(f"{where}: not a PCD file, or cut short: its header has no line 'DATA'")
+            raise DataError(f"{where}: not a PCD file, or truncated: its header has no line 'DATA'")
         words = content[at:end].decode("ascii", "replace").split()
         at = end + 1
         if not words or words[0].startswith("#"):
             continue
         key = "FIELDS" if words[0] == "COLUMNS" else words[0]  # the name before version 0.7
         if key not in KEYS or lines.setdefault(key, words[1:]) != words[1:]:
-            raise DataError(f"{where}: header line '{printable(' '.join(words), 60)}' is wrong or stands there twice")
+            raise DataError(f"{where}: header line '{printable(' '.join(words), 60)}' is invalid or duplicated")
     names, sizes, kinds = (lines.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts, form = lines.get("COUNT", ["1"] * len(names)), " ".join(lines["DATA"])
     types = [kind + size for kind, size in zip(kinds, sizes, strict=False)]
@@ -93,8 +93,8 @@ def _read_header(content: bytes, where: str) -> tuple[np.dtype[Any], int, str, i
     )
     if not is_sound:
         raise DataError(
-            f"{where}: fields ({printable(', '.join(names), 120)}), sizes, counts, numbers of points or form of its "
-            "header do not fit; expected x, y and z, one value each"
+            f"{where}: fields ({printable(', '.join(names), 120)}), sizes, counts, number of points or form in its "
+            "header are inconsistent; expected x, y and z, one value each"
         )
     fields = [
         (name if name in AXES else f"field {k}", f"<{kind.lower()}", (int(count),) if count != "1" else ())
@@ -110,9 +110,9 @@ def _text_points(text: bytes, row: np.dtype[Any], n: int, where: str) -> Float64
     try:
         values: Float64Array = np.fromstring(text, np.float64, sep=" ") if text else np.zeros(0)
     except ValueError as error:
-        raise DataError(f"{where}: holds something that is no number among its points; the file is damaged") from error
+        raise DataError(f"{where}: a point value is not a number; the file is damaged") from error
     if len(values) != n_values:
-        raise DataError(f"{where}: the header promises {n_values} values, the file has {len(values)}; it is damaged")
+        raise DataError(f"{where}: the header declares {n_values} values, the file has {len(values)}; it is damaged")
     first = dict(zip(row.names, np.cumsum([0, *sizes]).tolist(), strict=False))
     return np.ascontiguousarray(values.reshape(n, sum(sizes))[:, [first[axis] for axis in AXES]])
 
@@ -133,7 +133,7 @@ def _unpacked_points(path: Path, n: int, n_plain: int, n_file: int, where: str) 
 
 
 def write_pcd_points(path: Path, points: Float32Array) -> None:
-    """Write points (N, 3) as a binary PCD file, whole or not at all."""
+    """Write points (N, 3) as a binary PCD file, atomically."""
     n = len(points)
     lines = ["# .PCD v0.7 - Point Cloud Data file format", "VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F"]
     lines += ["COUNT 1 1 1", f"WIDTH {n}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {n}", "DATA binary", ""]

@@ -1,10 +1,10 @@
 """Pickles of other programs, read as plain data: Python's unpickler with an allow-list of operations and names.
 
-Nothing that a file names is imported: names stand for constructors of ours. NumPy's own constructors are not among
-them, as a hostile state of a dtype makes them read raw bytes as pointers. The unpickler is the one of the standard
-library in Python, which can pass over the masks of every view in a map of ConceptGraphs, gigabytes that the one in C
-keeps. Memory and time are bounded here by the size of the file: a child process with limits would add 0.2 s to each
-file of a folder, and a copy of its arrays.
+Nothing that a file names is imported: names map to constructors in this module. NumPy's own constructors are not
+allowed, because a hostile dtype state makes them read raw bytes as pointers. The unpickler is the standard library's
+Python one, which can skip the masks of every view in a map of ConceptGraphs, gigabytes that the C one keeps in memory.
+Memory and time are bounded by the size of the file: a child process with limits would add 0.2 s per file, and a copy of
+its arrays.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ from su3d_bench.formats.numpy_files import plain_array, plain_type
 GZIP_START = b"\x1f\x8b"
 MAX_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
 INFLATED_A_READ, SKIPPED_A_READ = 1 << 17, 1 << 16
-# Reads of one byte, one or two an operation; a map of ConceptGraphs takes less than a million of them.
+# One-byte reads, one or two per operation; a map of ConceptGraphs takes less than a million.
 FREE_STEPS, MAX_STEPS = 2_000_000, 20_000_000
 MAX_NAME = 1024
-MIN_SKIPPED_BYTES = 1 << 12  # bytes; smaller payloads are kept
-MAX_KEY = 1 << 60  # larger integers can be crafted to share one place in a dict
-# Of protocols 2 to 5, what holds plain values; ``torch.save`` uses 2.
+MIN_SKIPPED_BYTES = 1 << 12  # bytes; smaller payloads are not skipped
+MAX_KEY = 1 << 60  # larger integers can be crafted to collide in a dict
+# The operations of protocols 2 to 5 for plain values; ``torch.save`` uses 2.
 OPERATIONS = (
     "PROTO MARK POP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE SHORT_BINUNICODE "
     "BINUNICODE8 EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST APPEND APPENDS EMPTY_DICT BINPUT LONG_BINPUT "
     "MEMOIZE GLOBAL STACK_GLOBAL REDUCE NEWOBJ BINPERSID STOP"
 )
 CODES = {getattr(pickle, name)[0] for name in OPERATIONS.split()}
-# What the unpickler and the constructors raise where a file is not what it should be.
+# What the unpickler and the constructors raise for an invalid file.
 DAMAGE = (pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, struct.error)
 
 
 class Opaque:
-    """The place of an object without meaning here (settings, paths, pictures): it takes any state and keeps none."""
+    """Placeholder for an object that is not needed (settings, paths, pictures): it ignores any state."""
 
     def __init__(self, *_args: object) -> None: ...
 
 
 class Skipped:
-    """The place of a payload that the caller asked not to keep."""
+    """Placeholder for a payload that the caller asked to skip."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class GlobalRef:
 
 @dataclass(eq=False)
 class Deferred:
-    """An object whose state follows, of which ``build`` makes its ``value``."""
+    """An object whose state follows; ``build`` makes its ``value`` from the state."""
 
     build: Callable[[Any], object]
     value: object = None
@@ -74,7 +74,7 @@ OBJECTS = GlobalRef("numpy.object_")  # NumPy's dtype of Python objects
 
 
 class Source:
-    """The bytes of a pickle, of which no more are read than the file can hold, in a bounded number of steps."""
+    """The bytes of a pickle, read within the size of the file and in a bounded number of steps."""
 
     def __init__(self, stream: BinaryIO, n_bytes: int, n_packed: int) -> None:
         self._stream, self._n_left, self._allowance = stream, n_bytes, Allowance(n_packed)
@@ -89,7 +89,7 @@ class Source:
             self.spend(n)
         self._n_left -= n
         if self._n_left < 0:
-            raise ValueError(f"it promises {n} bytes, {self._n_left + n} are left")
+            raise ValueError(f"it declares {n} bytes, but {self._n_left + n} are left")
         content = self._stream.read(n)
         if len(content) != n:
             raise EOFError
@@ -106,17 +106,17 @@ class Source:
             n -= n_read
 
     def spend(self, n: int) -> None:
-        """Count ``n`` bytes that are kept."""
+        """Count ``n`` bytes that are kept in memory."""
         self._allowance.spend(n)
 
 
-Names = Mapping[str, object]  # what stands for each name that a pickle may use
+Names = Mapping[str, object]  # the value of each name that a pickle may use
 
 
 class PlainUnpickler(pickle._Unpickler):
-    """``forget``: the keys of dicts below which payloads are passed over."""
+    """``forget``: dict keys below which payloads are skipped."""
 
-    # of the unpickler in the standard library
+    # attributes of the standard library's unpickler
     stack: list[Any]
     metastack: list[list[Any]]
     memo: dict[int, Any]
@@ -141,16 +141,16 @@ class PlainUnpickler(pickle._Unpickler):
         if full == "_codecs.encode":
             return self._encoded
         if full not in self._names:
-            raise ValueError(f"it asks for {printable(full, 60)}, which is no plain data")
+            raise ValueError(f"it uses {printable(full, 60)}, which is not plain data")
         return self._names[full]
 
     def persistent_load(self, pid: object) -> Any:
         if self._persistent is None:
-            raise ValueError("it refers to something outside of it")
+            raise ValueError("it refers to external data")
         return self._persistent(pid)
 
     def _encoded(self, text: object, encoding: object) -> object:
-        """Bytes as protocol 2 has them; a pickle may say so of one text many times."""
+        """Bytes as in protocol 2; a pickle may encode the same text many times."""
         if not isinstance(text, str) or encoding != "latin1":
             raise ValueError("an encoding other than latin1")
         self._source.spend(len(text))
@@ -164,7 +164,7 @@ class PlainUnpickler(pickle._Unpickler):
             self.append(self.read(n))
 
     def _is_forgotten(self) -> bool:
-        """Whether the value of a key to forget is under way: the key lies right below it on the stack."""
+        """Whether the value of a key to skip is being read: the key is directly below it on the stack."""
         frames = (*self.metastack[-16:], self.stack)
         return any(isinstance(one, str) and one in self._forget for frame in frames for one in frame[-2:])
 
@@ -175,22 +175,22 @@ class PlainUnpickler(pickle._Unpickler):
     def _set(self, items: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, dict):
-            raise ValueError("items of what is no dict")
+            raise ValueError("items of something that is not a dict")
         for key, value in zip(items[::2], items[1::2], strict=True):
             is_plain = key is None or isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < MAX_KEY)
             if not is_plain:
-                raise ValueError("a key that is no text or number")
+                raise ValueError("a key that is not a string or an integer")
             target[key] = value
 
     def _build(self) -> None:
         state, target = self.stack.pop(), self.stack[-1]
         if isinstance(target, Deferred):
             self.stack[-1] = target.value = target.build(state)
-        elif not isinstance(target, Opaque | dict):  # the state of an OrderedDict holds attributes, no items
-            raise ValueError("a state of what has none")
+        elif not isinstance(target, Opaque | dict):  # the state of an OrderedDict has attributes, not items
+            raise ValueError("a state for an object without one")
 
     dispatch |= {
-        pickle.FRAME[0]: lambda self: self.read(8),  # of use to who reads ahead
+        pickle.FRAME[0]: lambda self: self.read(8),  # only useful for reading ahead
         pickle.SHORT_BINBYTES[0]: lambda self: self._payload(self.read(1)[0]),
         pickle.BINBYTES[0]: lambda self: self._payload(int.from_bytes(self.read(4), "little")),
         pickle.BINBYTES8[0]: lambda self: self._payload(int.from_bytes(self.read(8), "little")),
@@ -204,7 +204,7 @@ class PlainUnpickler(pickle._Unpickler):
 
 
 def _array(payload: object, kind: object, shape: object, is_fortran: object) -> object:
-    """The array of a pickle; one of objects becomes a list, or its only item where it has no dimension."""
+    """The array of a pickle; an array of objects becomes a list, or its only item if it has no dimension."""
     if isinstance(payload, Skipped):
         return payload
     if kind == OBJECTS and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
@@ -222,7 +222,7 @@ def _reconstruct(kind: object, *_: object) -> Deferred:
 
 
 def _frombuffer(payload: object, kind: object, shape: object, order: object) -> object:
-    """How protocol 5 holds an array."""
+    """An array in protocol 5."""
     return _array(payload, kind, shape, isinstance(order, str) and order == "F")
 
 
@@ -243,8 +243,7 @@ def _scalar(kind: object, payload: object) -> object:
     return array if isinstance(array, Skipped) else array[()]
 
 
-# ConceptGraphs stores its settings beside the map, a tree of omegaconf nodes with paths in it, and pictures beside its
-# detections.
+# ConceptGraphs stores its settings with the map, as omegaconf nodes with paths, and pictures with its detections.
 _INERT = (
     *(f"omegaconf.base.{name}" for name in ("ContainerMetadata", "Metadata")),
     *("omegaconf.dictconfig.DictConfig", "omegaconf.listconfig.ListConfig", "PIL.Image.Image", "torch.device"),
@@ -270,7 +269,7 @@ NAMES: dict[str, object] = {
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _frombuffer,
-    # OrderedDict() and defaultdict(factory), whose items follow; bytes(), how protocol 2 holds no bytes
+    # OrderedDict() and defaultdict(factory), whose items follow; bytes(), for empty bytes in protocol 2
     "collections.OrderedDict": lambda *_: {},
     "collections.defaultdict": lambda *_: {},
     "builtins.bytes": lambda: b"",
@@ -278,10 +277,10 @@ NAMES: dict[str, object] = {
 
 
 def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
-    """The value of a pickle, plain or gzipped: plain values, lists, dicts, tuples, and read-only arrays.
+    """The value of a pickle, optionally gzipped: plain values, lists, dicts, tuples, and read-only arrays.
 
-    Payloads below a dict key in ``forget`` are passed over and leave ``Skipped`` in their place; settings and paths
-    become ``Opaque``. Raises ``PredictionError`` for whatever is damaged or not plain data.
+    Payloads below a dict key in ``forget`` are skipped and replaced by ``Skipped``; settings and paths become
+    ``Opaque``. Raises ``PredictionError`` for a file that is damaged or not plain data.
     """
     with reading(shown(path)), opened(path) as stream:
         is_gzip = stream.read(2) == GZIP_START
@@ -307,9 +306,9 @@ def unpickled(
     try:
         return PlainUnpickler(Source(stream, n_bytes, n_packed), names, persistent, forget).load()
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise PredictionError(f"{where}: the file is cut short or damaged; copy it again") from error
+        raise PredictionError(f"{where}: the file is truncated or damaged; copy it again") from error
     except (*DAMAGE, UnpackingError) as error:
-        reason = f"operation or place {error} is not known" if isinstance(error, KeyError) else str(error)
+        reason = f"unknown operation or key {error}" if isinstance(error, KeyError) else str(error)
         raise PredictionError(
-            f"{where}: not read as a pickle of plain data: {printable(reason or type(error).__name__, 200)}"
+            f"{where}: not a pickle of plain data: {printable(reason or type(error).__name__, 200)}"
         ) from error

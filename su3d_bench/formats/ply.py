@@ -1,10 +1,10 @@
-"""PLY files, read and written whole: every element and every property, lists of any length among them.
+"""Read and write PLY files completely: every element and every property, including lists of any length.
 
-Libraries that show meshes keep vertices and faces and drop the rest in silence, a face's ``object_id`` first of all;
-plyfile, which drops nothing, takes five times as long for faces of 3 and 4 corners (6.8 s against 1.3 s a million) and
-is under the GPL. Source: Greg Turk, The PLY Polygon File Format, 1994, version 1.0.
+Mesh libraries keep vertices and faces and silently drop the rest, such as a face's ``object_id``; plyfile, which drops
+nothing, takes five times as long for faces of 3 and 4 corners (6.8 s compared with 1.3 s per million) and is under the
+GPL. Source: Greg Turk, The PLY Polygon File Format, 1994, version 1.0.
 
-Nothing is allocated on the word of the header: what it promises is compared with the size of the file first.
+The sizes in the header are compared with the size of the file before anything is allocated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from su3d_bench.core.types import Int64Array
 
 AnyArray = NDArray[Any]
 FIRST_BYTES = 1 << 20
-MAX_HEADER_BYTES = 1 << 20  # headers have a few hundred
+MAX_HEADER_BYTES = 1 << 20  # headers have a few hundred bytes
 FORMATS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}  # and their byte orders
 NAMES_OF_TYPES = {
     "i1": ("char", "int8"), "u1": ("uchar", "uint8"), "i2": ("short", "int16"), "u2": ("ushort", "uint16"),
@@ -38,7 +38,7 @@ _COUNT = re.compile(r"\d{1,18}")
 
 @dataclass(frozen=True)
 class ListColumn:
-    """A list property: row i is ``values[indptr[i]:indptr[i + 1]]``; ``count_type`` is the type of its lengths."""
+    """A list property: row i is ``values[indptr[i]:indptr[i + 1]]``; ``count_type`` is the dtype of its lengths."""
 
     indptr: Int64Array
     values: AnyArray
@@ -66,18 +66,18 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyFile:
-    """The elements of a PLY file in their order."""
+    """The elements of a PLY file, in order."""
 
     elements: tuple[PlyElement, ...]
 
     def element(self, name: str) -> PlyElement | None:
-        """The element of that name, None where there is none."""
+        """The element of that name, or None."""
         return next((element for element in self.elements if element.name == name), None)
 
 
 @dataclass(frozen=True)
 class Property:
-    """A property as the header promises it; ``count_type`` None for a scalar."""
+    """A property declared in the header; ``count_type`` None for a scalar."""
 
     name: str
     type: np.dtype[Any]
@@ -86,7 +86,7 @@ class Property:
 
 @dataclass(frozen=True)
 class DeclaredElement:
-    """An element as the header promises it."""
+    """An element declared in the header."""
 
     name: str
     n_rows: int
@@ -100,14 +100,14 @@ class Header:
     n_bytes: int
 
     def stored(self, kind: np.dtype[Any]) -> np.dtype[Any]:
-        """How values of a type lie in the body: those of a text are parsed to float64, which holds them all."""
+        """The dtype of stored values of a type: text is parsed to float64, which can represent all types."""
         return np.dtype("<f8") if self.format == "ascii" else kind.newbyteorder(FORMATS[self.format])  # type: ignore[arg-type]
 
 
 def read_ply(path: Path, where: str | None = None) -> PlyFile:
-    """Every element of a PLY file, in native byte order; ``where`` (default: the path) begins each message.
+    """Every element of a PLY file, in native byte order; ``where`` (default: the path) names the file in messages.
 
-    Raises ``DataError`` for a file that is missing, damaged, cut short or longer than its header says.
+    Raises ``DataError`` for a file that is missing, damaged, truncated or longer than its header states.
     """
     where = where or str(path)
     with reading(where, DataError):
@@ -121,14 +121,14 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
         element, at = _read_element(promise, header, body, at, f"{where}: element '{printable(promise.name, 60)}'")
         elements.append(element)
     if body[at:].strip() if header.format != "ascii" else len(body) > at:
-        raise DataError(f"{where}: more stands after the last element that the header names; the file is damaged")
+        raise DataError(f"{where}: data follows after the last element in the header; the file is damaged")
     return PlyFile(tuple(elements))
 
 
 def first_rows(path: Path, name: str) -> Mapping[str, Column]:
-    """The columns of the first rows of the element ``name``, as many as the first megabyte of the file holds.
+    """The columns of the first rows of the element ``name``, as many as fit in the first megabyte of the file.
 
-    Empty where the element is not the first of a binary file or has lists. Raises as ``read_ply`` does.
+    Empty if the element is not the first of a binary file or has lists. Raises the same errors as ``read_ply``.
     """
     where = str(path)
     with reading(where, DataError), opened(path) as file:
@@ -146,7 +146,7 @@ def first_rows(path: Path, name: str) -> Mapping[str, Column]:
 
 
 def read_header(content: bytes, where: str) -> Header:
-    """What the lines up to ``end_header`` promise."""
+    """The header, up to ``end_header``."""
     if not re.match(rb"ply[ \t]*\r?\n", content):
         raise DataError(f"{where}: not a PLY file; its first line is not 'ply'")
     at, n_lines, format_name = content.index(b"\n") + 1, 1, ""
@@ -154,7 +154,7 @@ def read_header(content: bytes, where: str) -> Header:
     while True:
         end = content.find(b"\n", at, MAX_HEADER_BYTES)
         if end < 0:
-            raise DataError(f"{where}: its header has no 'end_header'; the file is cut short or damaged")
+            raise DataError(f"{where}: its header has no 'end_header'; the file is truncated or damaged")
         line = content[at:end].decode("utf-8", "replace").strip()
         at, n_lines = end + 1, n_lines + 1
         match line.split():
@@ -168,7 +168,7 @@ def read_header(content: bytes, where: str) -> Header:
                 elements.append(DeclaredElement(name, int(count), []))
             case ["property", *rest] if elements and (new := _property(rest)) is not None:
                 if any(new.name == known.name for known in elements[-1].properties):
-                    raise DataError(f"{where}:{n_lines}: property '{printable(new.name, 60)}' stands there twice")
+                    raise DataError(f"{where}:{n_lines}: property '{printable(new.name, 60)}' is declared twice")
                 elements[-1].properties.append(new)
             case _:
                 raise DataError(
@@ -191,19 +191,19 @@ def _property(words: Sequence[str]) -> Property | None:
 def _parsed(text: bytes, where: str) -> bytes:
     """The numbers of a text as float64."""
     try:
-        # numpy answers -1 for a text without values
+        # numpy returns -1 for a text without values
         return np.fromstring(text, np.float64, sep=" ").astype("<f8").tobytes() if text else b""
     except ValueError as error:
-        raise DataError(f"{where}: holds something that is not a number; the file is damaged") from error
+        raise DataError(f"{where}: a value is not a number; the file is damaged") from error
 
 
 def _read_element(promise: DeclaredElement, header: Header, body: bytes, at: int, where: str) -> tuple[PlyElement, int]:
-    """The element whose first row is at ``at``, and where the next element begins."""
+    """The element whose first row is at offset ``at``, and the offset of the next element."""
     smallest = sum(header.stored(column.count_type or column.type).itemsize for column in promise.properties)
     if promise.n_rows * smallest > len(body) - at:
         raise DataError(
-            f"{where}: the header promises {promise.n_rows} rows of {smallest} or more bytes, but only "
-            f"{len(body) - at} are left; the file is cut short or damaged"
+            f"{where}: the header declares {promise.n_rows} rows of at least {smallest} bytes, but only "
+            f"{len(body) - at} are left; the file is truncated or damaged"
         )
     if not promise.properties:
         return PlyElement(promise.name, promise.n_rows, {}), at
@@ -225,7 +225,7 @@ Found = tuple[
 
 
 def _equal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int) -> Found | None:
-    """The columns where each list is in all rows as long as in the first, None where one is not."""
+    """The columns if each list has the same length in all rows; otherwise None."""
     fields: list[tuple[str, Any, Any]] = []
     here = at
     for k, column in enumerate(promise.properties):
@@ -256,7 +256,7 @@ def _equal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int) 
 
 
 def _unequal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int, where: str) -> Found:
-    """The columns of rows that differ in size, found by going through them one by one."""
+    """The columns of rows that differ in size, read row by row."""
     length_at = _lengths_of_text(body) if header.format == "ascii" else _lengths_of_bytes(body, FORMATS[header.format])
     sizes = [header.stored(column.type).itemsize for column in promise.properties]
     lists: list[tuple[int, np.dtype[Any], int, array[int]]] = []  # bytes before it, type of its length, size, lengths
@@ -274,12 +274,12 @@ def _unequal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int
             at += gap + counts.itemsize
             length = length_at(at - counts.itemsize, counts) if at <= len(body) else -1
             if length < 0:
-                raise DataError(f"{where} row {row}: a list has no valid length; the file is cut short or damaged")
+                raise DataError(f"{where} row {row}: a list has no valid length; the file is truncated or damaged")
             lengths.append(length)
             at += length * size
         at += n_before
         if at > len(body):
-            raise DataError(f"{where} row {row} of {promise.n_rows}: the file ends in the middle of it; copy it again")
+            raise DataError(f"{where} row {row} of {promise.n_rows}: the file ends within this row; copy it again")
     places: Int64Array = np.array(starts, np.int64)
     content, of_lists = np.frombuffer(body, np.uint8), iter(lists)
     columns: list[tuple[Any, AnyArray]] = []
@@ -308,24 +308,24 @@ def _lengths_of_text(body: bytes) -> Callable[[int, np.dtype[Any]], int]:
 
 
 def _count(value: Any) -> int:
-    """A length; -1 where there is none."""
+    """``value`` as a list length; -1 if it is not one."""
     return int(value) if 0 <= value < 1 << 32 and value == int(value) else -1
 
 
 def _typed(values: AnyArray, kind: np.dtype[Any], where: str) -> AnyArray:
-    """``values`` in the type of their property, which must hold those of a text."""
+    """``values`` in the dtype of their property; raises ``DataError`` if values of a text do not fit."""
     with np.errstate(over="ignore", invalid="ignore"):
         typed: AnyArray = values.astype(kind)
         if values.dtype.itemsize == kind.itemsize and values.dtype.kind == kind.kind:
             return typed
         is_unfit = typed.astype(np.float64) != values if kind.kind != "f" else np.isinf(typed) & np.isfinite(values)
     if is_unfit.any():
-        raise DataError(f"{where} is {float(values[np.argmax(is_unfit)]):g}, which {kind} cannot hold")
+        raise DataError(f"{where} is {float(values[np.argmax(is_unfit)]):g}, which is out of range for {kind}")
     return typed
 
 
 def write_ply(path: Path, elements: Sequence[PlyElement]) -> None:
-    """Write ``elements`` in little-endian bytes, whole or not at all; the types of the arrays are those of the file."""
+    """Write ``elements`` in little-endian bytes, atomically, with the dtypes of the arrays."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for element in elements:
         lines.append(f"element {element.name} {element.n_rows}")
@@ -346,8 +346,8 @@ def _type_name(kind: np.dtype[Any]) -> str:
 
 
 def _rows(element: PlyElement) -> bytes:
-    """The rows of an element, each value scattered to its place."""
-    parts: list[tuple[Any, AnyArray]] = []  # how many values each row has, None for one; and these
+    """The rows of an element as bytes."""
+    parts: list[tuple[Any, AnyArray]] = []  # the number of values per row, None for one; and the values
     for column in element.columns.values():
         if isinstance(column, ListColumn):
             assert column.lengths.max(initial=0) <= np.iinfo(column.count_type).max, "lengths beyond the count type"

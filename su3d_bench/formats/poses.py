@@ -1,4 +1,4 @@
-"""Camera poses out of text: a row-major matrix of 16 numbers a line, as NICE-SLAM and gradslam write trajectories."""
+"""Camera poses from text: one row-major matrix of 16 numbers per line, as in NICE-SLAM and gradslam trajectories."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ MAX_LINE = 4096  # characters of a pose; 16 numbers have about 400
 
 
 def poses_of_lines(lines: Sequence[str], where: str, first_line: int = 1) -> Float64Array:
-    """Rigid camera-to-world poses (n, 4, 4), one a line; ``where`` names the file, ``first_line`` counts from 1."""
+    """Rigid camera-to-world poses (n, 4, 4), one per line; ``where`` names the file, ``first_line`` counts from 1."""
     poses = np.array([_values(line, f"{where} line {n}") for n, line in enumerate(lines, first_line)])
     poses = poses.reshape(-1, 4, 4)
     is_rigid = are_rigid(poses)
     if not is_rigid.all():
         raise DataError(
-            f"{where} line {first_line + int(np.argmin(is_rigid))}: not a rigid motion; expected a row-major "
+            f"{where} line {first_line + int(np.argmin(is_rigid))}: not a rigid transform; expected a row-major "
             "camera-to-world matrix with last row 0 0 0 1"
         )
     return poses
@@ -39,12 +39,12 @@ def _values(line: str, where: str) -> list[float]:
         raise DataError(f"{where}: {str(error)[:80]}; expected 16 numbers") from error
     for value, word in zip(values, words, strict=True):
         if not math.isfinite(value):
-            raise DataError(f"{where}: the pose holds '{word[:20]}'; mend the trajectory or leave the scene out")
+            raise DataError(f"{where}: the pose has '{word[:20]}'; fix the trajectory or exclude the scene")
     return values
 
 
 def read_first_pose(path: Path, where: str) -> Float32Array:
-    """The camera-to-world matrix (4, 4) in the first line, in single precision as the original reads it."""
+    """The camera-to-world matrix (4, 4) in the first line, in single precision as in the original."""
     try:
         with opened_text(path) as file:
             line = file.readline(MAX_LINE)
@@ -57,7 +57,7 @@ def read_first_pose(path: Path, where: str) -> Float32Array:
 
 
 def moved(points: Float32Array, camera_to_world: Float32Array) -> Float32Array:
-    """``points`` (N, 3) in the world, in single precision, the same bits on every machine."""
+    """``points`` (N, 3) in the world, in single precision, bit-identical on every machine."""
     rotation, translation = camera_to_world[:3, :3], camera_to_world[:3, 3]
     world = [
         points[:, 0] * rotation[row, 0]

@@ -1,7 +1,7 @@
-"""Files of ``torch.save`` read without torch: a pickle, and beside it the bytes of the storages behind its tensors.
+"""Read files of ``torch.save`` without torch: a pickle, and the bytes of the storages of its tensors.
 
-They are a zip archive of both, or, as torch wrote before 1.6 and some programs still ask for, a stream of pickles with
-the bytes behind. Source: ``_save`` and ``_legacy_save`` of pytorch's serialization.py.
+The file is a zip archive of both, or, in the form used before torch 1.6, a stream of pickles followed by the bytes.
+Source: ``_save`` and ``_legacy_save`` of pytorch's serialization.py.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from su3d_bench.formats.pickles import NAMES, GlobalRef, Names, unpickled
 
 ZIP_START = b"PK\x03\x04"
 PICKLE_NAME = "data.pkl"
-MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001  # what the first two pickles of the older form hold
+MAGIC, VERSION = 0x1950A86A20F9469CFC6C, 1001  # the first two pickles of the older form
 MAGIC_WITHIN = 64  # bytes
 SPARSE = "torch.sparse_coo"
-BFLOAT16 = "BFloat16"  # the upper halves of float32, which is what they become
+BFLOAT16 = "BFloat16"  # the upper halves of float32, to which it is converted
 UNTYPED = "torch.storage.UntypedStorage"
-# NumPy codes of torch's storages and dtypes; those that NumPy lacks (quantised ones) are refused by name.
+# NumPy codes of torch's storages and dtypes; types that NumPy lacks (quantised ones) are rejected by name.
 CODES = {
     "Bool": "b1", "Byte": "u1", "Char": "i1", "Short": "i2", "Int": "i4", "Long": "i8",
     "Half": "f2", "Float": "f4", "Double": "f8", BFLOAT16: "f4",
@@ -46,7 +46,7 @@ DTYPES = {"bool": "b1"} | {
 
 @dataclass(frozen=True)
 class SparseTensor:
-    """Values (nnz, ...) at ``indices`` (dimensions, nnz) of an array of ``shape``; equal places add up."""
+    """Values (nnz, ...) at ``indices`` (dimensions, nnz) of an array of ``shape``; duplicate indices are summed."""
 
     indices: NDArray[Any]
     values: NDArray[Any]
@@ -55,7 +55,7 @@ class SparseTensor:
 
 @dataclass(eq=False)
 class Storage:
-    """Bytes that tensors are views of, filled once the pickle is read; ``code`` None: the tensor says the type."""
+    """The bytes behind tensors, filled after the pickle is read; ``code`` None: the tensor states the dtype."""
 
     kind: str
     n: int
@@ -64,13 +64,13 @@ class Storage:
     content: UInt8Array
 
     def fill(self, stream: Any, where: str) -> None:
-        """Read the bytes out of ``stream``."""
+        """Read the bytes from ``stream``."""
         place = self.content.data[: self.n_bytes]
         n_read = 0
         while n_read < self.n_bytes and (n := stream.readinto(place[n_read : n_read + PIECE])):
             n_read += n
         if n_read < self.n_bytes:
-            raise PredictionError(f"{where}: the file is cut short or damaged; copy it again")
+            raise PredictionError(f"{where}: the file is truncated or damaged; copy it again")
         if self.kind == BFLOAT16:
             upper = self.content[: self.n_bytes].view("<u2").astype("<u4")
             self.content.view("<u4")[:] = upper << 16
@@ -78,18 +78,18 @@ class Storage:
 
 @dataclass
 class Storages:
-    """The storages that a pickle refers to, by their names, of which a file can hold ``n_left`` bytes."""
+    """The storages that a pickle refers to, by name; the file can hold ``n_left`` more bytes of them."""
 
     n_left: int
     found: dict[str, Storage] = field(default_factory=dict)
 
     def find(self, key: Any) -> Storage:
-        """That of ("storage", type, name, place, number of values)."""
+        """The storage of ("storage", type, name, device, number of values)."""
         word, kind, name, _, n, *views = key
         if word != "storage" or not isinstance(kind, GlobalRef) or not isinstance(name, str) or type(n) is not int:
-            raise ValueError("a reference that is no storage")
+            raise ValueError("a reference that is not a storage")
         if not re.fullmatch(r"\d{1,20}", name) or any(view is not None for view in views):
-            raise ValueError("a reference to a storage of a form that is not known")
+            raise ValueError("a reference to a storage in an unknown form")
         known = self.found.get(name)
         short = kind.name.removeprefix("torch.").removesuffix("Storage")
         if known is None:
@@ -120,14 +120,14 @@ def _tensor_with_type(*parts: Any) -> NDArray[Any]:
 def _view(storage: object, code: str | None, offset: Any, size: object, stride: object) -> NDArray[Any]:
     sizes, strides = checked_shape(size), checked_shape(stride)
     if not isinstance(storage, Storage) or code is None or type(offset) is not int or offset < 0:
-        raise ValueError("a tensor without a valid place in a storage")
+        raise ValueError("a tensor without a valid storage, dtype or offset")
     n, width = math.prod(sizes), int(code[-1])
     n_stored = len(storage.content) // width
     if not n:
         return np.zeros(sizes, code)
     end = offset + sum((n_items - 1) * step for n_items, step in zip(sizes, strides, strict=True)) + 1
     if end > n_stored or n > n_stored:
-        raise ValueError(f"a tensor of shape {sizes} lies beyond the {n_stored} values of its storage")
+        raise ValueError(f"a tensor of shape {sizes} exceeds the {n_stored} values of its storage")
     values = storage.content[: n_stored * width].view(f"<{code}")
     return np.lib.stride_tricks.as_strided(values[offset:], sizes, [step * width for step in strides], writeable=False)
 
@@ -160,7 +160,7 @@ TORCH_NAMES: Names = {
 def read_torch(path: Path, *, is_outline: bool = False) -> object:
     """The value that ``torch.save`` wrote: tensors as read-only arrays or ``SparseTensor``, containers, plain values.
 
-    In an outline the values of tensors are arbitrary. ``PredictionError`` for whatever is damaged or not plain data.
+    With ``is_outline`` the values of tensors are arbitrary. ``PredictionError`` for damaged or other than plain data.
     """
     where = shown(path)
     with reading(where), opened(path) as stream:
@@ -170,7 +170,7 @@ def read_torch(path: Path, *, is_outline: bool = False) -> object:
         if not start.startswith(ZIP_START) and MAGIC.to_bytes(10, "little") in start:
             return _read_stream(stream, n_bytes, where, is_outline)
     if not start.startswith(ZIP_START):
-        raise PredictionError(f"{where}: no file of torch.save; copy it again")
+        raise PredictionError(f"{where}: not a file of torch.save; copy it again")
     with opened_zip(path) as archive:
         names = [name for name in archive.namelist() if name.split("/")[1:] == [PICKLE_NAME]]
         if len(names) != 1:
@@ -178,23 +178,23 @@ def read_torch(path: Path, *, is_outline: bool = False) -> object:
         folder, allowance, storages = names[0].removesuffix(PICKLE_NAME), allowance_of(archive), Storages(n_bytes)
         order = f"{folder}byteorder"
         if order in archive.namelist() and read_member(archive, order, where, allowance) != b"little":
-            raise PredictionError(f"{where}: is of another byte order; save it on a little-endian machine")
+            raise PredictionError(f"{where}: is not little-endian; save it on a little-endian machine")
         content = read_member(archive, names[0], where, allowance)
         value = unpickled(io.BytesIO(content), len(content), n_bytes, where, TORCH_NAMES, storages.find)
         for name, storage in {} if is_outline else storages.found.items():
             info = archive.NameToInfo.get(f"{folder}data/{name}")
             if info is None or info.file_size != storage.n_bytes or info.compress_type != zipfile.ZIP_STORED:
                 raise PredictionError(
-                    f"{where}: storage {name} is missing, packed or of another size; copy the file again"
+                    f"{where}: storage {name} is missing, compressed or of another size; copy the file again"
                 )
             with archive.open(info) as member:
                 storage.fill(member, where)
-                member.read(1)  # which checks the checksum
+                member.read(1)  # this checks the checksum
         return value
 
 
 def _read_stream(stream: BinaryIO, n_bytes: int, where: str, is_outline: bool) -> object:
-    """The value of the older form: magic number, version, system, value, names of storages, and these."""
+    """The value of the older form: magic number, version, system, value, names of storages, storages."""
     storages = Storages(n_bytes)
 
     def part(names: Names = NAMES) -> Any:
@@ -202,22 +202,22 @@ def _read_stream(stream: BinaryIO, n_bytes: int, where: str, is_outline: bool) -
 
     magic, version, system = part(), part(), part()
     if magic != MAGIC or version != VERSION or not isinstance(system, dict) or not system.get("little_endian", True):
-        raise PredictionError(f"{where}: is of a form of torch.save that is not known; save it with a later torch")
+        raise PredictionError(f"{where}: is in an unknown form of torch.save; save it with a later torch")
     value, keys = part(TORCH_NAMES), part()
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys) or {*keys} != {*storages.found}:
-        raise PredictionError(f"{where}: does not name each storage once; copy the file again")
+        raise PredictionError(f"{where}: does not list each storage once; copy the file again")
     for key in () if is_outline else keys:
         storage = storages.found[key]
         if int.from_bytes(stream.read(8), "little") != storage.n:
-            raise PredictionError(f"{where}: storage {key} is of another size; copy the file again")
+            raise PredictionError(f"{where}: storage {key} has another size; copy the file again")
         storage.fill(stream, where)
     if not is_outline and stream.read(1):
-        raise PredictionError(f"{where}: has more bytes behind its end; copy the file again")
+        raise PredictionError(f"{where}: has extra bytes at its end; copy the file again")
     return value
 
 
 def check_stored(path: Path) -> None:
-    """Refuses an archive of torch.save that is compressed: torch writes none, and would unpack any."""
+    """Raise ``PredictionError`` for a compressed archive of torch.save: torch writes none, but would unpack any."""
     with reading(shown(path)), opened(path) as stream:
         is_zip = stream.read(4) == ZIP_START
     if is_zip:

@@ -1,1 +1,1 @@
-"""Geometry, statistics, clusters, grids of cells and compiled loops that several folders use."""
+"""Shared numerics: spatial relations, statistics, clustering and compiled kernels."""

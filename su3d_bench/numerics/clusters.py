@@ -1,12 +1,12 @@
-"""DBSCAN on a grid, compiled: the labels of scikit-learn's or Open3D's.
+"""Compiled DBSCAN on a grid, with the same labels as scikit-learn or Open3D.
 
 scikit-learn 1.9 gives the same labels and takes 15 times as long (20,000 points of four planes, eps 5 cm: 0.16 s and
-0.01 s), for it keeps every neighbour.
+0.01 s), because it stores all neighbours.
 
-Cells are a little smaller than eps / sqrt(3), so that points of one cell are always within eps of each other: the core
-points of a cell are one cluster, and clusters grow from cell to cell. What comes out does not depend on the order of
-the work: a cluster is a component of core points, clusters are numbered by their first core point, and a border point
-belongs to the first cluster that has a core point within eps of it.
+Cells are slightly smaller than eps / sqrt(3), so that points in one cell are always within eps of each other: the core
+points of a cell are one cluster, and clusters grow from cell to cell. The result does not depend on the order of
+processing: a cluster is a connected component of core points, clusters are numbered by their first core point, and a
+border point belongs to the first cluster that has a core point within eps of it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from su3d_bench.core.compiled import njit
 from su3d_bench.core.types import Float64Array, Int64Array
 
 NOISE = ABSENT = -1
-# Of 5x5x5 cells around one, the nearest first; a point within eps lies in one of them.
+# The 5x5x5 cells around one, nearest first; every point within eps lies in one of them.
 _STEPS = np.array(
     sorted(np.ndindex(5, 5, 5), key=lambda step: sum(max(abs(axis - 2) - 1, 0) ** 2 for axis in step)), np.int64
 )
@@ -27,9 +27,9 @@ STEPS = _STEPS[np.argsort((_STEPS != 2).any(axis=1), kind="stable")] - 2
 
 
 def density_clusters(points: Float64Array, eps: float, min_points: int, *, holds_eps: bool = True) -> Int64Array:
-    """The cluster (N,) of each of ``points`` (N, 3): 0, 1, ... or NOISE; a point is near to itself.
+    """The cluster (N,) of each of ``points`` (N, 3): 0, 1, ... or NOISE; a point is its own neighbour.
 
-    ``holds_eps``: a point at eps itself is near, as in scikit-learn; to Open3D it is not.
+    ``holds_eps``: a point at distance eps is a neighbour, as in scikit-learn; in Open3D it is not.
     """
     labels = np.full(len(points), NOISE, np.int64)
     if len(points):
@@ -41,9 +41,10 @@ def density_clusters(points: Float64Array, eps: float, min_points: int, *, holds
 
 @njit(cache=True, inline="always")
 def slot_of(table, keys, x, y, z):  # type: ignore[no-untyped-def]
-    """Where the cell is in the hash ``table``, or the free slot where it belongs.
+    """The slot of the cell in the hash ``table``, or the free slot for it.
 
-    ``table`` holds rows of ``keys`` (N, 3), the cells' coordinates, or ABSENT; its length is a power of two above N.
+    ``table`` has row numbers of ``keys`` (N, 3), the cells' coordinates, or ABSENT; its length is a power of two above
+    N.
     """
     size = np.uint64(len(table) - 1)
     mixed = (
@@ -61,7 +62,7 @@ def slot_of(table, keys, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _fill_cells(points, eps, table, keys, cell_of):  # type: ignore[no-untyped-def]
-    """Writes the cell of each point and each cell's coordinates; gives the number of cells."""
+    """Write the cell of each point and each cell's coordinates; returns the number of cells."""
     side = eps / math.sqrt(3.0) * (1.0 - 1e-6)
     lowest = np.array([points[:, 0].min(), points[:, 1].min(), points[:, 2].min()])
     n_cells = 0
@@ -80,7 +81,7 @@ def _fill_cells(points, eps, table, keys, cell_of):  # type: ignore[no-untyped-d
 
 @njit(cache=True)
 def _by_cell(points, cell_of, n_cells):  # type: ignore[no-untyped-def]
-    """Where each cell's points begin, the points cell by cell, and the index of each of those."""
+    """The start offset of each cell's points, the points sorted by cell, and their original indices."""
     starts = np.zeros(n_cells + 1, np.int64)
     for cell in cell_of:
         starts[cell + 1] += 1
@@ -103,7 +104,7 @@ def _is_near(points, i, j, most_squared):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _neighbours(cell, table, keys, steps, around):  # type: ignore[no-untyped-def]
-    """Writes the cells around ``cell`` that hold points, itself first; gives their number."""
+    """Write the non-empty cells around ``cell``, itself first; returns their number."""
     n = 0
     for s in range(len(steps)):
         cx, cy, cz = keys[cell, 0] + steps[s, 0], keys[cell, 1] + steps[s, 1], keys[cell, 2] + steps[s, 2]
@@ -116,7 +117,7 @@ def _neighbours(cell, table, keys, steps, around):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _has_neighbours(i, points, starts, around, n_around, most_squared, min_points):  # type: ignore[no-untyped-def]
-    """Whether at least ``min_points`` points, itself included, are near to point ``i`` of ``around[0]``."""
+    """Whether point ``i`` of ``around[0]`` has at least ``min_points`` neighbours, including itself."""
     n = starts[around[0] + 1] - starts[around[0]]
     for a in range(1, n_around):
         if n >= min_points:
@@ -136,7 +137,7 @@ def root_of(parents, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _touch(points, is_core, first, second, starts, most_squared):  # type: ignore[no-untyped-def]
-    """Whether a core point of one cell is near to one of the other."""
+    """Whether a core point of one cell is a neighbour of one of the other."""
     for i in range(starts[first], starts[first + 1]):
         if is_core[i]:
             for j in range(starts[second], starts[second + 1]):
@@ -147,7 +148,7 @@ def _touch(points, is_core, first, second, starts, most_squared):  # type: ignor
 
 @njit(cache=True)
 def _first_cluster(i, points, is_core, starts, around, n_around, number_of, most_squared):  # type: ignore[no-untyped-def]
-    """The lowest cluster with a core point near to point ``i``, or NOISE."""
+    """The lowest cluster number with a core point that is a neighbour of point ``i``, or NOISE."""
     first = NOISE
     for a in range(n_around):
         number = number_of[around[a]]
@@ -162,10 +163,10 @@ def _first_cluster(i, points, is_core, starts, around, n_around, number_of, most
 
 @njit(cache=True, nogil=True)
 def dbscan(points, eps, most_squared, min_points, steps, labels):  # type: ignore[no-untyped-def]
-    """Writes the cluster of each of at least one points (N, 3), 0, 1, ... or NOISE, into ``labels``.
+    """Write the cluster of each of ``points`` (N >= 1, 3), 0, 1, ... or NOISE, into ``labels``.
 
-    Points are near up to the squared distance ``most_squared``: eps * eps, or the number before it where a point at eps
-    itself is too far.
+    Points are neighbours up to the squared distance ``most_squared``: eps * eps, or the next smaller float to exclude a
+    distance of exactly eps.
     """
     n_slots = 4
     while n_slots < 2 * len(points):
@@ -201,7 +202,7 @@ def dbscan(points, eps, most_squared, min_points, steps, labels):  # type: ignor
 
 @njit(cache=True)
 def _numbered(order, cell_of, is_core, starts, parents, n_cells):  # type: ignore[no-untyped-def]
-    """The cluster of each cell's core points, NOISE where it has none; numbered by the first core point of each."""
+    """The cluster of each cell's core points, NOISE without core points; numbered by their first core point."""
     core_in_order = np.zeros(len(order), np.bool_)
     for i in range(len(order)):
         core_in_order[order[i]] = is_core[i]

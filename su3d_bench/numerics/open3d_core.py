@@ -11,18 +11,17 @@ from threading import Lock
 from typing import Any
 
 NAME = "open3d.cpu.pybind"
-# Set by the package itself before it loads the module: torch may have brought an OpenMP of its own.
+# Set by the package itself before it loads the module: torch may have loaded its own OpenMP.
 ENVIRONMENT = {"KMP_DUPLICATE_LIB_OK": "True", "TCM_ENABLE": "1"}
 _LOCK = Lock()
 
 
 def compiled_open3d() -> Any:
-    """What ``import open3d`` gives for geometry and ray casting (``core``, ``geometry``, ``t``, ``utility``).
+    """The part of ``open3d`` for geometry and ray casting (``core``, ``geometry``, ``t``, ``utility``).
 
-    The package imports Dash, pandas and scikit-learn for its viewers: 2.5 s of processor time, 0.6 s without, in each
-    process of a run. Imported later all
-    the same, it takes up the module loaded here. Where a GPU may be, the package itself is imported: it has another
-    compiled module for those, and the two do not go together.
+    The package imports Dash, pandas and scikit-learn for its viewers: 2.5 s of CPU time, 0.6 s without, in each process
+    of a run. If the package is imported later, it uses the module loaded here. On a machine that may have a GPU the
+    package itself is imported: it has another compiled module for GPUs, and the two cannot be mixed.
     """
     with _LOCK:
         if NAME in sys.modules and "open3d" not in sys.modules:
@@ -36,7 +35,7 @@ def compiled_open3d() -> Any:
         module = module_from_spec(spec)
         try:
             spec.loader.exec_module(module)
-        except ImportError:  # a library that the package loads first; its own message is the better one
+        except ImportError:  # a library that the package loads first; its own message is better
             return importlib.import_module("open3d")
         sys.modules[NAME] = module
         return module
@@ -48,7 +47,7 @@ def _may_have_gpu() -> bool:
 
 
 def _module_file() -> Path | None:
-    """The compiled module on Linux, the one system on which loading it alone was tried."""
+    """The file of the compiled module; only on Linux, where loading it alone is tested."""
     package = find_spec("open3d") if sys.platform == "linux" else None
     folders = [] if package is None else package.submodule_search_locations or []
     return next((file for folder in folders for file in sorted(Path(folder, "cpu").glob("pybind*.so"))), None)

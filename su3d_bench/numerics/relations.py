@@ -1,9 +1,9 @@
-"""How the things of a scene lie to one another: on, in, under, above, next to, near, between.
+"""Spatial relations between the objects of a scene: on, in, under, above, next to, near, between.
 
-One code for the truth of the built-in rooms, for questions made from any ground truth and for what is answered of a
-map. It sees axis-aligned boxes, z up, in metres; docs/questions/relations.md has a picture and the reason of every
-rule. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike, so that
-"on" and "in" take which things are containers.
+The same code is used for the ground truth of the built-in rooms, for questions generated from any ground truth and for
+answers from a map. It uses axis-aligned boxes, z up, in metres; docs/questions/relations.md has a picture and the
+reason for every rule. Boxes contain less information than surfaces: an object on an inner board of a shelf and one in a
+basket look alike, so "on" and "in" depend on which objects are containers.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ Point = Float64Array | tuple[float, ...]
 Relation = Literal["on", "under", "in", "above", "next to", "near"]
 RELATIONS: tuple[Relation, ...] = ("on", "under", "in", "above", "next to", "near")
 
-# Every threshold is ours, for the field has no agreed ones; the reasons stand in docs/questions/relations.md.
-CONTACT_M = 0.04  # what touches may miss by the paper's voxel of 0.02 m on either side
-SAME_TOP_M = 0.01  # one thing lies on several whose tops are so level; what is deeper is under the first of them
-ON_SHARE = 0.3  # of the smaller footprint: less, and it would fall
-WITHIN_SHARE = 0.7  # of the footprint of what lies inside
-INNER_FLOOR_M = 0.05  # an inner board lies above the holder's foot by this
+# The thresholds are chosen here, because the field has no agreed ones; for the reasons see docs/questions/relations.md.
+CONTACT_M = 0.04  # objects in contact may be apart by the paper's voxel of 0.02 m on either side
+SAME_TOP_M = 0.01  # an object is on several others if their tops differ by less; lower ones are under the first of them
+ON_SHARE = 0.3  # of the smaller footprint: with less it would fall
+WITHIN_SHARE = 0.7  # of the footprint of the inner object
+INNER_FLOOR_M = 0.05  # minimum height of an inner board above the holder's foot
 OVER_SHARE, OVER_PAD_M = 0.5, 0.1  # half of a footprint, or its centre; a picture hangs behind the sofa, not in it
 ABOVE_M = 1.0  # a lamp over a table, not one under the ceiling of a hall
 REACH_SHARE, MIN_REACH_M, MAX_REACH_M = 0.5, 0.1, 0.5  # neighbours: half the longer side of the smaller one
-HAND_M = 0.25  # within an open hand of one another some people call the smallest things neighbours
+HAND_M = 0.25  # some people call even the smallest objects neighbours within a hand's width
 NEAR_M = 1.0  # an arm's length
-FLAT_M, SPREAD_M = 0.03, 0.5  # so low and so wide is a rug: part of the floor for what stands beside it
-BETWEEN_ENDS = 0.05  # share of the way, at either end, that is not between
-BETWEEN_CORE = 0.5  # of either side of a footprint, about its middle: what the line grazes is not between
-MIN_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
-# What things are called whose last word decides how others lie to them.
+FLAT_M, SPREAD_M = 0.03, 0.5  # an object this low and this wide is a rug: part of the floor for its neighbours
+BETWEEN_ENDS = 0.05  # fraction of the line, at either end, that is not between
+BETWEEN_CORE = 0.5  # of each side of a footprint, about its centre: an object that the line only grazes is not between
+MIN_BEARING_RAD = 0.05  # two objects closer to one line of sight are neither left nor right of each other
+# Last words of names that decide the relations of other objects to them.
 CONTAINERS = frozenset(
     {"basket", "bin", "box", "bag", "backpack", "bathtub", "sink", "bucket", "drawer", "pot", "bowl", "vase", "crate"}
 )
-# What carries things below its top; whether people call what stands in any other thing "on" it, nobody knows.
+# Objects that carry others below their top; it is doubtful whether people say "on" for the inside of other objects.
 SHELVES = frozenset({"shelf", "bookshelf", "bookcase", "rack"})
 SEATS = frozenset({"sofa", "couch", "loveseat", "chair", "armchair", "recliner", "bench", "stool", "bed", "futon"})
 FIXTURES = frozenset({"window", "door", "vent", "switch", "plug", "outlet", "socket", "blinds", "blind", "radiator"})
 BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove"})  # "under the sink" is in its cabinet
 FLOORS = frozenset({"floor", "ground"})
 SURFACES = FLOORS | {"wall", "ceiling", "roof"}  # of the room itself
-BAND = 1.25  # what a threshold so much lower or higher would decide otherwise is doubtful
+BAND = 1.25  # a relation is doubtful if a threshold lower or higher by this factor changes it
 
 
 @dataclass(frozen=True)
 class Link:
-    """Row ``subject`` stands in ``relation`` to row ``object``."""
+    """Row ``subject`` is in ``relation`` to row ``object``."""
 
     subject: int
     relation: Relation
@@ -61,10 +61,10 @@ class Link:
 
 
 class Relations:
-    """The relations of all pairs of ``boxes`` (K, 2, 3) of things with such last words of their ``names``.
+    """The relations of all pairs of ``boxes`` (K, 2, 3); ``names`` are the last words of the objects' names.
 
-    Surfaces of the room stand in none. ``slack`` above 1 loosens every threshold by this factor, below 1 it tightens
-    them. Row and column of a matrix (K, K) are subject and object.
+    Surfaces of the room have no relations. ``slack`` above 1 loosens every threshold by this factor, below 1 tightens
+    it. Row and column of a matrix (K, K) are subject and object.
     """
 
     def __init__(self, boxes: Float64Array, names: Sequence[str], slack: float = 1.0) -> None:
@@ -81,11 +81,11 @@ class Relations:
         return len(self._boxes)
 
     def of(self, relation: Relation) -> BoolArray:
-        """Which pairs (K, K) stand in ``relation``."""
+        """Which pairs (K, K) are in ``relation``."""
         return np.asarray(getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation)))
 
     def doubtful(self, relation: Relation) -> BoolArray:
-        """The pairs (K, K) of which a slightly other threshold, or another reading of the word, says otherwise."""
+        """The pairs (K, K) that a slightly different threshold, or another reading of the word, would change."""
         tight, loose = self._around
         answer: BoolArray = tight.of(relation) != loose.of(relation)
         if relation in ("on", "under"):
@@ -100,41 +100,41 @@ class Relations:
         return Relations(self._boxes, self._names, 1 / BAND), Relations(self._boxes, self._names, BAND)
 
     def links(self) -> Iterator[Link]:
-        """Every relation but "near", by subject and object."""
+        """Every relation except "near", by subject and object."""
         held = {name: self.of(name) for name in RELATIONS if name != "near"}
         for a, b in np.argwhere(np.any(list(held.values()), axis=0)).tolist():
             for name, matrix in held.items():
                 if matrix[a, b]:
                     yield Link(a, name, b)
 
-    # ---- what the rules are made of
+    # ---- building blocks of the rules
 
     @cached_property
     def _is_pair(self) -> BoolArray:
-        """Pairs of two things of which neither is a surface of the room."""
+        """Pairs of two objects, neither of which is a surface of the room."""
         is_pair = self._is_thing[:, None] & self._is_thing[None]
         return np.asarray(is_pair & ~np.eye(len(self), dtype=bool))
 
     @cached_property
     def _apart(self) -> Float64Array:
-        """Metres (K, K, 3) between two boxes along each axis; 0 where they overlap."""
+        """Metres (K, K, 3) between two boxes along each axis; 0 if they overlap."""
         low, high = self._boxes[:, 0], self._boxes[:, 1]
         return np.maximum(low[:, None] - high[None], low[None] - high[:, None]).clip(min=0.0)
 
     @cached_property
     def _area(self) -> Float64Array:
-        """Square metres (K,) of the footprints, above 0 so that one can divide by them."""
+        """Square metres (K,) of the footprints, always above 0 for divisions."""
         return np.asarray(np.prod((self._boxes[:, 1] - self._boxes[:, 0])[:, :2], axis=1).clip(min=1e-9))
 
     def _shared(self, pad_m: float = 0.0) -> Float64Array:
-        """Square metres (K, K) that a footprint shares with another that is grown by ``pad_m``."""
+        """Square metres (K, K) that a footprint shares with another one grown by ``pad_m``."""
         low, high = self._boxes[:, 0, :2], self._boxes[:, 1, :2]
         sides = np.minimum(high[:, None], high[None] + pad_m) - np.maximum(low[:, None], low[None] - pad_m)
         return np.asarray(np.prod(sides.clip(min=0.0), axis=2))
 
     @cached_property
     def _risen(self) -> Float64Array:
-        """Metres (K, K) by which the bottom of one thing is above the top of the other."""
+        """Metres (K, K) by which the bottom of one object is above the top of the other."""
         return self._boxes[:, None, 0, 2] - self._boxes[None, :, 1, 2]
 
     @cached_property
@@ -159,7 +159,7 @@ class Relations:
 
     @cached_property
     def _stands_inside(self) -> BoolArray:
-        """As ``_rests_inside``, above the holder's foot: on a seat or an inner board."""
+        """As ``_rests_inside``, but above the holder's foot: on a seat or an inner board."""
         foot = self._boxes[:, 0, 2]
         return self._rests_inside & (foot[:, None] >= foot[None] + INNER_FLOOR_M / self._slack)
 
@@ -174,7 +174,7 @@ class Relations:
 
     @cached_property
     def _hangs_in_front(self) -> BoolArray:
-        """Two things that hang one in front of the other, as blinds before their window."""
+        """Two objects that hang one in front of the other, such as blinds in front of a window."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2]
         along = sides.argmax(axis=1)
         low, high = self._boxes[:, 0, :2], self._boxes[:, 1, :2]
@@ -191,19 +191,19 @@ class Relations:
 
     @cached_property
     def holders(self) -> BoolArray:
-        """What (K, K) each thing rests on or lies in; rugs, which are part of the floor, hold nothing."""
+        """The holders (K, K) of each object, on or in which it lies; rugs are part of the floor and hold nothing."""
         return (self.on | self.inside) & ~self._is_spread_out[None]
 
     @cached_property
     def is_on_floor(self) -> BoolArray:
-        """Which things (K,) stand on the floor: at the top of what is called so, or as low as the lowest one."""
+        """Which objects (K,) are on the floor: at the top of the object named so, or as low as the lowest object."""
         foot, top = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         floor_m = top.min(initial=foot.min(initial=np.inf, where=self._is_thing), where=self._is_floor)
         return np.asarray(foot <= floor_m + CONTACT_M)
 
     @cached_property
     def hangs(self) -> BoolArray:
-        """Which things (K,) rest on nothing: on a wall, or from the ceiling."""
+        """Which objects (K,) rest on nothing: they hang on a wall or from the ceiling."""
         return ~self.holders.any(axis=1) & ~self.is_on_floor
 
     @cached_property
@@ -223,12 +223,12 @@ class Relations:
 
     @cached_property
     def inside(self) -> BoolArray:
-        """The first lies in the second: a container that it may stick out of."""
+        """The first lies in the second, a container, and may stick out of it."""
         return np.asarray(self._rests_inside & self._is_container[None])
 
     @cached_property
     def above(self) -> BoolArray:
-        """The first hangs over the second: half of it or its centre, a metre at most, with nothing in between."""
+        """The first hangs over the second: half of it or its centre, at most a metre above, with nothing in between."""
         candidates = self._is_over & self.hangs[:, None] & self._is_pair
         candidates &= (self._risen > CONTACT_M / self._slack) & (self._risen <= ABOVE_M * self._slack)
         top, foot = self._boxes[:, 1, 2], self._boxes[:, 0, 2]
@@ -239,7 +239,7 @@ class Relations:
 
     @cached_property
     def under(self) -> BoolArray:
-        """The first bears the second or has it above, or stands on the ground that the second covers."""
+        """The first carries the second or has it above, or stands on the ground covered by the second."""
         foot, top = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         is_low = (np.abs(foot[:, None] - foot[None]) <= INNER_FLOOR_M * self._slack) & (top[:, None] <= top[None])
         is_covered = self._shared() / self._area[:, None] >= min(1.0, WITHIN_SHARE / self._slack)
@@ -249,14 +249,14 @@ class Relations:
 
     @cached_property
     def next_to(self) -> BoolArray:
-        """Side by side at one height on one support, on the floor or on the wall, with nothing in between."""
+        """Side by side at the same height on one support, on the floor or on the wall, with nothing in between."""
         return self._without_between(self._is_beside(np.minimum, MIN_REACH_M) & self.one_place)
 
     @cached_property
     def may_be_next_to(self) -> BoolArray:
-        """What some people call so: by the reach of the larger thing, and for a switch beside the door that stands.
+        """Pairs that some people call next to each other: within the reach of the larger one, also on other supports.
 
-        What lies on a table is not next to the chair before it, whatever one means by the words.
+        An object on a table is never next to a chair in front of it.
         """
         stands = self.is_on_floor & ~self.holders.any(axis=1)
         lies = self.holders.any(axis=1) & ~self.is_on_floor
@@ -264,7 +264,7 @@ class Relations:
         return self._without_between(self._is_beside(np.maximum, HAND_M) & ~is_apart)
 
     def _is_beside(self, longer_or_shorter: np.ufunc, least_m: float) -> BoolArray:
-        """Pairs (K, K) at one height, aside of one another, within the reach of the larger or smaller of the two."""
+        """Pairs (K, K) side by side at the same height, within the reach of the larger or smaller of the two."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2].max(axis=1, initial=0.0)
         side_m = longer_or_shorter(sides[:, None], sides[None])
         reach_m = np.clip(REACH_SHARE * side_m, least_m, MAX_REACH_M) * self._slack
@@ -279,14 +279,14 @@ class Relations:
         return np.asarray((gap_m <= reach_m) & is_aside & is_level & ~stacked & ~stacked.T & ~is_rug & self._is_pair)
 
     def _without_between(self, pairs: BoolArray) -> BoolArray:
-        """The symmetrical ``pairs`` (K, K) between which nothing stands."""
+        """The symmetric ``pairs`` (K, K) with nothing in between."""
         free = pairs.copy()
         for a, b in np.argwhere(np.triu(pairs)).tolist():
             free[a, b] = free[b, a] = not self._has_between(a, b)
         return free
 
     def _has_between(self, a: int, b: int) -> bool:
-        """Whether something at their height stands in the gap between two things."""
+        """Whether another object at their height is in the gap between two objects."""
         low, high = self._boxes[:, 0], self._boxes[:, 1]
         first, last = np.minimum(high[a], high[b]), np.maximum(low[a], low[b])
         gap = np.array([np.minimum(first, last), np.maximum(first, last)])
@@ -297,28 +297,28 @@ class Relations:
 
     @cached_property
     def near(self) -> BoolArray:
-        """No more than a metre from box to box."""
+        """At most one metre from box to box."""
         return np.asarray((np.linalg.norm(self._apart, axis=2) <= NEAR_M * self._slack) & self._is_pair)
 
 
 def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
-    """Whether the line from the middle of box ``b`` to that of box ``c`` leads over the inner half of box ``a``.
+    """Whether the line from the centre of box ``b`` to that of box ``c`` crosses the inner half of box ``a``.
 
-    Boxes (2, 3), ``a`` at the height of both; nothing is between what lies flat on the floor and something else.
+    Boxes (2, 3), ``a`` at the height of both; False if any of the three is flat.
     """
     way = _Way.of(a, b, c)
     return way is not None and BETWEEN_ENDS < way.along(a) < 1 - BETWEEN_ENDS and way.meets(a, BETWEEN_CORE, 0.0)
 
 
 def may_be_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
-    """Whether some people would call box ``a`` so: it stands anywhere in the lane that is as wide as its two ends."""
+    """Whether some people would call box ``a`` so: it is anywhere in the lane that is as wide as its two ends."""
     way = _Way.of(a, b, c)
     return way is not None and 0.0 < way.along(a) < 1.0 and way.meets(a, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class _Way:
-    """Seen from above: from the middle of one box to that of another, with half their sides, each (2,)."""
+    """In top view, the line from the centre of one box to that of another, with half their sides, each (2,)."""
 
     start: Float64Array
     way: Float64Array
@@ -327,7 +327,7 @@ class _Way:
 
     @classmethod
     def of(cls, a: Float64Array, b: Float64Array, c: Float64Array) -> _Way | None:
-        """From ``b`` to ``c``, where something may be between them and ``a`` is at their height."""
+        """The line from ``b`` to ``c``; None if ``a`` is not at their height, a box is flat or the centres coincide."""
         if any(min(a[1, 2], end[1, 2]) <= max(a[0, 2], end[0, 2]) for end in (b, c)):
             return None
         if any(end[1, 2] - end[0, 2] < FLAT_M for end in (a, b, c)):
@@ -336,13 +336,13 @@ class _Way:
         return way if float(np.linalg.norm(way.way)) >= 1e-6 else None
 
     def along(self, a: Float64Array) -> float:
-        """How far along the way the middle of a box stands, as a share of it."""
+        """The position of a box's centre along the line, as a fraction of it."""
         return float((a.mean(axis=0)[:2] - self.start) @ self.way) / float(self.way @ self.way)
 
     def meets(self, a: Float64Array, share: float, width: float) -> bool:
-        """Whether what moves along the way comes to ``share`` of a box's sides.
+        """Whether a rectangle moved along the line meets the inner ``share`` of a box's sides.
 
-        It is as wide as ``width`` of the ends, shrinking or growing evenly from one to the other.
+        The rectangle has ``width`` times the size of the ends, interpolated linearly from one to the other.
         """
         aside, half = self.start - a.mean(axis=0)[:2], share * (a[1] - a[0])[:2] / 2
         enters, leaves = 0.0, 1.0
@@ -361,17 +361,17 @@ class _Way:
 
 
 def bearing_rad(eye: Point, a: Point, b: Point) -> float:
-    """The angle, seen from above, by which point ``a`` stands left of ``b`` for who looks at them from ``eye``."""
+    """The angle, in top view, by which point ``a`` is left of ``b`` as seen from ``eye``."""
     angle_a = math.atan2(float(a[1] - eye[1]), float(a[0] - eye[0]))
     angle_b = math.atan2(float(b[1] - eye[1]), float(b[0] - eye[0]))
     return math.remainder(angle_a - angle_b, math.tau)
 
 
 def is_left_of(a: Point, b: Point, eye: Point) -> bool:
-    """Whether point ``a`` stands left of ``b`` for who looks at both from ``eye``."""
+    """Whether point ``a`` is left of ``b`` as seen from ``eye``."""
     return bearing_rad(eye, a, b) > MIN_BEARING_RAD
 
 
 def gap_m(a: Float64Array, b: Float64Array) -> float:
-    """The shortest way between two boxes (2, 3); 0 where they touch."""
+    """The distance between two boxes (2, 3); 0 if they touch."""
     return float(np.linalg.norm(np.clip(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0, None)))

@@ -1,4 +1,4 @@
-"""How sure numbers over several scenes or items are: intervals, tests, ranks, power; how costs grow; Shapley shares."""
+"""Statistics over scenes or items: confidence intervals, tests, ranks, power; growth of costs; Shapley values."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ import numpy as np
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Interval
 
 LEVEL = 0.95
-ALPHA = 0.05  # a two-sided p below it is called a difference
-FEW_SCENES = 10  # an interval over fewer is said to be rough: docs/numbers/statistics.md shows how often it holds
+ALPHA = 0.05  # a difference is significant if its two-sided p is below this
+FEW_SCENES = 10  # with fewer, an interval is reported as rough: docs/numbers/statistics.md shows its coverage
 MAX_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
-MIN_ITEMS = 10  # of fewer a t interval of a change or an agreement holds the truth in less than 90 of 100 sets
-NO_SPREAD = 1e-12  # pseudo-values of fractions that differ by less differ by rounding
+MIN_ITEMS = 10  # with fewer, a t interval of a change or an agreement has a coverage below 90 %
+NO_SPREAD = 1e-12  # smaller differences between pseudo-values of fractions are rounding
 SEED = 0
-N_RESAMPLES = 1000  # of the blocks of a growth's slope
+N_RESAMPLES = 1000  # of the blocks for the slope of a growth
 MAX_EXACT_PAIRS = 40  # two halves of 2^20 sums, 8 MB each
-N_FLIPS = 100_000  # patterns drawn where there are more pairs
-FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader of a plot calls flat
+N_FLIPS = 100_000  # patterns drawn if there are more pairs
+FLAT_EXPONENT = 0.1  # at most 7 % more for twice the size: flat in a plot
 MIN_FIT = 8
-MIN_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
-SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # between which a fraction lies, and a difference of two
+MIN_SPREAD = 1e-9  # of a resample's sizes, relative to that of all: below it a slope would be rounding noise
+SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # the range of a fraction, and of a difference of two
 POWER = 0.8
-MAX_SCENES = 100_000  # more are not looked for
-MIN_SEEDS = 3  # of two, where seeds matter, the interval over scenes and seeds holds the truth in 85 of 100 sets
-MIN_SCENES = 6  # of fewer, no pattern of signs has a p below 0.05: 2 of 2^5 are 0.0625
+MAX_SCENES = 100_000  # the search stops here
+MIN_SEEDS = 3  # with two, if seeds matter, the interval over scenes and seeds has a coverage of only 85 %
+MIN_SCENES = 6  # with fewer, no pattern of signs has a p below 0.05: 2 / 2^5 = 0.0625
 
-EXACT_STEPS = 8  # up to so many every choice of steps is taken: 256 values
-N_ORDERS = 200  # that are drawn of more
-Value = Callable[[int], float]  # of the steps whose bits are set
+EXACT_STEPS = 8  # up to this number all subsets of steps are evaluated: 256 values
+N_ORDERS = 200  # orders drawn for more steps
+Value = Callable[[int], float]  # a function of the steps whose bits are set
 
 
 def _group_of_scene(n_scenes: int) -> Int64Array:
-    """With which scenes each (S,) is left out: alone, or with those that stand ``MAX_GROUPS`` after it."""
+    """The group (S,) with which each scene is left out: alone, or with every ``MAX_GROUPS``-th scene."""
     return np.arange(n_scenes) % min(n_scenes, MAX_GROUPS)
 
 
-@lru_cache(maxsize=1)  # every method and protocol of a run asks for the same
+@lru_cache(maxsize=1)  # every method and protocol of a run uses the same
 def leave_one_out(n_scenes: int) -> Int64Array:
-    """How often each scene is counted (1 + G, S): all of them, then all but the first, and so on; read-only.
+    """The weight of each scene (1 + G, S): all scenes, then all except the first, and so on; read-only.
 
-    More than ``MAX_GROUPS`` scenes are left out in as many groups: each has a part in one of them.
+    More than ``MAX_GROUPS`` scenes are left out in ``MAX_GROUPS`` groups, each scene in one of them.
 
     >>> leave_one_out(2).tolist()
     [[1, 1], [0, 1], [1, 0]]
@@ -58,10 +58,9 @@ def leave_one_out(n_scenes: int) -> Int64Array:
 
 
 def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
-    """Which of the G scenes, or groups of them, have a part in a number, from its ``values`` (1 + G,) without each.
+    """Which of the G scenes, or groups, contribute to a number, from its ``values`` (1 + G,): over all, without each.
 
-    One has that holds a scene with a value of its own, as ``has_value`` (S,) says, or without which the number is
-    another.
+    A group contributes if one of its scenes has a value, by ``has_value`` (S,), or if the number changes without it.
     """
     n_with_value = np.bincount(_group_of_scene(len(has_value)), weights=has_value, minlength=len(values) - 1)
     return np.asarray((n_with_value > 0) | (values[1:] != values[0]))
@@ -70,10 +69,10 @@ def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
 def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Float64Array:
     """Tukey's jackknife pseudo-values of a number, from its ``values`` (1 + G,): over all, then without each scene.
 
-    Of scenes that have no part in it, as ``is_part`` (G,) says, there is none.
-    Source: Miller, The jackknife: a review, Biometrika 61 (1974), equation 2.2; groups of scenes are in it too.
+    Scenes that do not contribute, by ``is_part`` (G,), are omitted.
+    Source: Miller, The jackknife: a review, Biometrika 61 (1974), equation 2.2, which also covers groups.
 
-    >>> pseudo_values(np.array([0.5, 0.6, 0.4])).round(12).tolist()  # of a mean they are the values themselves
+    >>> pseudo_values(np.array([0.5, 0.6, 0.4])).round(12).tolist()  # for a mean they are the values themselves
     [0.4, 0.6]
     """
     whole, left_out = values[0], values[1:]
@@ -90,13 +89,13 @@ def jackknife_interval(
 ) -> Interval | None:
     """The t interval around a number over scenes, its standard error from the pseudo-values of ``values`` (1 + G,).
 
-    With ``has_value`` (S,) scenes that have no part in the number are left aside. It is around the value itself rather
-    than the mean of the pseudo-values, which covers the truth less often at few scenes
-    (``python benchmarks coverage_of_intervals`` has both), and ends at ``bounds``. None for a single scene, where a
-    scene left out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
+    With ``has_value`` (S,), scenes that do not contribute to the number are ignored. The interval is centred on the
+    value rather than on the mean of the pseudo-values, which has lower coverage with few scenes
+    (``python benchmarks coverage_of_intervals`` has both), and is clipped to ``bounds``. None for a single scene, if
+    nothing can be scored without one scene, and if the scenes do not differ, which allows no estimate of the spread.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; the t quantile after Tukey.
 
-    >>> means = np.array([0.5, 0.55, 0.5, 0.45])  # of 0.4, 0.5 and 0.6, and without each of them
+    >>> means = np.array([0.5, 0.55, 0.5, 0.45])  # the mean of 0.4, 0.5 and 0.6, and the means without each of them
     >>> low, high = jackknife_interval(means)
     >>> round(low, 4), round(high, 4)
     (0.2516, 0.7484)
@@ -112,7 +111,7 @@ def jackknife_interval(
 
 
 def mean_interval(values: Float64Array, bounds: Interval = SHARE) -> Interval | None:
-    """The t interval of a mean; None for fewer than two values, and where all are equal."""
+    """The t interval of a mean; None for fewer than two values, or if all are equal."""
     n = len(values)
     if n < 2:
         return None
@@ -121,10 +120,10 @@ def mean_interval(values: Float64Array, bounds: Interval = SHARE) -> Interval | 
 
 
 def share_interval(share: float, n: int, level: float = LEVEL) -> Interval | None:
-    """Wilson's interval of a share of ``n`` things that were drawn, each of which speaks for it or not.
+    """Wilson's interval of the fraction ``share`` of ``n`` sampled items with a binary property.
 
-    Of things that speak for it in part, the share of several judges, it is too wide rather than too narrow. None of
-    nothing. Source: Wilson, JASA 22 (1927); Brown, Cai and DasGupta, Statistical Science 16 (2001), advise it.
+    For items with fractional values, such as the share of several annotators, it is too wide rather than too narrow.
+    None for n = 0. Source: Wilson, JASA 22 (1927); recommended by Brown, Cai and DasGupta, Stat. Science 16 (2001).
 
     >>> low, high = share_interval(1.0, 10)
     >>> round(low, 3), high
@@ -135,12 +134,12 @@ def share_interval(share: float, n: int, level: float = LEVEL) -> Interval | Non
     z = t_quantile((1.0 + level) / 2.0, np.inf)
     middle = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(max(0.0, share * (1 - share)) / n + z * z / (4 * n * n))
-    # the ends of 0 and 1 are exact; only rounding moves them
+    # the ends 0 and 1 are exact; only rounding would change them
     return (0.0 if share <= 0 else float(middle - half)), (1.0 if share >= 1 else float(middle + half))
 
 
-# Student's t at 0.975 with 1, 2, ... degrees of freedom, as scipy has it: what intervals over a few scenes need,
-# without the quarter of a second that scipy.special takes to load.
+# Student's t at 0.975 with 1, 2, ... degrees of freedom, from scipy: for intervals over a few scenes, without the
+# 0.25 s that scipy.special takes to load.
 T_975 = (
     12.706204736174694, 4.302652729749462, 3.1824463052837078, 2.7764451051977934, 2.5705818356363146,
     2.4469118511449786, 2.364624251592784, 2.306004135204166, 2.262157162798205, 2.228138851986274, 2.200985160091639,
@@ -152,7 +151,7 @@ T_975 = (
 
 
 def t_quantile(level: float, n_free: float) -> float:
-    """The quantile of Student's t with ``n_free`` degrees of freedom, of the normal distribution where infinite.
+    """The quantile of Student's t with ``n_free`` degrees of freedom; of the normal distribution if infinite.
 
     >>> round(t_quantile(0.975, 3), 3), round(t_quantile(0.975, np.inf), 3)
     (3.182, 1.96)
@@ -165,7 +164,7 @@ def t_quantile(level: float, n_free: float) -> float:
 
 
 def ratio(part: Float64Array | Int64Array, whole: Float64Array | Int64Array) -> Float64Array:
-    """``part / whole``; NaN of nothing.
+    """``part / whole``; NaN if ``whole`` is 0.
 
     >>> ratio(np.array([1, 0]), np.array([4, 0])).tolist()
     [0.25, nan]
@@ -175,18 +174,18 @@ def ratio(part: Float64Array | Int64Array, whole: Float64Array | Int64Array) -> 
 
 
 def nan_mean(values: Float64Array) -> float:
-    """Mean of the values that are not NaN; NaN where there is none.
+    """Mean of the values that are not NaN; NaN if there are none.
 
     >>> nan_mean(np.array([1.0, np.nan, 0.0]))
     0.5
     """
     is_nan = np.isnan(values)
     n = len(values) - np.count_nonzero(is_nan)
-    return float(np.where(is_nan, 0.0, values).sum() / n) if n else float("nan")  # np.nanmean, which takes its time
+    return float(np.where(is_nan, 0.0, values).sum() / n) if n else float("nan")  # as np.nanmean, but faster
 
 
 def row_means(values: Float64Array) -> Float64Array:
-    """Mean of each row without its NaN; NaN for a row without any number.
+    """Mean of each row, ignoring NaN; NaN for a row without any number.
 
     >>> row_means(np.array([[1.0, np.nan, 0.0], [np.nan] * 3])).tolist()
     [0.5, nan]
@@ -197,10 +196,10 @@ def row_means(values: Float64Array) -> Float64Array:
 
 @dataclass(frozen=True)
 class SignFlipTest:
-    """What the sign-flip test of ``n_pairs`` paired differences says.
+    """The result of the sign-flip test of ``n_pairs`` paired differences.
 
-    ``p`` is two-sided; ``smallest_p`` is the least that so many pairs can give, whatever their differences.
-    ``is_exact``: all patterns of signs were counted; else so many were drawn as ``N_FLIPS`` says.
+    ``p`` is two-sided; ``smallest_p`` is the smallest p possible with this number of pairs.
+    ``is_exact``: all patterns of signs were counted; otherwise ``N_FLIPS`` were drawn.
     """
 
     p: float
@@ -210,9 +209,9 @@ class SignFlipTest:
 
 
 def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
-    """How often the mean of ``differences`` would be as far from 0 if each sign were a coin's; ``None`` without pairs.
+    """The sign-flip test of the mean of ``differences`` against 0; ``None`` without pairs.
 
-    NaN are left out. Up to ``MAX_EXACT_PAIRS`` pairs all 2^n patterns of signs are counted; beyond, random ones.
+    NaN are ignored. Up to ``MAX_EXACT_PAIRS`` pairs all 2^n patterns of signs are counted; otherwise random ones.
 
     >>> sign_flip_test(np.array([0.1, 0.2, 0.3]))
     SignFlipTest(p=0.25, smallest_p=0.25, n_pairs=3, is_exact=True)
@@ -221,7 +220,7 @@ def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
     n = len(pairs)
     if n == 0:
         return None
-    # sums in another order differ by rounding; equals must count as equals
+    # sums in another order differ by rounding; equal sums must count as equal
     observed = abs(float(pairs.sum())) - 1e-12 * float(np.abs(pairs).sum())
     if n <= MAX_EXACT_PAIRS:
         p = 1.0 if observed <= 0 else _n_sums_from(pairs, observed) * 2 / 2**n
@@ -247,9 +246,9 @@ def _n_sums_from(pairs: Float64Array, least: float) -> int:
 
 
 def holm(values: Sequence[float | None]) -> list[float | None]:
-    """Each p as it counts among all of ``values``: below 0.05, it is a difference though so many were looked at.
+    """The p values adjusted for multiple tests.
 
-    None, where there is no test, stays None and counts for nothing.
+    None, for no test, stays None and is not counted.
     Source: Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6 (1979).
 
     >>> [None if p is None else round(p, 3) for p in holm([0.01, 0.04, None, 0.03])]
@@ -265,10 +264,10 @@ def holm(values: Sequence[float | None]) -> list[float | None]:
 
 
 def rank_intervals(values: Sequence[Float64Array], alpha: float = ALPHA) -> list[tuple[int, int]]:
-    """The best and the worst rank that each of K rows may have, whose ``values`` (S,) are of the same scenes.
+    """The best and the worst possible rank of each of K rows, with ``values`` (S,) over the same scenes.
 
-    A row ranks below each that is better by the sign-flip test of their paired differences, corrected by Holm over all
-    pairs; all ranks together hold the true ones with a probability of at least 1 - ``alpha``.
+    A row ranks below each row that is better by the sign-flip test of their paired differences, corrected by Holm over
+    all pairs; all intervals together contain the true ranks with a probability of at least 1 - ``alpha``.
     Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for Ranks, Review of Economic Studies 91 (2024).
 
     >>> far = [np.arange(10) / 100 + level for level in (0.8, 0.1)]
@@ -290,7 +289,7 @@ def rank_intervals(values: Sequence[Float64Array], alpha: float = ALPHA) -> list
 
 @dataclass(frozen=True)
 class Growth:
-    """How a cost grows with a size: ``cost ~ size ** exponent``, with the 95 % interval of the exponent."""
+    """The growth of a cost with a size: ``cost ~ size ** exponent``, with the 95 % interval of the exponent."""
 
     exponent: float
     low: float
@@ -298,17 +297,17 @@ class Growth:
 
     @property
     def words(self) -> str:
-        """``constant per update``, ``grows`` or ``not settled``, by the interval against ``FLAT_EXPONENT``."""
+        """``constant per update``, ``grows`` or ``not settled``, by comparing the interval with ``FLAT_EXPONENT``."""
         if self.high <= FLAT_EXPONENT:
             return "constant per update"
         return "grows" if self.low > FLAT_EXPONENT else "not settled"
 
 
 def growth_exponent(sizes: Float64Array, costs: Float64Array, n_resamples: int = N_RESAMPLES) -> Growth | None:
-    """The slope of log cost on log size, with a moving-block bootstrap interval, since neighbours in time are alike.
+    """The slope of log cost on log size, with a moving-block bootstrap interval, because successive values correlate.
 
-    Sizes and costs (N,) are in the order of time; those that are not above 0 are left out. None where fewer than
-    ``MIN_FIT`` remain, or where the largest size is not twice the smallest: nothing can be said of growth then.
+    Sizes and costs (N,) are in the order of time; values that are not above 0 are ignored. None if fewer than
+    ``MIN_FIT`` remain, or if the largest size is less than twice the smallest: growth cannot be estimated then.
 
     >>> sizes = np.linspace(1.0, 100.0, 50)
     >>> growth_exponent(sizes, 3.0 * sizes).words, growth_exponent(sizes, np.full(50, 7.0)).words
@@ -329,9 +328,9 @@ def growth_exponent(sizes: Float64Array, costs: Float64Array, n_resamples: int =
 
 
 def _slopes_of_blocks(x: Float64Array, y: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
-    """The least-squares slope of ``y`` on ``x`` over each row's blocks of neighbours; NaN where ``x`` hardly varies.
+    """The least-squares slope of ``y`` on ``x`` over each row's blocks; NaN if ``x`` hardly varies.
 
-    Row r takes the ``lengths[b]`` neighbours from ``starts[r, b]`` on. Sums of a block are differences of running sums.
+    Row r uses ``lengths[b]`` values from ``starts[r, b]``. The sum of a block is a difference of running sums.
     """
     x, y = x - x.mean(), y - y.mean()
     n = lengths.sum()
@@ -350,9 +349,9 @@ def _block_sums(values: Float64Array, starts: Int64Array, lengths: Int64Array) -
 
 @dataclass(frozen=True)
 class Variance:
-    """How the difference of a scene under a seed varies: the variance of scenes, of seeds, and of what is left.
+    """The variance components of a difference per scene and seed: of scenes, of seeds, and the residual.
 
-    ``of_seeds`` is None where there was one seed alone; what seeds move in a scene is then part of ``of_scenes``.
+    ``of_seeds`` is None with only one seed; the variance of seeds within a scene is then part of ``of_scenes``.
     """
 
     of_scenes: float
@@ -362,7 +361,7 @@ class Variance:
     n_seeds: int
 
     def error(self, n_scenes: int, n_seeds: int) -> tuple[float, float]:
-        """The standard error of a mean over so many scenes, each under so many seeds, and its degrees of freedom.
+        """The standard error of a mean over ``n_scenes`` scenes with ``n_seeds`` seeds each, and degrees of freedom.
 
         Source of the latter: Satterthwaite, An approximate distribution of estimates of variance components,
         Biometrics Bulletin 2 (1946).
@@ -374,16 +373,16 @@ class Variance:
         return float(np.sqrt(total)), total**2 / parts if parts > 0 else float(n_scenes - 1)
 
     def scaled(self, factor: float) -> Variance:
-        """All of it so many times as large."""
+        """All components multiplied by ``factor``."""
         seeds = None if self.of_seeds is None else factor * self.of_seeds
         return Variance(factor * self.of_scenes, seeds, factor * self.of_rest, self.n_scenes, self.n_seeds)
 
 
 def variance_of(differences: Float64Array) -> Variance:
-    """The parts of the variance of ``differences`` (R, S) of S >= 2 scenes, each under R seeds; none is below 0.
+    """The variance components of ``differences`` (R, S) of S >= 2 scenes with R seeds each, clipped at 0.
 
     Source: Searle, Casella and McCulloch, Variance Components (1992), chapter 4: the two-way crossed random model with
-    one observation a cell.
+    one observation per cell.
 
     >>> variance_of(np.array([[0.0, 2.0], [0.0, 2.0]]))
     Variance(of_scenes=2.0, of_seeds=0.0, of_rest=0.0, n_scenes=2, n_seeds=2)
@@ -404,9 +403,9 @@ def variance_of(differences: Float64Array) -> Variance:
 
 
 def crossed_interval(middle: float, variance: Variance) -> Interval | None:
-    """The t interval of a difference over the scenes and the seeds that were measured.
+    """The t interval of a difference over the measured scenes and seeds.
 
-    None where nothing varied, and of two seeds, which tell too little of seeds.
+    None if nothing varies, and for two seeds, which are too few to estimate their variance.
     """
     if 1 < variance.n_seeds < MIN_SEEDS:
         return None
@@ -418,14 +417,14 @@ def crossed_interval(middle: float, variance: Variance) -> Interval | None:
 
 
 def power_of(variance: Variance, difference: float, n_scenes: int, n_seeds: int) -> float:
-    """How likely a true ``difference`` is found, the right way round, by a two-sided t test at 5 %.
+    """The probability that a two-sided t test at 5 % finds a true ``difference`` with the right sign.
 
     Source: Cohen, Statistical Power Analysis for the Behavioral Sciences (1988), chapter 2: the noncentral t.
 
     >>> round(power_of(Variance(1.0, None, 0.0, 8, 1), 0.5, 34, 1), 3)  # 34 scenes, half a deviation
     0.808
     """
-    from scipy.stats import nct  # scipy.special's has no number where the shift is large
+    from scipy.stats import nct  # scipy.special's version has no value for large shifts
 
     error, n_free = variance.error(n_scenes, n_seeds)
     if error <= NO_SPREAD:
@@ -435,10 +434,10 @@ def power_of(variance: Variance, difference: float, n_scenes: int, n_seeds: int)
 
 
 def scenes_needed(variance: Variance, difference: float, n_seeds: int, power: float = POWER) -> int | None:
-    """The least number of scenes that find a true ``difference`` with ``power``, each under ``n_seeds`` seeds.
+    """The smallest number of scenes that finds a true ``difference`` with ``power``, with ``n_seeds`` seeds each.
 
-    At least as many as give the sign-flip test a p below 0.05. None where ``MAX_SCENES`` are too few, or where seeds
-    move the difference as such and there is one alone: no number of scenes tells the two apart then.
+    At least the number that allows the sign-flip test a p below 0.05. None if ``MAX_SCENES`` are too few, or if seeds
+    affect the difference and only one is used: no number of scenes can separate the two then.
 
     >>> scenes_needed(Variance(1.0, None, 0.0, 8, 1), 0.5, 1)
     34
@@ -446,7 +445,7 @@ def scenes_needed(variance: Variance, difference: float, n_seeds: int, power: fl
     if n_seeds == 1 and variance.of_seeds:
         return None
     low = high = MIN_SCENES
-    # by doubling: where seeds outweigh scenes, their few degrees of freedom take power away again
+    # by doubling: if seeds dominate, their few degrees of freedom reduce the power again
     while power_of(variance, difference, high, n_seeds) < power:
         if high >= MAX_SCENES:
             return None
@@ -458,7 +457,7 @@ def scenes_needed(variance: Variance, difference: float, n_seeds: int, power: fl
 
 
 def variance_range(variance: Variance) -> tuple[Variance, Variance]:
-    """The variance at the two ends of its 95 % interval, which so few scenes leave wide: by chi squared, of scenes."""
+    """The variance at the two ends of its 95 % interval, by chi squared over scenes; wide with few scenes."""
     from scipy.special import chdtri
 
     n_free = variance.n_scenes - 1
@@ -468,10 +467,10 @@ def variance_range(variance: Variance) -> tuple[Variance, Variance]:
 
 @dataclass(frozen=True)
 class Share:
-    """Of one step from one value to another: its share, the ``least`` and the ``most`` that it adds anywhere.
+    """The Shapley value ``share`` of one step, with the ``least`` and the ``most`` that it adds in any order.
 
-    What a step adds depends on those before it; its share is the mean over the orders of the steps (Shapley 1953, "A
-    value for n-person games"). ``standard_error``: what drawing orders leaves open, 0 where every order was taken.
+    The contribution of a step depends on the steps before it; its share is the mean over the orders of the steps
+    (Shapley 1953, "A value for n-person games"). ``standard_error``: of the drawn orders, 0 if all orders were used.
     """
 
     share: float
@@ -481,7 +480,7 @@ class Share:
 
 
 def choices(n_steps: int, seed: int = 0) -> list[int]:
-    """The sets of steps, as bits, whose values ``shares`` asks for.
+    """The sets of steps, as bits, whose values ``shares`` needs.
 
     >>> choices(2)
     [0, 1, 2, 3]
@@ -492,16 +491,16 @@ def choices(n_steps: int, seed: int = 0) -> list[int]:
 
 
 def shares(n_steps: int, value: Value, seed: int = 0) -> list[Share]:
-    """The share of each step in ``value(all) - value(none)``, which is their sum up to the last bits.
+    """The share of each step in ``value(all) - value(none)``, which is their sum except for rounding.
 
-    Exact for at most ``EXACT_STEPS``; over ``N_ORDERS`` orders that ``seed`` draws otherwise.
+    Exact for at most ``EXACT_STEPS`` steps; otherwise over ``N_ORDERS`` orders drawn with ``seed``.
 
     >>> [one.share for one in shares(2, lambda bits: {0: 0.0, 1: 1.0, 2: 2.0, 3: 5.0}[bits])]
     [2.0, 3.0]
     """
     if n_steps > EXACT_STEPS:
         return _drawn(n_steps, value, seed)
-    # In which share of all orders just these steps come before another one.
+    # The fraction of all orders in which exactly these steps come before another one.
     weights = [1 / (n_steps * math.comb(n_steps - 1, size)) for size in range(n_steps)]
     found = []
     for step in range(n_steps):
@@ -530,7 +529,7 @@ def _orders(n_steps: int, seed: int) -> list[list[int]]:
 
 
 def _sets_on_the_way(order: Sequence[int]) -> list[int]:
-    """The sets of steps on the way, from none to all."""
+    """The sets of steps along an order, from none to all."""
     found = [0]
     for step in order:
         found.append(found[-1] | 1 << step)

@@ -1,1 +1,1 @@
-"""What is kept on disk, whole or not at all: run folders, their records, predictions, scratch."""
+"""Atomic storage on disk: run folders, their records, predictions, caches."""

@@ -1,4 +1,4 @@
-"""What is kept to be quick: what the cache folder holds, by kind, and whether compiled code can be kept at all."""
+"""The cache: the content of the cache folder by kind, and whether compiled code can be cached."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from su3d_bench.core.files.locks import is_locked
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 _HEX = "[0-9a-f]"
-SMALL_BYTES = 1 << 16  # a kept kernel has about as many: a full disk takes none
+SMALL_BYTES = 1 << 16  # about the size of a cached kernel: fails on a full disk
 
 
 def kernel_folders() -> tuple[Path, ...]:
-    """Where Numba keeps kernels, in the order in which it tries: where it is told, beside the code, for the user.
+    """The folders in which Numba caches kernels, in the order tried: NUMBA_CACHE_DIR, with the code, the user's cache.
 
-    As numba.core.caching, Numba 0.68, chooses.
+    As in numba.core.caching, Numba 0.68.
     """
     told = os.environ.get("NUMBA_CACHE_DIR")
     own = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "numba").expanduser()
@@ -33,14 +33,14 @@ def kernel_folders() -> tuple[Path, ...]:
 
 
 def cache_warning() -> str | None:
-    """A line that says that no kernel can be kept, and what to do; None where one can."""
+    """A warning that no kernel can be cached, with the remedy; None if one can."""
     folders = kernel_folders()
     if any(map(_takes_files, folders)):
         return None
     tried = ", ".join(map(shown, folders))
     return (
-        f"compiled code cannot be kept in any of {tried}: every scene compiles it again, which takes longer than "
-        "many a scene; set NUMBA_CACHE_DIR to a folder that can be written"
+        f"compiled code cannot be cached in any of {tried}: every scene compiles it again, which can take longer "
+        "than the scene itself; set NUMBA_CACHE_DIR to a writable folder"
     )
 
 
@@ -50,16 +50,16 @@ def _takes_files(folder: Path) -> bool:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(SMALL_BYTES))
             file.flush()
-    except (OSError, RuntimeError):  # of a home that nobody knows
+    except (OSError, RuntimeError):  # RuntimeError: unknown home folder
         return False
     return True
 
 
 @dataclass(frozen=True)
 class CacheKind:
-    """One kind of what the cache folder keeps: the folder's name, the form of a file's path in it, and what it is.
+    """One kind of cache content: the folder's name, the form of a file's path in it, and a description.
 
-    ``form`` is a regular expression. ``is_paid``: it is not computed again but asked for anew, which may cost money.
+    ``form`` is a regular expression. ``is_paid``: it is not recomputed but requested again, which may cost money.
     """
 
     name: str
@@ -72,9 +72,9 @@ _PERCEPTION = f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"
 _RUN = f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"
 _REPLY = f"(images/)?{_HEX}+\\.(json|png)"
 _KINDS = (
-    CacheKind("perception", _PERCEPTION, "what was found in frames: runs over the same frames are many times as fast"),
-    CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds a gigabyte"),
-    CacheKind("runs", _RUN, "the small files of runs that are kept in a store such as s3://"),
+    CacheKind("perception", _PERCEPTION, "detections in frames: further runs on the same frames are many times faster"),
+    CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds per gigabyte"),
+    CacheKind("runs", _RUN, "small files of runs that are stored elsewhere, such as s3://"),
     CacheKind("replies", _REPLY, "replies of language models outside a run, which may have cost money", is_paid=True),
 )
 KINDS = {kind.name: kind for kind in _KINDS}
@@ -82,7 +82,7 @@ KINDS = {kind.name: kind for kind in _KINDS}
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """A file of a kind: its path below the kind's folder, its size, and when it was written (seconds since 1970)."""
+    """A cached file: its path below the kind's folder, its size, and its modification time (seconds since 1970)."""
 
     name: str
     n_bytes: int
@@ -90,22 +90,22 @@ class CacheEntry:
 
 
 def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
-    """The files of ``kind`` below ``root``; what has another form, and what is behind a link, is passed over."""
+    """The files of ``kind`` below ``root``; files with another form of name and links are ignored."""
     top = root / kind.name
     for place, folders, names in () if top.is_symlink() else os.walk(top):
         folders.sort()
         for path in (Path(place, name) for name in sorted(names)):
             name = path.relative_to(top).as_posix()
-            with suppress(FileNotFoundError):  # gone meanwhile
+            with suppress(FileNotFoundError):  # removed meanwhile
                 status = path.lstat()
                 if stat.S_ISREG(status.st_mode) and re.fullmatch(kind.form, name):
                     yield CacheEntry(name, status.st_size, status.st_mtime)
 
 
 def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tuple[int, int]:
-    """Remove the files of ``kind`` that were written before a time; how many, and their bytes.
+    """Remove the files of ``kind`` written before a time; returns their number and bytes.
 
-    Folders stay, for a run may be about to write there; so does what a living process holds.
+    Folders stay, because a run may be about to write there; files locked by a running process stay too.
     """
     top, held = root / kind.name, dict[str, bool]()
     n_files = n_bytes = 0
@@ -121,7 +121,7 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
 
 
 def size_text(n_bytes: int) -> str:
-    """A size as people say it.
+    """A size in MB or GB.
 
     >>> size_text(1_234_567_890), size_text(56_700_000), size_text(1200)
     ('1.2 GB', '56.7 MB', '0.0 MB')

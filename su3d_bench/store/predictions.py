@@ -1,4 +1,4 @@
-"""The prediction of one scene as a file: the fields of its type as arrays, features of each point beside them."""
+"""The prediction of one scene as a file: the fields of its type as arrays, per-point features in a second file."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacin
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.files import regular
 
-MAX_TEXTS = 1 << 20  # of one field; each becomes an object of its own
+MAX_TEXTS = 1 << 20  # per field; each becomes a Python object
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
-# Kind of values and shape of each field of a stored prediction, None for any length, in the order of the file.
+# The dtype kind and shape of each field of a stored prediction, None for any length, in the order of the file.
 FIELDS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     "points": ("f", (None, 3)),
     "indptr": ("i", (None,)),
@@ -39,8 +39,7 @@ FIELDS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     "edge_scores": ("f", (None, None)),
     "predicates": ("U", (None,)),
 }
-# Kinds of what is kept of predictions over the points of files that have no coordinates; ``predictions.own_runs`` reads
-# them.
+# Kinds of stored predictions over points of files without coordinates; ``predictions.own_runs`` reads them.
 OVER_VERTICES = ("VertexMasks", "VertexLabels")
 
 
@@ -49,7 +48,7 @@ def _fields_of(kind: type[Prediction]) -> list[str]:
 
 
 def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
-    """A prediction as named arrays, ``kind`` among them; absent fields are left out."""
+    """A prediction as named arrays, including ``kind``; absent fields are omitted."""
     arrays = {"kind": np.array(type(prediction).__name__)}
     for name in _fields_of(type(prediction)):
         value = getattr(prediction, name)
@@ -59,21 +58,21 @@ def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
 
 
 def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Prediction:
-    """The reverse of ``prediction_arrays``; ``where`` begins the message when the arrays are no prediction."""
+    """The reverse of ``prediction_arrays``; ``where`` begins the message if the arrays are not a prediction."""
     kinds = {kind.__name__: kind for kind in (Instances, Partition, DenseFeatures)}
     kind = kinds.get(str(arrays.get("kind")))
     if str(arrays.get("kind")) in OVER_VERTICES:
         raise PredictionError(
-            f"{where}: is over the points of ground-truth files, which have no coordinates, so that there is no map; "
-            "evaluate against the dataset itself (--dataset) for one"
+            f"{where}: uses the points of ground-truth files, which have no coordinates, so there is no map; "
+            "evaluate with the dataset itself (--dataset)"
         )
     if kind is None:
-        raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
+        raise PredictionError(f"{where}: has no 'kind' of {', '.join(kinds)}; it is not a prediction")
     if fault := array_fault(arrays):
         raise PredictionError(f"{where}: {fault}; run the scene again")
     for name in (name for name in FIELDS if name in arrays):
         if arrays[name].dtype.kind == "U" and arrays[name].size > MAX_TEXTS:
-            raise PredictionError(f"{where}: '{name}' holds {arrays[name].size} texts; is it damaged?")
+            raise PredictionError(f"{where}: '{name}' has {arrays[name].size} texts; is it damaged?")
     values: dict[str, Any] = {}
     for name in _fields_of(kind):
         value = arrays.get(name)
@@ -81,7 +80,7 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     types = {name: str(field.type) for name, field in kind.__dataclass_fields__.items()}
     missing = [name for name, value in values.items() if value is None and "None" not in types[name]]
     if missing:
-        raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
+        raise PredictionError(f"{where}: '{missing[0]}' is missing; write it again with su3d-bench run")
     prediction: Prediction = kind(**values)
     return prediction
 
@@ -91,19 +90,19 @@ def _texts(values: NDArray[Any]) -> tuple[Any, ...]:
 
 
 def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:
-    """Which array of a prediction has another shape or kind of values than it must, and what it must have."""
+    """A message on the first array of a prediction with a wrong shape or dtype, with the expected one; or None."""
     kinds = {"f": "floats", "i": "integers", "U": "texts"}
     for name in (name for name in FIELDS if name in arrays):
         array, (kind, shape) = np.asarray(arrays[name]), FIELDS[name]
         fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits or array.dtype.kind != kind or (name == "indptr" and not array.size):
             wanted = f"{kinds[kind]} ({', '.join('N' if n is None else str(n) for n in shape)})"
-            return f"'{name}' is an array of shape {array.shape} {array.dtype.name}, not {wanted}"
+            return f"'{name}' is an array of shape {array.shape} {array.dtype.name}; expected {wanted}"
     return None
 
 
 def value_fault(prediction: Prediction) -> str | None:
-    """Which values of a prediction cannot be, or do not go with its points; None where all can."""
+    """A message on the first invalid values of a prediction, or on sizes that do not match its points; or None."""
     n = len(prediction.points)
     scores = prediction.scores if isinstance(prediction, Instances) else np.zeros(0)
     for name, values in (("points", prediction.points), ("scores", scores)):
@@ -119,12 +118,12 @@ def value_fault(prediction: Prediction) -> str | None:
 
 
 def features_beside(path: Path) -> Path:
-    """Where the features of a dense prediction at ``path`` are: a file of their own, read without loading it."""
+    """The path of the features of a dense prediction at ``path``: a separate file that is memory-mapped."""
     return path.with_name(f"{path.name.removesuffix('.npz')}.features.npy")
 
 
 def write_prediction(path: Path, prediction: Prediction) -> None:
-    """Store ``prediction`` at ``path``, the features of a dense one beside it."""
+    """Store ``prediction`` at ``path``, and the features of a dense one in a second file."""
     arrays, features_path = prediction_arrays(prediction), features_beside(path)
     if isinstance(prediction, DenseFeatures):
         _write_rows(features_path, arrays.pop("features"))
@@ -134,7 +133,7 @@ def write_prediction(path: Path, prediction: Prediction) -> None:
 
 
 def _write_rows(path: Path, table: NDArray[Any]) -> None:
-    """Put ``table`` at ``path`` as a .npy file, a block at a time."""
+    """Write ``table`` to ``path`` as a .npy file, one block at a time."""
     descr = np.lib.format.dtype_to_descr(table.dtype)
     with replacing(path) as stream:
         header = {"descr": descr, "fortran_order": False, "shape": table.shape}
@@ -146,7 +145,7 @@ def _write_rows(path: Path, table: NDArray[Any]) -> None:
 def read_prediction(path: Path) -> Prediction:
     """The prediction that a run stored at ``path``; features of a dense one are memory-mapped.
 
-    Points are metres, (M, 3) float32. A ``StoreError`` or ``PredictionError`` where the file is damaged or none.
+    Points are metres, (M, 3) float32. Raises ``StoreError`` or ``PredictionError`` for a damaged or missing file.
 
     >>> import su3d_bench as su3d
     >>> prediction = su3d.read_prediction("runs/demo/scenes/rooms.bathroom7/oracle/prediction.npz")
@@ -157,7 +156,7 @@ def read_prediction(path: Path) -> Prediction:
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         arrays["features"] = _mapped_rows(features_beside(path))
         if "points" not in arrays or arrays["features"].shape[:1] != arrays["points"].shape[:1]:
-            raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
+            raise StoreError(f"{features_beside(path)}: its rows do not match {path.name}; delete both and run again")
     return prediction_from_arrays(arrays, str(path))
 
 
@@ -167,5 +166,5 @@ def _mapped_rows(path: Path) -> NDArray[Any]:
     except DAMAGE as error:
         raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
     if table.ndim != 2 or table.dtype.kind != "f":
-        raise StoreError(f"{path}: holds {table.dtype} {table.shape}, no rows of features; delete it and run again")
+        raise StoreError(f"{path}: has {table.dtype} {table.shape}; expected rows of features; delete it and run again")
     return table

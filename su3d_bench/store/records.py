@@ -1,7 +1,7 @@
-"""What the small files of a run hold: ``run.json``, ``metrics.json``, the seals of ``done.json``, ``updates.csv``.
+"""The records in the small files of a run: ``run.json``, ``metrics.json``, ``done.json`` and ``updates.csv``.
 
-Whoever writes one of them writes these records, and whoever reads one gets them. Their fields stand in the order in
-which a file has them; one with a default may be missing, for earlier versions did not write it.
+These files are written from and read into these records. Fields have the order of the file; a field with a default may
+be missing, because earlier versions did not write it.
 """
 
 from __future__ import annotations
@@ -24,24 +24,23 @@ from su3d_bench.core.types import Float64Array
 SCHEMA = 1
 MAX_UPDATES = 10_000_000
 Kind = TypeVar("Kind")
-ROUNDING = 1e-9  # by how much a mean of shares may pass 1
-MAX_VALUE = 1e18  # milliseconds, bytes or things: more than there are
-Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass every comparison
+ROUNDING = 1e-9  # a mean of fractions may exceed 1 by this much
+MAX_VALUE = 1e18  # milliseconds, bytes or things: more than possible
+Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would pass every comparison
 Amount = Annotated[float, Field(ge=0, le=MAX_VALUE, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=int(MAX_VALUE))]
 Share = Annotated[float, Field(ge=0, le=1 + ROUNDING, allow_inf_nan=False)]
 
 
 def impossible_value(name: str, value: float) -> str | None:
-    """A clause where the value ``name`` of a result cannot be ``value``: ``n_...`` are numbers of things, all others
-    fractions.
+    """A message if ``value`` is impossible for ``name`` in a result: ``n_...`` are counts, all others fractions.
 
     >>> impossible_value("mAcc", 7e300), impossible_value("n_classes", 7)
-    ("'mAcc' is 7e+300, a fraction lies from 0 to 1", None)
+    ("'mAcc' is 7e+300; a fraction must be from 0 to 1", None)
     """
     if name.startswith("n_"):
-        return None if 0 <= value <= MAX_VALUE else f"'{name}' is {value:g}, of which there are none or more"
-    return None if 0 <= value <= 1 + ROUNDING else f"'{name}' is {value:g}, a fraction lies from 0 to 1"
+        return None if 0 <= value <= MAX_VALUE else f"'{name}' is {value:g}; a count must be from 0 to {MAX_VALUE:g}"
+    return None if 0 <= value <= 1 + ROUNDING else f"'{name}' is {value:g}; a fraction must be from 0 to 1"
 
 
 def _possible(values: Mapping[str, float | None]) -> Mapping[str, float | None]:
@@ -56,7 +55,7 @@ Values = Annotated[Mapping[str, Number | None], AfterValidator(_possible)]
 
 @dataclass(frozen=True)
 class ProtocolRecord:
-    """The rules that scored a run. ``rules``: all of them, where they are somebody's own and not the program's."""
+    """The protocol that scored a run. ``rules``: the complete rules of a user-defined protocol."""
 
     name: str
     version: int
@@ -66,7 +65,7 @@ class ProtocolRecord:
 
 @dataclass(frozen=True)
 class FailureRecord:
-    """A scene under a method that failed, with its line."""
+    """A scene that failed with a method, with the error message."""
 
     scene: str
     method: str
@@ -75,7 +74,7 @@ class FailureRecord:
 
 @dataclass(frozen=True)
 class UnscoredRecord:
-    """Why a scene under a method has no score of a protocol."""
+    """The reason why a scene has no score for a method and protocol."""
 
     scene: str
     method: str
@@ -85,9 +84,9 @@ class UnscoredRecord:
 
 @dataclass(frozen=True)
 class TruthRecord:
-    """What predictions made elsewhere were held against: a dataset, or the files at ``path``.
+    """The ground truth of imported predictions: a dataset, or the files at ``path``.
 
-    ``values``: what a text was said to hold; ``queries``: SHA-256 of the file of queries.
+    ``values``: the declared meaning of the values in a text file; ``queries``: SHA-256 of the file of queries.
     """
 
     dataset: str | None
@@ -98,10 +97,10 @@ class TruthRecord:
 
 @dataclass(frozen=True)
 class PredictionsRecord:
-    """Predictions made elsewhere that a run took for those of ``method``.
+    """Imported predictions that a run used as those of ``method``.
 
-    ``files``: SHA-256 of every file that was read, by scene and path. ``confidences`` is ``file`` where those of the
-    files count even where a protocol has 1 for every mask. ``texts``: the file of the features of class names and its
+    ``files``: SHA-256 of every file that was read, by scene and path. ``confidences`` is ``file`` if those of the files
+    are used even if a protocol has 1 for every mask. ``texts``: the file of text features of the class names and its
     SHA-256.
     """
 
@@ -123,12 +122,12 @@ class GitRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """``run.json``: where the numbers come from; that of a run that is not finished, or of an older version, says less.
+    """``run.json``: the provenance of the numbers; with fewer fields for an unfinished run or an older version.
 
-    ``models`` holds the SHA-256 of weight files by model and file name.
+    ``models`` has the SHA-256 of weight files by model and file name.
 
-    ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``. ``predictions`` are those that were made
-    elsewhere, ``ground_truth`` what they were held against.
+    ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``. ``predictions`` are imported ones,
+    ``ground_truth`` what they were compared with.
     """
 
     schema: int = SCHEMA
@@ -157,13 +156,13 @@ class RunRecord:
 
     @property
     def truth_files(self) -> str | None:
-        """The folder of ground truth that predictions were compared with in place of a dataset."""
+        """The folder of ground-truth files used in place of a dataset."""
         return None if self.ground_truth is None else self.ground_truth.path
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumbersRecord:
-    """``result`` of a result: the numbers over the scored scenes as fractions, null where undefined."""
+    """``result`` of a result: the numbers over the scored scenes as fractions, null if undefined."""
 
     protocol: str = ""
     version: int = 0
@@ -184,7 +183,7 @@ class NumbersRecord:
 
 @dataclass(frozen=True)
 class MidwayRecord:
-    """The metrics of the maps after ``share`` of the updates."""
+    """The metrics of the maps after the fraction ``share`` of the updates."""
 
     share: Share
     metrics: Values
@@ -192,11 +191,11 @@ class MidwayRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRecord:
-    """One method under one protocol; ``encoder`` is null where the method named its instances itself.
+    """One method under one protocol; ``encoder`` is null if the method labelled its instances itself.
 
-    ``result`` is null where no scene was scored; ``anytime`` is missing where no map midway was asked for;
-    ``confidences``: what ranked the predictions of an average precision, null where none was formed. ``labels``: how
-    many labels of a mask or point count, null where none does, or where an older run does not say.
+    ``result`` is null if no scene was scored; ``anytime`` is missing if no intermediate map was requested;
+    ``confidences``: what ranked the predictions for average precision, null without that metric. ``labels``: how many
+    labels per mask or point count, null if labels are not scored, or if an older run did not record it.
     """
 
     method: str
@@ -220,7 +219,7 @@ class ResultRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class MetricsRecord:
-    """``metrics.json``: what the run measured; ``limit`` is 0 where all frames were used."""
+    """``metrics.json``: the results of the run; ``limit`` is 0 if all frames were used."""
 
     schema: int = SCHEMA
     is_partial: bool = False
@@ -232,7 +231,7 @@ class MetricsRecord:
 
 @dataclass(frozen=True)
 class MapCost:
-    """What one map took: the updates before it, milliseconds of ``finish``, and what of them was perception's."""
+    """The cost of one map: the updates before it, milliseconds of ``finish``, and the part of perception in these."""
 
     n_updates: Count
     finish_ms: Amount
@@ -241,11 +240,11 @@ class MapCost:
 
 @dataclass(frozen=True)
 class CostsRecord:
-    """``costs`` beside the seal of ``predict``: maps midway and the last one, null for what was not measured.
+    """``costs`` in the completion record of ``predict``: intermediate maps and the last one, null if not measured.
 
-    ``calibration_ms``: the time of a fixed piece of work, measured between the updates; ``start_ms`` and ``close_ms``:
-    what the method took before the first frame and after the last map. What a method measures itself stands beside the
-    numbers of a map.
+    ``calibration_ms``: the time of a fixed workload, measured between the updates; ``start_ms`` and ``close_ms``:
+    the method's time before the first frame and after the last map. Numbers that a method measures itself are stored
+    with those of a map.
     """
 
     maps: tuple[MapCost, ...] = ()
@@ -258,7 +257,7 @@ class CostsRecord:
 
 @dataclass(frozen=True)
 class CompletionRecord:
-    """A step of ``done.json``: the key of its inputs, the SHA-256 of the files that it vouches for, and remarks."""
+    """The completion record of a step in ``done.json``: the key of its inputs, SHA-256 of its files, and remarks."""
 
     key: Mapping[str, str]
     files: Annotated[Mapping[str, str], Field(min_length=1)]
@@ -271,7 +270,7 @@ _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
 
 
 def plain(record: Any) -> dict[str, Any]:
-    """``record`` as it is written."""
+    """``record`` as a dict in the form that is written."""
     written = asdict(record)
     if isinstance(record, RunRecord) and record.ground_truth is None:
         del written["predictions"], written["ground_truth"]
@@ -285,26 +284,26 @@ def plain(record: Any) -> dict[str, Any]:
 
 
 def checked(kind: type[Kind], value: Any) -> Kind:
-    """The record that ``value`` is; a ``ValidationError`` or ``RecursionError`` where it is none."""
+    """``value`` as a record; raises ``ValidationError`` or ``RecursionError`` if it is invalid."""
     record: Kind = _ADAPTERS[kind].validate_python(value)
     return record
 
 
 def read_record(kind: type[Kind], file: Path, shown: str) -> Kind:
-    """The record in ``file``; ``shown`` begins the ``StoreError`` where it holds none."""
+    """The record in ``file``; ``shown`` begins the ``StoreError`` if it is invalid."""
     try:
         return checked(kind, read_json(file))
     except (RecursionError, ValidationError) as error:
-        key, reason = "it", "nested too deep"
+        key, reason = "it", "too deeply nested"
         if isinstance(error, ValidationError):
             first = error.errors()[0]
             key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"].removeprefix("Value error, ")
-        what = f"{printable(key, 120)} is not as a run writes it ({printable(reason, 160)})"
+        what = f"{printable(key, 120)} is invalid ({printable(reason, 160)})"
         raise StoreError(f"{shown}: {file.name}: {what}; run it again") from error
 
 
 def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:
-    """``updates.csv``: the updates of a scene, one row each; a stage that an update lacks is 0."""
+    """``updates.csv``: the updates of a scene, one row each; a missing stage is 0."""
     columns = list(dict.fromkeys(name for row in rows for name in row if name != "total_ms"))
     text = io.StringIO()
     writer = csv.DictWriter(text, [*columns, "total_ms"] if rows else ["update"], restval=0, lineterminator="\n")
@@ -314,7 +313,7 @@ def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:
 
 
 def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
-    """The columns (N,) of an ``updates.csv``, none where no update was timed; ``where`` begins a ``DataError``."""
+    """The columns (N,) of an ``updates.csv``, empty if no update was timed; ``where`` begins a ``DataError``."""
     try:
         with opened_text(file, newline="") as stream:
             reader = csv.reader(stream)
@@ -324,13 +323,13 @@ def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
                 return {}
             table = np.array(rows, np.float64).reshape(len(rows), len(header))
     except (ValueError, csv.Error, UnicodeDecodeError) as error:
-        raise DataError(f"{where}: is not a table of numbers; run the same command again to mend it") from error
+        raise DataError(f"{where}: is not a table of numbers; run the same command again to repair it") from error
     if not np.isfinite(table).all():
-        raise DataError(f"{where}: holds a number that is not finite; run the same command again to mend it")
+        raise DataError(f"{where}: has a number that is not finite; run the same command again to repair it")
     if table.size and not 0 <= table.min() <= table.max() <= MAX_VALUE:
         raise DataError(
-            f"{where}: holds {table.min():g} and {table.max():g}; times and sizes lie from 0 to {MAX_VALUE:g}"
+            f"{where}: has {table.min():g} and {table.max():g}; times and sizes must be from 0 to {MAX_VALUE:g}"
         )
     if len(set(header)) != len(header):
-        raise DataError(f"{where}: has two columns of one name; run the same command again to mend it")
+        raise DataError(f"{where}: has two columns with the same name; run the same command again to repair it")
     return {name: table[:, column] for column, name in enumerate(header)}

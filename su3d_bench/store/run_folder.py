@@ -1,8 +1,8 @@
-"""The run folder: where its files are, content keys, one writer at a time.
+"""The run folder: its files, content keys, one writer at a time.
 
-A job is one scene under one method. It has two *steps*, ``predict`` and ``score``; ``done.json`` seals each with the
-key of all its inputs and the SHA-256 of the files that it vouches for. A file that is damaged or missing makes its
-step run anew; a step sealed under another key is refused, naming the field that changed.
+A job is one scene with one method. It has two *steps*, ``predict`` and ``score``; ``done.json`` has a completion record
+for each, with the key of all its inputs and the SHA-256 of its files. If a file is damaged or missing, its step runs
+again; a step completed under another key is an error that names the changed field.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import SCHEMA, CompletionRecord, checked, plain
 
 JOBS = "scenes"
-SHARED_FOLDERS = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
-MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
+SHARED_FOLDERS = ("language", "language/images")  # written by all jobs of a run; a job clears its own folders
+MARKS = ("run.toml", "run.json")  # files that identify a run folder; a run writes the first one first
 RECORDS = (*MARKS, "metrics.json", "ablation.json")
-FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run whose files have names of many forms
-# The files that a run, or a verb beside its map, writes; "refined_names.json" is what the verb refine leaves.
+FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run with files of any name
+# The files written by a run or by a command that adds to a map; "refined_names.json" is written by refine.
 _RUN_OPTIONS = re.compile(
     r"run\.toml|(run|metrics|ablation)\.json|\.lock|(language|slurm|\.cache)/.+|scenes/[^/]+/[^/]+/("
     r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|updates\.csv"
     r"|log\.txt|done\.json|refined_names\.json|pictures/[^/]+\.png)",
     re.DOTALL,
 )
-BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may hold of which a power cut took them
-# What a folder's name says otherwise, so that each scene has a folder of its own; "." ends the dataset's name.
+BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may have left if a power cut removed the MARKS
+# Characters escaped in folder names, so that each scene has its own folder; "." ends the dataset's name.
 _ESCAPES = {"%": "%25", "/": "%2F", ".": "%2E"}
 _ESCAPED = re.compile("|".join(_ESCAPES.values()))
 
 
 def folder_of_scene(address: str) -> str:
-    """The name of the folder of a scene, ``<dataset>/<scene>``; no two scenes have one.
+    """The folder name of a scene ``<dataset>/<scene>``, unique to the scene.
 
     >>> folder_of_scene("rooms/living0"), folder_of_scene("mine/hall/left_1.5")
     ('rooms.living0', 'mine.hall%2Fleft_1.5')
@@ -54,7 +54,7 @@ def folder_of_scene(address: str) -> str:
 
 
 def scene_of_folder(name: str) -> str:
-    """The address of the scene whose folder has this name.
+    """The address of the scene with this folder name.
 
     >>> scene_of_folder("rooms.living0"), scene_of_folder("mine.hall%2Fleft_1.5")
     ('rooms/living0', 'mine/hall/left_1.5')
@@ -68,56 +68,56 @@ def _escaped(text: str, characters: str) -> str:
 
 
 def check_no_links(top: Path, place: Path) -> None:
-    """A ``StoreError`` where a folder below ``top`` on the way to ``place``, or that itself, is a link elsewhere."""
+    """Raise ``StoreError`` if ``place`` or one of its parents below ``top`` is a symbolic link."""
     for folder in (place, *place.parents):
         if folder == top:
             return
         if folder.is_symlink():
-            raise StoreError(f"{shown(folder)}: is a link, and a run writes into folders of its own alone; remove it")
+            raise StoreError(f"{shown(folder)}: is a link, but a run writes only to its own folders; remove the link")
 
 
 def check_not_run_file(place: Path) -> None:
-    """A ``StoreError`` where a verb would write into the place of what a run itself has written."""
+    """Raise ``StoreError`` if a command would overwrite a file of the run itself."""
     above = place.absolute().parents
     is_record = place.name in RECORDS and is_run(above[0])
     is_of_job = len(above) > 3 and above[2].name == JOBS and is_run(above[3])
     if (is_record or is_of_job) and os.path.exists(place):
-        raise StoreError(f"{shown(place)}: is a file of the run itself, and stays as it is; choose another name")
+        raise StoreError(f"{shown(place)}: is a file of the run itself and cannot be replaced; choose another name")
 
 
 def is_run(folder: Path) -> bool:
-    """Whether the folder is known for a run's."""
+    """Whether the folder is a run folder."""
     return any(os.path.isfile(folder / name) for name in MARKS)
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Where one run's files are; see DESIGN for the layout."""
+    """The files of one run; see DESIGN for the layout."""
 
     path: Path
 
     def job(self, scene: str, method: str) -> JobFolder:
-        """The folder of one scene (``<dataset>/<scene>``) under one method."""
+        """The folder of one scene (``<dataset>/<scene>``) with one method."""
         return JobFolder(self.path / JOBS / folder_of_scene(scene) / method)
 
     def check_is_run_folder(self) -> None:
-        """A ``StoreError`` where the folder holds something and is no run's."""
+        """Raise ``StoreError`` if the folder is not empty and not a run folder."""
         try:
             names = sorted(os.listdir(self.path))
-        except OSError:  # whoever writes there says more
+        except OSError:  # writing there gives a better message
             return
         foreign_files = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
         if foreign_files and not any(name in MARKS for name in names):
             raise StoreError(
-                f"{shown(self.path)}: holds '{foreign_files[0]}' and is no folder of a run; choose a new folder with --out"
+                f"{shown(self.path)}: contains '{foreign_files[0]}' and is not a run folder; choose a new one with --out"
             )
 
     def jobs(self) -> list[JobFolder]:
-        """The folder of each job that is there, of this run's request or not."""
+        """The folders of all existing jobs, requested by this run or not."""
         return [JobFolder(path) for path in sorted(self.path.glob(f"{JOBS}/*/*")) if path.is_dir()]
 
     def foreign_files(self) -> Iterator[str]:
-        """What stands in the folder and was written by no run, nor by a verb beside its map; links count among it."""
+        """Files in the folder that neither a run nor another command has written; including links."""
         for above, folders, files in os.walk(self.path):
             where = Path(above).relative_to(self.path)
             links = [name for name in folders if Path(above, name).is_symlink()]
@@ -130,7 +130,7 @@ class RunFolder:
                 yield from (name for name in sorted(folders) if not is_unfinished(name) and name not in known)
 
     def remove(self) -> None:
-        """Remove the folder with all that it holds, at once or not at all; ``StoreError`` where a run writes there."""
+        """Remove the folder and its content atomically; ``StoreError`` if a run is writing there."""
         with self.locked():
             place = temporary_path(self.path)
             try:
@@ -140,11 +140,11 @@ class RunFolder:
                 raise StoreError(f"{shown(self.path)}: cannot be removed: {reason}; nothing was changed") from error
             shutil.rmtree(place, ignore_errors=True)
         if place.exists():
-            raise StoreError(f"{shown(place)}: a part of what was removed cannot be; remove it yourself")
+            raise StoreError(f"{shown(place)}: was only partly removed; remove the rest yourself")
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the folder against a second run; the lock dies with the process and leaves no file behind."""
+        """Lock the folder; the lock ends with the process and leaves no file."""
         make_folder(self.path)
         try:
             handle = hold_folder(self.path)
@@ -164,7 +164,7 @@ class RunFolder:
 
 @dataclass(frozen=True)
 class JobFolder:
-    """The files of one scene under one method."""
+    """The files of one scene with one method."""
 
     path: Path
 
@@ -173,7 +173,7 @@ class JobFolder:
         return self.path / "prediction.npz"
 
     def anytime(self, share: float) -> Path:
-        """The map after the first ``share`` of the updates."""
+        """The map after the first fraction ``share`` of the updates."""
         return self.path / f"anytime-{share:g}.npz"
 
     def anytime_counts(self, share: float) -> Path:
@@ -201,22 +201,22 @@ class JobFolder:
         return self.path / "done.json"
 
     def check_no_links(self) -> None:
-        """A ``StoreError`` where writing into the job's folders would write elsewhere."""
+        """Raise ``StoreError`` if a folder of the job is a link."""
         check_no_links(self.path.parents[2], self.pictures)
 
     def picture(self, name: str) -> Path:
-        """Where a picture of this name goes."""
+        """The path of the picture ``name``."""
         self.check_no_links()
         return self.pictures / name
 
     def prepare(self) -> None:
-        """Make the folder and clear what a killed run left unfinished."""
+        """Create the folder and remove unfinished files of a killed run."""
         self.check_no_links()
         make_folder(self.path)
         clear_unfinished(self.pictures)
 
     def remove(self) -> None:
-        """Remove the folder, and that of its scene where it was the last there."""
+        """Remove the folder, and its scene's folder if that is then empty."""
         self.check_no_links()
         place = temporary_path(self.path)
         with suppress(FileNotFoundError):
@@ -226,7 +226,7 @@ class JobFolder:
             self.path.parent.rmdir()
 
     def completion_records(self) -> dict[str, CompletionRecord]:
-        """The sealed steps; nothing where ``done.json`` is missing or damaged."""
+        """The completion records by step; empty if ``done.json`` is missing or damaged."""
         try:
             record = read_json(self.done)
         except StoreError:
@@ -241,9 +241,9 @@ class JobFolder:
     def mark_complete(
         self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, Any] | None = None
     ) -> None:
-        """Vouch for ``files`` as the outcome of ``step`` under ``key``; sealing ``predict`` breaks the other seal.
+        """Record ``files`` as the result of ``step`` under ``key``; a new record of ``predict`` removes the other one.
 
-        The features beside a dense prediction go with it. ``remarks`` are kept beside them for whoever resumes.
+        The features of a dense prediction are included. ``remarks`` are stored for resumed runs.
         """
         steps = {} if step == "predict" else self.completion_records()
         temporary_path = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
@@ -255,12 +255,12 @@ class JobFolder:
         )
 
     def remarks(self, step: str) -> Mapping[str, Any]:
-        """What was kept beside the seal of ``step``."""
+        """The remarks in the completion record of ``step``."""
         mark_complete = self.completion_records().get(step)
         return {} if mark_complete is None else mark_complete.remarks
 
     def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
-        """A clause that names the first field in which the sealed key differs from ``key``; None where none does.
+        """A clause with the first field in which the recorded key differs from ``key``; None if equal.
 
         Fields in ``known_later`` are not compared.
         """
@@ -274,11 +274,11 @@ class JobFolder:
         return None
 
     def is_done(self, step: str, key: Mapping[str, str]) -> bool:
-        """Whether ``step`` is sealed under exactly ``key`` and every file that it vouches for is whole."""
+        """Whether ``step`` is completed under exactly ``key`` and all its files are intact."""
         return self.is_whole(self.completion_records().get(step), key)
 
     def is_whole(self, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``mark_complete``, one of ``completion_records``, is of exactly ``key`` and every file that it vouches for is whole."""
+        """Whether ``mark_complete``, one of ``completion_records``, has exactly ``key`` and all its files are intact."""
         if mark_complete is None or mark_complete.key != dict(key):
             return False
         files = {self.path / name: digest for name, digest in mark_complete.files.items()}

@@ -1,4 +1,4 @@
-"""The public Python API: every example of a docstring, tables that hold what the files hold, errors of one line."""
+"""The public Python API: all docstring examples, tables equal to the files, one-line errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BOTH = ["rooms-semantic", "rooms-instance"]
 
 
 def documented() -> Iterator[tuple[str, Any]]:
-    """Every public name, and what of ours the public classes of results have."""
+    """Every public name, and the public members of the result classes."""
     for name in su3d.__all__:
         value = getattr(su3d, name)
         yield name, value
@@ -41,7 +41,7 @@ DOCUMENTED = dict(documented())
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
-    """A folder with what the examples speak of: a run of a small room, predictions and their truth."""
+    """A folder with the data of the examples: a run of a small room, predictions and their ground truth."""
     folder = tmp_path_factory.mktemp("api")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -67,16 +67,14 @@ def here(place: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 
 
 @pytest.mark.parametrize("name", DOCUMENTED)
-def test_each_public_name_has_an_example_that_runs(name: str, here: Path) -> None:
+def test_each_public_name_has_a_running_example(name: str, here: Path) -> None:
     (found,) = doctest.DocTestFinder(recurse=False).find(DOCUMENTED[name], name, globs={})
     assert found.examples, f"{name}: its docstring has no example"
     ran = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(found)
     assert ran.failed == 0
 
 
-def test_the_page_of_python_runs_as_one_script(
-    rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_page_runs_as_one_script(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     blocks = (ROOT / "docs" / "python.md").read_text().split("```python\n")[1:]
@@ -92,7 +90,7 @@ def test_the_page_of_python_runs_as_one_script(
 
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Two methods over four painted scenes, from the command line; one loses an object of each."""
+    """Two methods over four painted scenes, from the command line; one misses an object in each."""
     folder = tmp_path_factory.mktemp("painted") / "run"
     words = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "oracle", "--protocols", *BOTH]
     words += ["--set", "collector.drop=1"]
@@ -102,7 +100,7 @@ def painted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def test_the_tables_of_numbers_hold_what_metrics_json_holds(painted: Path) -> None:
+def test_metric_tables_equal_metrics_json(painted: Path) -> None:
     run = su3d.load_run(painted)
     results = json.loads((painted / "metrics.json").read_text())["results"]
     metrics = run.metrics.set_index(["method", "protocol", "metric"])
@@ -128,7 +126,7 @@ def test_the_tables_of_numbers_hold_what_metrics_json_holds(painted: Path) -> No
     assert min(n.values()) > 0
 
 
-def test_the_table_of_updates_holds_every_updates_csv(painted: Path) -> None:
+def test_updates_table_equals_every_updates_csv(painted: Path) -> None:
     run = su3d.load_run(painted)
     updates = run.updates
     for scene in run.scenes:
@@ -139,7 +137,7 @@ def test_the_table_of_updates_holds_every_updates_csv(painted: Path) -> None:
     assert str(updates["update"].dtype) == "int64" and str(updates["total_ms"].dtype) == "float64"
 
 
-def test_the_table_of_errors_is_what_attribute_says(painted: Path, tmp_path: Path) -> None:
+def test_errors_table_equals_the_attribute_command(painted: Path, tmp_path: Path) -> None:
     words = ["report", "attribution", str(painted), "--method", "collector"]
     assert main([*words, f"--json={tmp_path / 'errors.json'}"]) == 0
     errors = su3d.load_run(painted).errors
@@ -154,7 +152,7 @@ def test_the_table_of_errors_is_what_attribute_says(painted: Path, tmp_path: Pat
             assert value + rows.drop("stage", level="part")["gain"].sum() == pytest.approx(1, abs=1e-12)
 
 
-def test_a_run_that_is_evaluated_has_the_numbers_of_the_evaluation(here: Path) -> None:
+def test_evaluated_run_has_the_numbers_of_the_evaluation(here: Path) -> None:
     scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
     run = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance", out="runs/again")
     assert type(scores) is su3d.Scores and isinstance(run, su3d.Run)
@@ -168,20 +166,20 @@ def test_a_run_that_is_evaluated_has_the_numbers_of_the_evaluation(here: Path) -
     assert found["centre_x_m"].isna().all(), "files of truth say nothing of places"
 
 
-# what is shown
+# display
 
 
-def test_a_terminal_and_a_notebook_show_the_tables_without_what_would_act_there(painted: Path) -> None:
+def test_terminal_and_notebook_show_escaped_tables(painted: Path) -> None:
     run = su3d.Run(painted, ["<script>alert(1)</script> \x1b[31m"])
     assert "collector" in str(run) and "\x1b" not in str(run) + repr(run)
     page = run._repr_html_()
     assert "<table>" in page and "&lt;script&gt;" in page and "<script>" not in page and "\x1b" not in page
 
 
-# making
+# running
 
 
-def test_a_script_without_a_guard_starts_workers_and_runs_once(tmp_path: Path) -> None:
+def test_script_without_main_guard_starts_workers_and_runs_once(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
         "import su3d_bench as su3d\n"
@@ -194,9 +192,7 @@ def test_a_script_without_a_guard_starts_workers_and_runs_once(tmp_path: Path) -
     assert done.stdout.splitlines() == ["begun", f"{script} True 2"], done.stderr
 
 
-def test_scenes_that_fail_are_an_error_and_the_others_are_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_scenes_raise_an_error_and_the_others_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     see_painted(monkeypatch)
     events = list[str]()
     with pytest.raises(RunIncomplete, match=r"1 of 2 scenes failed, the first with: .*frame 2 is missing.*load_run"):
@@ -225,8 +221,8 @@ def test_scenes_that_fail_are_an_error_and_the_others_are_there(
             lambda: su3d.run("rooms/living0", settings={"opensu3d.top_m": object()}),
             r"run\(settings=...\): no TOML form",
         ),
-        (lambda: su3d.run("rooms/living0", into="other"), "is none of own, extend, replace"),  # type: ignore[arg-type]
-        (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions were named"),
+        (lambda: su3d.run("rooms/living0", into="other"), "expected one of own, extend, replace"),  # type: ignore[arg-type]
+        (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions; pass a folder"),
         (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),  # type: ignore[call-overload]
         (lambda: su3d.load_run("nowhere"), "nowhere: contains no run.json"),
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
@@ -235,7 +231,7 @@ def test_scenes_that_fail_are_an_error_and_the_others_are_there(
         (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "has no scores of the method 'sam3d'"),
     ],
 )
-def test_what_a_user_can_cause_is_an_error_of_one_line(call: Any, line: str, here: Path) -> None:
+def test_each_user_error_is_one_line(call: Any, line: str, here: Path) -> None:
     with pytest.raises(su3d.Su3dError, match=line) as raised:
         call()
     assert "\n" not in str(raised.value)
@@ -246,7 +242,7 @@ def test_what_a_user_can_cause_is_an_error_of_one_line(call: Any, line: str, her
 NOTEBOOK = ROOT / "docs" / "python.ipynb"
 
 
-def test_the_notebook_is_kept_without_answers() -> None:
+def test_notebook_is_stored_without_outputs() -> None:
     cells = json.loads(NOTEBOOK.read_text())["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert len(code) > 8
@@ -254,7 +250,7 @@ def test_the_notebook_is_kept_without_answers() -> None:
 
 
 @pytest.mark.proof
-def test_every_cell_of_the_notebook_runs(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_notebook_cell_runs(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbclient
     import nbformat
 

@@ -237,6 +237,6 @@ def test_nothing_is_written_through_a_symlink_in_place_of_a_job_folder(
     for words in (["runs", "refine", "runs/made"], ["query", "ask", SCENE, "Where is the bed?"]):
         assert main(words) == 2
         assert capsys.readouterr().err.endswith(
-            f"su3d-bench: {job.path}: is a link, and a run writes into folders of its own alone; remove it\n"
+            f"su3d-bench: {job.path}: is a link, but a run writes only to its own folders; remove the link\n"
         )
     assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == before

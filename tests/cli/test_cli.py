@@ -79,14 +79,14 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
         ("run --scenes nothing", "no scene matches 'nothing'; known datasets: rooms, replica"),
         (f"{TYPED} --methods opensu3", "unknown method 'opensu3'; did you mean 'opensu3d'?"),
-        (f"{TYPED} --methods {SCENES}/none.py:X", f"method '{SCENES}/none.py:X': there is no file {SCENES}/none.py"),
+        (f"{TYPED} --methods {SCENES}/none.py:X", f"method '{SCENES}/none.py:X': no file {SCENES}/none.py"),
         (f"{TYPED} --profile orcale", "unknown profile 'orcale'; did you mean 'oracle'?"),
         (
             f"{TYPED} --protocols scannet-instance",
             "protocol 'scannet-instance' fits no scene of this run: it scores the labels of 'scannet', painted has "
             "those of 'replica'",
         ),
-        (f"{TYPED} --set colector.drop=1", "--set colector.drop=1: 'colector' is no method or dataset of this run"),
+        (f"{TYPED} --set colector.drop=1", "--set colector.drop=1: 'colector' is not a method or dataset of this run"),
         (f"{TYPED} --set collector.dorp=1", "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
         (f"{TYPED} --config none.toml", "none.toml: cannot read the configuration: No such file or directory"),
         ("protocols shwo", "protocols: unknown action 'shwo'; did you mean 'show'? known: list, show, "),

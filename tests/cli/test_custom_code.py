@@ -46,8 +46,8 @@ def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 # The change to the template, and the message in addition to file and line.
 METHODS = {
     "no Python": ("    def start(", "    def start", "SyntaxError"),
-    "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "ends the program when it is imported"),
-    "no update": ("    def update(", "    def _update(", "lacks 'update'; a method has Config, finish, name"),
+    "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "exits the program on import"),
+    "no update": ("    def update(", "    def _update(", "'update' is missing; a method has Config, finish, name"),
     "unknown masks": (
         'masks="grounded"',
         'masks="boxes"',

@@ -105,7 +105,7 @@ def test_one_and_two_workers_generate_identical_files(tmp_path: Path) -> None:
         (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
         (["datasets", "make", "rooms", "--scenes", "replica/*"], "no scene 'replica/*'; expected 'rooms/...'"),
         (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),
-        ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file stands where a folder should be"),
+        ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file is in the place of a folder"),
     ],
 )  # fmt: skip
 def test_invalid_request_is_a_one_line_error(

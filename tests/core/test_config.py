@@ -40,7 +40,7 @@ def file_settings(tmp_path: Path, text: str) -> Settings:
     return read_file(path)
 
 
-def test_a_later_source_wins_and_each_value_knows_its_own(tmp_path: Path) -> None:
+def test_later_source_overrides_and_each_value_records_its_source(tmp_path: Path) -> None:
     settings = file_settings(tmp_path, "[method.opensu3d]\ntop_m = 7\nratios = [1, 2]\n")
     settings += read_assignments(["opensu3d.top_m=10"], ["opensu3d"], [])
     model = resolve(settings, ("method", "opensu3d"), Model)
@@ -61,7 +61,7 @@ def test_a_later_source_wins_and_each_value_knows_its_own(tmp_path: Path) -> Non
         ("seed = 1\nseed\n", "run.toml:2: not valid TOML: expected '=' after a key in a key/value pair"),
     ],
 )
-def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_file_is_reported_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_keys(file_settings(tmp_path, text))
     assert str(error.value).startswith(f"{tmp_path}/{message}")
@@ -75,7 +75,7 @@ def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message:
         ("[method.x]\n\ntop_m = '3'\n", "run.toml:3: x.top_m = '3': input should be a valid integer"),
     ],
 )
-def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_value_is_reported_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(file_settings(tmp_path, text), ("method", "x"), Model)
     assert str(error.value).startswith(f"{tmp_path}/{message}")
@@ -85,27 +85,27 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message
     ("text", "message"),
     [
         ("opensu3d.top_m", "--set opensu3d.top_m: expected KEY=VALUE, such as opensu3d.top_m=10"),
-        ("opensu3.top_m=1", "--set opensu3.top_m=1: 'opensu3' is no method or dataset of this run; "),
-        ("seed=3", "--set seed=3: 'seed' has a flag of its own: --seed"),
-        ("x.y=3", "--set x.y=3: 'x' is no method or dataset of this run; known: opensu3d, rooms, perception"),
+        ("opensu3.top_m=1", "--set opensu3.top_m=1: 'opensu3' is not a method or dataset of this run; "),
+        ("seed=3", "--set seed=3: 'seed' has its own flag: --seed"),
+        ("x.y=3", "--set x.y=3: 'x' is not a method or dataset of this run; known: opensu3d, rooms, perception"),
     ],
 )
-def test_a_wrong_assignment_is_explained(text: str, message: str) -> None:
+def test_invalid_assignment_is_explained(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         read_assignments([text], ["opensu3d", "opensu3d"], ["rooms"])
     assert str(error.value).startswith(message)
 
 
-def test_a_key_is_taken_as_a_file_has_it_too() -> None:
+def test_assignment_also_accepts_the_key_form_of_files() -> None:
     texts = ["method.opensu3d.top_m=1", "dataset.rooms.noise=2", "opensu3d.k=3"]
     settings = read_assignments(texts, ["opensu3d"], ["rooms"])
     paths = [("method", "opensu3d", "top_m"), ("dataset", "rooms", "noise"), ("method", "opensu3d", "k")]
     assert [entry.path for entry in settings.entries] == paths
-    with pytest.raises(ConfigError, match=r"'method' is no method or dataset of this run"):
+    with pytest.raises(ConfigError, match=r"'method' is not a method or dataset of this run"):
         read_assignments(["method.opensu3=1"], ["opensu3d"], ["rooms"])
 
 
-def test_assignments_take_toml_values_and_plain_text() -> None:
+def test_assignments_accept_toml_values_and_plain_text() -> None:
     settings = read_assignments(
         ["a.x=[1, 2.5]", "a.y=plain text", "a.z=true", "perception.q.r=-1e-3", 'rooms.s="12"'], ["a"], ["rooms"]
     )
@@ -118,13 +118,13 @@ def test_assignments_take_toml_values_and_plain_text() -> None:
     ]
 
 
-def test_run_values_out_of_range_are_refused() -> None:
+def test_run_values_out_of_range_are_rejected() -> None:
     settings = Settings((Setting(("stride",), -1, "--stride"),))
     with pytest.raises(ConfigError, match=r"^--stride: stride = -1: input should be greater than or equal to 0$"):
         resolve(settings, (), RunConfig)
 
 
-def test_written_toml_reads_back_as_it_was() -> None:
+def test_written_toml_reads_back_unchanged() -> None:
     table = {
         "seed": 3,
         "scenes": ["rooms/*", 'quote " and \\ back'],

@@ -1,4 +1,4 @@
-"""Keys of code: everything that can move a number counts, in whatever folder; what only shows numbers does not."""
+"""Code digests: they cover every file that can change a number, in any folder, and no file that only shows numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from su3d_bench.core import digests
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A small package in place of ours."""
+    """A small package in place of su3d_bench."""
     for name in ("metrics/area.py", "metrics/rules/area.toml", "datasets/rooms/labels.json", "cli/run.py"):
         write(tmp_path / name, "x = 1\n")
     monkeypatch.setattr(digests, "PACKAGE_ROOT", tmp_path)
@@ -50,22 +50,22 @@ def key() -> str:
         ("metrics/README.md", False),
     ],
 )
-def test_what_can_move_a_number_moves_the_key(package: Path, name: str, counts: bool) -> None:
+def test_code_digest_changes_with_files_that_can_change_a_number(package: Path, name: str, counts: bool) -> None:
     before = key()
     write(package / name, "x = 2\n")
     assert (key() != before) == counts
 
 
-def test_a_renamed_file_moves_the_key(package: Path) -> None:
+def test_renamed_file_changes_the_code_digest(package: Path) -> None:
     before = key()
     (package / "metrics/area.py").rename(package / "metrics/size.py")
     assert key() != before
 
 
-def test_a_part_has_a_key_of_its_own_and_nothing_has_none(package: Path) -> None:
+def test_package_digest_depends_on_its_part_and_missing_part_is_an_error(package: Path) -> None:
     before = digests.package_digest("metrics")
     write(package / "datasets/rooms/labels.json", "[2]")
     forget()
     assert digests.package_digest("metrics") == before
-    with pytest.raises(FileNotFoundError, match="holds no code"):
+    with pytest.raises(FileNotFoundError, match="contains no code to digest"):
         digests.package_digest("metrics", "metrcs")

@@ -1,4 +1,4 @@
-"""One and several of every class: what is asked is English, and what is understood is what was asked."""
+"""Singular and plural of every class, articles, and words of questions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def texts_in(value: Any) -> set[str]:
 
 
 def every_name() -> list[str]:
-    """The classes of every label set, the words that regions are called by, and other names of classes."""
+    """The classes of every label set, the vocabulary of region names, and synonyms of classes."""
     names = {*vocabulary(), *(other for others in SYNONYMS.values() for other in others)}
     for path in (ROOT / "su3d_bench/metrics/rules").glob("classes.*.toml"):
         names |= {row[1] for row in tomllib.loads(path.read_text(encoding="utf-8"))["classes"]}
@@ -33,17 +33,17 @@ def every_name() -> list[str]:
     return sorted({plain_name(name).lower() for name in names if len(name) < 40})
 
 
-def test_several_of_a_thing_give_its_name_back_for_every_class() -> None:
+def test_plural_of_every_class_reduces_to_its_name() -> None:
     names = every_name()
     assert len(names) > 300
     assert [name for name in names if words(plural(name)) != words(name)] == []
 
 
-def test_the_examples_of_the_docstrings_hold() -> None:
+def test_docstring_examples_are_correct() -> None:
     assert doctest.testmod(english).failed == 0
 
 
-def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:
+def test_always_plural_and_uncountable_nouns() -> None:
     assert (is_plural("blinds"), is_plural("pile of books"), is_plural("stairs"), is_plural("bus")) == (
         True, False, True, False,
     )  # fmt: skip
@@ -63,5 +63,5 @@ def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:
         ("TV", "a TV"), ("x-ray", "an x-ray"), ("blinds", "blinds"), ("the bed", "the bed"),
     ],
 )  # fmt: skip
-def test_the_article_is_the_one_that_is_spoken(noun: str, expected: str) -> None:
+def test_article_follows_pronunciation(noun: str, expected: str) -> None:
     assert with_article(noun) == expected

@@ -1,4 +1,4 @@
-"""The door through which files are read."""
+"""Opening files for reading."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from su3d_bench.core.system.files import file_bytes, file_text, opened, opened_t
 @pytest.mark.parametrize(
     ("kind", "reason"),
     [
-        ("pipe", "a pipe stands where a file should be"),
-        ("device", "a device stands where a file should be"),
-        ("socket", "a socket stands where a file should be"),
+        ("pipe", "a pipe is in the place of a file"),
+        ("device", "a device is in the place of a file"),
+        ("socket", "a socket is in the place of a file"),
         ("folder", "Is a directory"),
         ("nothing", "No such file or directory"),
     ],
 )
-def test_what_is_no_regular_file_is_refused_at_once(kind: str, reason: str, tmp_path: Path) -> None:
+def test_anything_but_a_regular_file_is_rejected_at_once(kind: str, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "x"
     if kind == "pipe":
         os.mkfifo(path)
@@ -40,7 +40,7 @@ def test_what_is_no_regular_file_is_refused_at_once(kind: str, reason: str, tmp_
         assert caught.value.strerror == reason
 
 
-def test_a_file_behind_a_link_is_read_as_it_is(tmp_path: Path) -> None:
+def test_file_behind_a_link_is_read_unchanged(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes("ä\r\nb".encode())
     (tmp_path / "link").symlink_to("file")
     assert file_bytes(tmp_path / "link") == "ä\r\nb".encode()
@@ -53,15 +53,15 @@ def test_a_file_behind_a_link_is_read_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (".".join("a" * 990) + " = 1", "a key of more than 64 parts"),
-        ("\n[" + ".".join(["a"] * 65) + "]", "a key of more than 64 parts"),
-        (" . ".join(['"a b"'] * 30_000) + " = 1", "a key of more than 64 parts"),
-        ("x = {" + ".".join(["'a'"] * 20_000) + " = 1}", "a key of more than 64 parts"),
+        (".".join("a" * 990) + " = 1", "key has more than 64 parts"),
+        ("\n[" + ".".join(["a"] * 65) + "]", "key has more than 64 parts"),
+        (" . ".join(['"a b"'] * 30_000) + " = 1", "key has more than 64 parts"),
+        ("x = {" + ".".join(["'a'"] * 20_000) + " = 1}", "key has more than 64 parts"),
         ("x = " + "[" * 20_000, "cannot be read"),
         ("x = " + "1" * 5000, "(?i)exceeds the limit"),
     ],
 )
-def test_toml_deeper_or_longer_than_use_is_one_line_at_once(text: str, reason: str, tmp_path: Path) -> None:
+def test_excessive_toml_is_rejected_quickly_in_one_line(text: str, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text(text)
     started = time.process_time()
@@ -70,7 +70,7 @@ def test_toml_deeper_or_longer_than_use_is_one_line_at_once(text: str, reason: s
     assert time.process_time() - started < 3
 
 
-def test_toml_of_use_is_read_whatever_its_dots() -> None:
+def test_normal_toml_with_many_dots_is_read() -> None:
     floats, words = ", ".join(["0.5"] * 500), "one. two, three.four " * 50
     assert parse_toml(f"x = [{floats}]\ny = '{words}'") == {"x": [0.5] * 500, "y": words}
     deep = ".".join("abcdefghijklmnopqrstuvwxyz")

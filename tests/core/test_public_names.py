@@ -1,4 +1,4 @@
-"""What the package itself offers, and the Python examples of the documentation, which use nothing else."""
+"""The public names of the package, and the Python examples of the documentation, which use only these."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from places import ROOT
 
 import su3d_bench
 
-IN_ORDER = ROOT / "docs" / "python.md"  # its examples go on from one another: tests/api runs them
+IN_ORDER = ROOT / "docs" / "python.md"  # its examples build on each other: tests/api runs them
 PAGES = [ROOT / "README.md", *sorted(set((ROOT / "docs").glob("*.md")) - {IN_ORDER})]
 EXAMPLES = [
     pytest.param(block, id=f"{page.name}-{number}")
@@ -22,7 +22,7 @@ EXAMPLES = [
 ]
 
 
-def test_importing_the_package_imports_nothing_heavy() -> None:
+def test_importing_the_package_imports_no_heavy_modules() -> None:
     code = "import sys, su3d_bench; print(*sorted(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = done.stdout.split()
@@ -32,12 +32,12 @@ def test_importing_the_package_imports_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("name", su3d_bench.__all__)
-def test_each_name_is_found_and_listed(name: str) -> None:
+def test_each_public_name_is_importable_and_listed(name: str) -> None:
     assert getattr(su3d_bench, name).__name__ == name
     assert name in dir(su3d_bench)
 
 
-def test_type_checkers_see_the_same_names() -> None:
+def test_type_checkers_see_the_same_public_names() -> None:
     tree = ast.parse(Path(su3d_bench.__file__).read_text())
     checked = next(node for node in tree.body if isinstance(node, ast.If))
     named = [each.name for line in checked.body if isinstance(line, ast.ImportFrom) for each in line.names]
@@ -45,7 +45,7 @@ def test_type_checkers_see_the_same_names() -> None:
 
 
 @pytest.mark.parametrize("block", EXAMPLES)
-def test_an_example_runs_and_uses_names_of_the_package_alone(block: str, tmp_path: Path) -> None:
+def test_documented_example_runs_and_uses_only_public_names(block: str, tmp_path: Path) -> None:
     for node in ast.walk(ast.parse(block)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("su3d_bench"):
             assert node.module == "su3d_bench"

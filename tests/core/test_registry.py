@@ -1,4 +1,4 @@
-"""Classes are checked when they are loaded: what they must have, and what they misspell of what they may have."""
+"""Classes are checked when they are loaded: required members, and misspelt optional ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load_text(folder: Path, kind: str, text: str) -> object:
 
 
 @pytest.mark.parametrize("kind", ["dataset", "method"])
-def test_every_built_in_class_is_as_it_must_be(kind: str) -> None:
+def test_every_built_in_class_passes_the_checks(kind: str) -> None:
     for name in registry.BUILT_IN[kind]:
         assert registry.load(kind, name).name == name
 
@@ -55,7 +55,7 @@ def test_every_built_in_class_is_as_it_must_be(kind: str) -> None:
         ("method", "n_instance: int", "n_instances"),
     ],
 )
-def test_a_misspelt_ability_names_the_right_one(tmp_path: Path, kind: str, line: str, meant: str) -> None:
+def test_misspelt_ability_is_reported_with_the_right_name(tmp_path: Path, kind: str, line: str, meant: str) -> None:
     with pytest.raises(ConfigError, match=rf"mine.py:Mine': a {kind} has no '\w+'; did you mean '{meant}'\?"):
         load_text(tmp_path, kind, f"{TEXT[kind]}    {line}\n")
 
@@ -69,9 +69,9 @@ def test_a_misspelt_ability_names_the_right_one(tmp_path: Path, kind: str, line:
         ("method", "name"),
     ],
 )
-def test_a_missing_member_is_named(tmp_path: Path, kind: str, member: str) -> None:
+def test_missing_member_is_reported(tmp_path: Path, kind: str, member: str) -> None:
     text = "\n".join(line for line in TEXT[kind].splitlines() if f" {member}" not in line)
-    with pytest.raises(ConfigError, match=rf"lacks '{member}'; a {kind} has .*{member}"):
+    with pytest.raises(ConfigError, match=rf"'{member}' is missing; a {kind} has .*{member}"):
         load_text(tmp_path, kind, text)
 
 
@@ -84,5 +84,5 @@ def test_a_missing_member_is_named(tmp_path: Path, kind: str, member: str) -> No
         ("method", ["closed = False", "def preset(self): ..."]),
     ],
 )
-def test_names_of_ones_own_are_left_alone(tmp_path: Path, kind: str, lines: list[str]) -> None:
+def test_other_member_names_are_accepted(tmp_path: Path, kind: str, lines: list[str]) -> None:
     assert load_text(tmp_path, kind, TEXT[kind] + "".join(f"    {line}\n" for line in lines))

@@ -1,4 +1,4 @@
-"""The door to terminals and logs: what goes through it, who goes through it, and what happens where nobody listens."""
+"""Output to terminals and logs: what is escaped, which output is covered, and output that is not read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ACTS = re.compile(r"[^\n\x20-\x7e]|^ *::|##\w*\[", re.MULTILINE)
 
 
 @pytest.mark.parametrize("text", ["::error::x", "  ::error::x", "a\n::error::x", "a\r::error::x", "a\u2028 ::error::x"])
-def test_no_line_begins_with_a_command(text: str) -> None:
+def test_commands_at_line_starts_are_escaped(text: str) -> None:
     stream = io.StringIO()
     door = SafeStream(stream)
     for character in text:
@@ -29,7 +29,7 @@ def test_no_line_begins_with_a_command(text: str) -> None:
     assert not one_line(text).lstrip().startswith("::")
 
 
-def test_a_stream_that_lacks_a_letter_gets_its_escape() -> None:
+def test_unencodable_characters_are_escaped() -> None:
     held = io.BytesIO()
     stream = io.TextIOWrapper(held, encoding="ascii")
     door = SafeStream(stream)
@@ -38,7 +38,7 @@ def test_a_stream_that_lacks_a_letter_gets_its_escape() -> None:
     assert held.getvalue() == b"na\\xefve\n"
 
 
-def test_json_reads_back_to_what_it_was() -> None:
+def test_escaped_json_reads_back_unchanged() -> None:
     value = {HOSTILE: [HOSTILE, "\U000e0041", 1.5, None, "naïve"]}
     for form in ({}, {"indent": 2}):
         text = escaped_json(value, **form)
@@ -46,7 +46,7 @@ def test_json_reads_back_to_what_it_was() -> None:
         assert all(line.isprintable() for line in text.split("\n")) and "##[" not in text
 
 
-def test_logs_and_other_peoples_prints_go_through_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_logs_and_prints_of_libraries_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     with doors():
         print(HOSTILE, file=sys.stderr)
         print(HOSTILE)
@@ -56,13 +56,13 @@ def test_logs_and_other_peoples_prints_go_through_it(capsys: pytest.CaptureFixtu
     assert not ACTS.search(said.out + said.err)
 
 
-def test_what_is_written_to_it_at_the_end_of_the_interpreter_is_dropped(
+def test_writes_at_interpreter_exit_are_dropped(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with doors():
         kept = sys.stdout
         print("said", end="")
-    kept.write("\x1b[0m\n")  # colorama's way to leave a terminal
+    kept.write("\x1b[0m\n")  # written by colorama on exit
     assert capsys.readouterr().out == "said"
     closed = io.StringIO()
     closed.close()
@@ -74,7 +74,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_bars_show_names_as_they_are_and_what_is_said_meanwhile_above_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bars_show_literal_names_and_messages_printed_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
@@ -103,7 +103,7 @@ def shell(command: str) -> subprocess.CompletedProcess[str]:
         ("verb protocols show scannet200-instance | head -1 > /dev/null; exit ${PIPESTATUS[0]}", 0, 0),
     ],
 )
-def test_who_does_not_read_the_answer_leaves_the_code_as_it_is(command: str, code: int, n_lines: int) -> None:
+def test_unread_output_does_not_change_the_exit_code(command: str, code: int, n_lines: int) -> None:
     done = shell(command)
     assert (done.returncode, done.stderr.count("\n")) == (code, n_lines), done.stderr
     assert not n_lines or done.stderr.startswith("su3d-bench: stdout: write error (No space left on device); ")

@@ -163,7 +163,7 @@ def test_folder_with_other_content_is_refused_before_scoring(capsys: pytest.Capt
     Path("notes").mkdir()
     Path("notes/paper.txt").write_text("mine")
     assert main([*BOTH, *PROTOCOLS, "--out", "notes"]) == 2
-    assert "notes: holds 'paper.txt' and is no folder of a run" in capsys.readouterr().err
+    assert "notes: contains 'paper.txt' and is not a run folder" in capsys.readouterr().err
     assert both() == 0
     record = json.loads(Path(RUN, "run.json").read_text())
     del record["predictions"]
@@ -201,9 +201,9 @@ def test_run_from_text_ground_truth_has_attribution_and_states_what_is_missing(
     query = answered(
         capsys, "query", "text", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2
     )
-    assert "is over the points of ground-truth files, which have no coordinates" in query
+    assert "uses the points of ground-truth files, which have no coordinates" in query
     sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
-    assert sheets.count("\n") == 1 and "is over the points of ground-truth files" in sheets
+    assert sheets.count("\n") == 1 and "uses the points of ground-truth files" in sheets
     answered(capsys, "runs", "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
     again = json.loads(Path("again.json").read_text())["protocols"]["scannet-instance"]["metrics"]

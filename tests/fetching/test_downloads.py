@@ -1,4 +1,4 @@
-"""One file downloaded from a server on loopback that behaves well, badly, or breaks off."""
+"""Downloads of one file from a loopback server that behaves well, badly, or interrupts the transfer."""
 
 from __future__ import annotations
 
@@ -37,12 +37,10 @@ def fetched(server: FileServer, place: Path, n_retries: int = 0, **changes: Any)
     return download_file(wanted, place, lambda *words: None, n_retries)
 
 
-def test_a_broken_download_is_resumed_where_it_ended_and_leaves_nothing_beside_it(
-    server: FileServer, tmp_path: Path
-) -> None:
+def test_interrupted_download_is_resumed_and_leaves_no_temporary_files(server: FileServer, tmp_path: Path) -> None:
     place = tmp_path / NAME
     server.files[f"/{NAME}"] = Served(CONTENT, breaks_after=[500_000])
-    with pytest.raises(DataError, match="500,000 bytes of it are here"):
+    with pytest.raises(DataError, match="500,000 bytes were downloaded; run the same command again to resume"):
         fetched(server, place, **UNSTATED)
     assert not place.exists() and part_of(place).read_bytes() == CONTENT[:500_000]
     assert fetched(server, place, **UNSTATED) == SHA256
@@ -51,7 +49,7 @@ def test_a_broken_download_is_resumed_where_it_ended_and_leaves_nothing_beside_i
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
 
-def test_retries_are_counted_again_whenever_bytes_came(server: FileServer, tmp_path: Path) -> None:
+def test_retry_count_restarts_after_progress(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT, breaks_after=[100_000, 100_000, 0, 100_000, 0, 100_000])
     fetched(server, tmp_path / NAME, 2)
     assert (tmp_path / NAME).read_bytes() == CONTENT and len(server.asked) == 7
@@ -62,8 +60,8 @@ def test_retries_are_counted_again_whenever_bytes_came(server: FileServer, tmp_p
     [
         Served(CONTENT, breaks_after=[500_000], takes_ranges=False),
         Served(OTHER, breaks_after=[500_000]),  # the file changes after the break
-        Served(OTHER, etag='W/"weak"', breaks_after=[500_000]),  # nothing tells whether it changed
-        Served(CONTENT + b"more", etag='"one"', breaks_after=[900_002]),  # more is here than there is
+        Served(OTHER, etag='W/"weak"', breaks_after=[500_000]),  # a change cannot be detected
+        Served(CONTENT + b"more", etag='"one"', breaks_after=[900_002]),  # the partial file is longer than the file
     ],
 )
 def test_parts_of_two_files_are_never_joined(server: FileServer, tmp_path: Path, first: Served) -> None:
@@ -83,25 +81,23 @@ def test_parts_of_two_files_are_never_joined(server: FileServer, tmp_path: Path,
         ExpectedContent(recorded="2" * 64),
     ],
 )
-def test_a_file_with_a_wrong_checksum_is_thrown_away(
-    server: FileServer, tmp_path: Path, stated: ExpectedContent
-) -> None:
+def test_file_with_a_wrong_checksum_is_deleted(server: FileServer, tmp_path: Path, stated: ExpectedContent) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
-    with pytest.raises(DataError, match="it was thrown away"):
+    with pytest.raises(DataError, match="it was deleted"):
         fetched(server, tmp_path / NAME, stated=stated)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_beginning_of_an_md5_is_compared_with_the_whole(server: FileServer, tmp_path: Path) -> None:
+def test_md5_prefix_is_compared_with_the_full_md5(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
     fetched(server, tmp_path / NAME, stated=ExpectedContent(md5_prefix=hashlib.md5(CONTENT).hexdigest()[:6]))
     assert (tmp_path / NAME).is_file()
 
 
-def test_a_redirection_goes_to_named_hosts_alone(server: FileServer, tmp_path: Path) -> None:
+def test_redirects_are_followed_only_to_allowed_hosts(server: FileServer, tmp_path: Path) -> None:
     server.files["/store"] = Served(CONTENT)
     server.files[f"/{NAME}"] = Served(b"", redirect=f"{server.other_host}/store")
-    with pytest.raises(DataError, match="host 'localhost' is not named for it"):
+    with pytest.raises(DataError, match="host 'localhost' is not allowed for it"):
         fetched(server, tmp_path / NAME)
     assert [asked.path for asked in server.asked] == [f"/{NAME}"]
     fetched(server, tmp_path / NAME, hosts=("127.0.0.1", "localhost"))
@@ -112,30 +108,30 @@ def test_a_redirection_goes_to_named_hosts_alone(server: FileServer, tmp_path: P
     ("served", "said"),
     [
         (Served(b"", status=404), "status 404"),
-        (Served(b"", status=503), "status 503.*nothing of it is here"),
-        (Served(CONTENT, headers={"Content-Encoding": "gzip"}), "comes compressed"),
-        (Served(CONTENT, states_size=False), "nobody says how large it is"),
+        (Served(b"", status=503), "status 503.*nothing was downloaded"),
+        (Served(CONTENT, headers={"Content-Encoding": "gzip"}), "is sent compressed"),
+        (Served(CONTENT, states_size=False), "its size is unknown"),
         (Served(b"", redirect="http://example.org/weights.pth"), "is not encrypted"),
         (Served(b"", redirect=f"/{NAME}"), "redirect"),
     ],
 )
-def test_what_a_server_refuses_is_one_line(server: FileServer, tmp_path: Path, served: Served, said: str) -> None:
+def test_each_server_refusal_is_a_one_line_error(server: FileServer, tmp_path: Path, served: Served, said: str) -> None:
     server.files[f"/{NAME}"] = served
     with pytest.raises(DataError, match=said) as raised:
         fetched(server, tmp_path / NAME, n_bytes=None, hosts=("127.0.0.1", "example.org"))
     assert "\n" not in str(raised.value) and not list(tmp_path.iterdir())
 
 
-def test_no_more_is_read_than_is_stated(server: FileServer, tmp_path: Path) -> None:
+def test_download_stops_at_the_stated_size(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT + b"more")
-    with pytest.raises(DataError, match="has 900,004 bytes, stated are 900,000"):
+    with pytest.raises(DataError, match="has 900,004 bytes, expected 900,000"):
         fetched(server, tmp_path / NAME)
     server.files[f"/{NAME}"] = Served(CONTENT * 3, states_size=False)
     fetched(server, tmp_path / NAME)
     assert (tmp_path / NAME).read_bytes() == CONTENT
 
 
-def test_a_full_disk_keeps_what_came_and_the_next_command_goes_on(server: FileServer, tmp_path: Path) -> None:
+def test_download_interrupted_by_a_full_disk_is_resumed(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))

@@ -1,4 +1,4 @@
-"""``models fetch`` and ``datasets fetch`` against servers on loopback that serve tiny things in the real layouts."""
+"""``models fetch`` and ``datasets fetch`` with loopback servers that serve tiny files in the real layouts."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def left(root: Path) -> set[str]:
     return {path.relative_to(root / ".fetched").as_posix() for path in (root / ".fetched").rglob("*")}
 
 
-def test_a_dry_run_names_every_fact_and_contacts_nobody(
+def test_dry_run_lists_all_facts_without_network_access(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, out, _ = called(["models", "fetch", "sam-vit-h", "--dry-run", "--sources", sam(server, tmp_path)], capsys)
@@ -65,7 +65,7 @@ def test_a_dry_run_names_every_fact_and_contacts_nobody(
     assert called(["datasets", "fetch", "scannet", "--dry-run"], capsys)[0] == 0
 
 
-def test_nothing_is_fetched_before_its_licence_is_accepted(
+def test_fetch_requires_accepting_the_licence(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["models", "fetch", "sam-vit-h", "--sources", sam(server, tmp_path)]
@@ -79,7 +79,7 @@ def test_nothing_is_fetched_before_its_licence_is_accepted(
         assert called([*words, "--accept", accepted], capsys)[0] == 0
 
 
-def test_a_checkpoint_comes_to_where_models_are_looked_for_and_is_not_fetched_twice(
+def test_checkpoint_is_stored_where_models_are_searched_and_fetched_once(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["models", "fetch", "sam-vit-h", "--accept", "MIT", "--sources", sam(server, tmp_path)]
@@ -91,16 +91,16 @@ def test_a_checkpoint_comes_to_where_models_are_looked_for_and_is_not_fetched_tw
     assert code == 0 and "already present" in out and len(server.asked) == n_asked
 
 
-def test_nothing_that_is_damaged_is_taken_for_a_model_and_the_next_call_goes_on(
+def test_damaged_download_is_never_used_as_a_model_and_is_resumed(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content, place = b"weights" * 500, tmp_path / "models/.fetched/sam-vit-h" / SAM
     words = ["models", "fetch", "sam-vit-h", "--accept", "MIT", "--retries", "0", "--sources", sam(server, tmp_path)]
     cases = [
-        (Served(content, breaks_after=[1000]), "1,000 bytes of it are here, and the same command goes on from there"),
-        (Served(content[:1000] + b"x" * (len(content) - 1000)), "it was thrown away"),
-        (Served(content, redirect=f"{server.other_host}/store"), "host 'localhost' is not named for it"),
-        (Served(content + b"grown"), "it is another file by now"),
+        (Served(content, breaks_after=[1000]), "1,000 bytes were downloaded; run the same command again to resume"),
+        (Served(content[:1000] + b"x" * (len(content) - 1000)), "it was deleted"),
+        (Served(content, redirect=f"{server.other_host}/store"), "host 'localhost' is not allowed for it"),
+        (Served(content + b"grown"), "the file has changed"),
     ]
     for served, said in cases:
         server.files[f"/{SAM}"] = served
@@ -109,37 +109,35 @@ def test_nothing_that_is_damaged_is_taken_for_a_model_and_the_next_call_goes_on(
         assert not place.exists() and not (tmp_path / "models/sam-vit-h").exists()
     server.files[f"/{SAM}"] = Served(content)
     held = hold_folder(place.parent)
-    assert "another process fetches it" in called(words, capsys)[2]
+    assert "another process is fetching it" in called(words, capsys)[2]
     os.close(held)
     assert called(words, capsys)[0] == 0
     assert (tmp_path / "models/sam-vit-h" / SAM).read_bytes() == content
 
 
-def test_a_disk_without_the_room_is_said_before_anything_comes(
+def test_download_fails_early_when_disk_is_full(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     facts = serve_file(server, SAM, b"x") | {"n_bytes": 1 << 43}
     table = write_table(tmp_path / "own.toml", [entry("sam-vit-h", "models", {SAM: facts})])
     code, _, err = called(["models", "fetch", "sam-vit-h", "--accept", "MIT", "--sources", table, "--quiet"], capsys)
     assert code == 2 and not server.asked
-    assert (
-        err.startswith("su3d-bench: sam-vit-h: takes 8,796,093,022,208 bytes more below") and "free some space" in err
-    )
+    assert err.startswith("su3d-bench: sam-vit-h: needs 8,796,093,022,208 more bytes in") and "free some space" in err
 
 
-def test_a_mirror_gives_the_files_that_the_table_states(
+def test_mirror_must_serve_the_stated_files(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server.files[f"/mirror/{SAM}"] = Served(b"another file")
     words = ["models", "fetch", "sam-vit-h", "--accept", "sam-vit-h", "--retries", "0", "--quiet"]
     code, _, err = called([*words, "--mirror", f"sam-vit-h={server.url}/mirror/"], capsys)
-    assert code == 2 and "has 12 bytes, stated are 2,564,550,879" in err
+    assert code == 2 and "has 12 bytes, expected 2,564,550,879" in err
     for mirror in ("sam-vit-h", "sam=https://example.org", "sam-vit-h=http://example.org"):
         code, _, err = called([*words, "--mirror", mirror], capsys)
         assert code == 2 and len(err.splitlines()) == 1, err
 
 
-def test_a_model_of_the_hub_comes_whole_by_its_stated_checksums(
+def test_hub_model_is_fetched_and_verified_by_published_checksums(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
@@ -154,7 +152,7 @@ def test_a_model_of_the_hub_comes_whole_by_its_stated_checksums(
     store = f"/store/{hashlib.sha256(b'weights' * 800).hexdigest()}"
     server.files[store].breaks_after = [2000]
     code, _, err = called(words, capsys)
-    assert code == 2 and "2,000 bytes of it are here" in err
+    assert code == 2 and "2,000 bytes were downloaded" in err
     assert "found: " not in called(["models", "list"], capsys)[1]
     code, out, _ = called(words, capsys)
     assert code == 0 and out.count("published SHA-256") == 1 and out.count("published git blob") == 3
@@ -163,7 +161,7 @@ def test_a_model_of_the_hub_comes_whole_by_its_stated_checksums(
     assert not any("authorization" in asked.headers for asked in server.asked)
 
 
-def test_what_the_hub_cannot_give_is_one_line(
+def test_each_hub_failure_is_a_one_line_error(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
@@ -177,21 +175,21 @@ def test_what_the_hub_cannot_give_is_one_line(
     row["hub"]["weights"] = [{"name": "config.json", "n_bytes": 2, "sha256": "0" * 64, "read_at": "here"}]
     server.files["/api/models/laion/tiny"] = Served(b"", status=404)
     code, _, err = called([*words, "--sources", table], capsys)
-    assert code == 2 and "the hub does not say what is there" in err and len(err.splitlines()) == 1
+    assert code == 2 and "the hub does not list its files" in err and len(err.splitlines()) == 1
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     code, _, err = called([*words, "--sources", table], capsys)
-    assert code == 2 and "HF_HUB_OFFLINE is set, so nobody is asked" in err
+    assert code == 2 and "HF_HUB_OFFLINE is set; unset it to fetch" in err
 
 
 @pytest.fixture
 def replica(server: FileServer, tmp_path: Path) -> list[str]:
-    """The words that fetch a tiny Replica of one scene, which is served in the published layouts."""
+    """The arguments that fetch a tiny Replica of one scene, served in the published layouts."""
     write_box_room(tmp_path / "made")
     table = write_table(tmp_path / "own.toml", serve_replica(server, tmp_path / "made"))
     return ["datasets", "fetch", "replica", "--accept", "MIT", "--retries", "0", "--sources", str(table)]
 
 
-def test_replica_comes_to_where_it_is_read_and_its_check_passes(
+def test_fetched_replica_is_found_and_passes_its_check(
     server: FileServer, replica: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = tmp_path / "data"
@@ -207,7 +205,7 @@ def test_replica_comes_to_where_it_is_read_and_its_check_passes(
     assert "already present" in called(replica, capsys)[1] and len(server.asked) == n_asked
 
 
-def test_what_no_publisher_states_is_held_against_the_first_download(
+def test_unpublished_checksums_are_compared_with_the_first_download(
     server: FileServer, replica: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert called(replica, capsys)[0] == 0
@@ -216,14 +214,14 @@ def test_what_no_publisher_states_is_held_against_the_first_download(
     server.files["/replica_v1_0.tar.gz.partab"] = Served(b"x" * len(part.content))
     code, _, err = called([*replica, "--quiet"], capsys)
     first = hashlib.sha256(part.content).hexdigest()
-    assert code == 2 and f"that of the first download was {first}" in err and "record.json" in err
+    assert code == 2 and f"first download: {first}" in err and "record.json" in err
     server.files["/replica_v1_0.tar.gz.partab"] = part
     code, out, _ = called(replica, capsys)
     assert code == 0 and "verified against: SHA-256 of the first download" in out
     assert called(["datasets", "check", "replica/*", "--quick"], capsys)[0] == 0
 
 
-def test_no_scene_is_seen_before_it_is_whole(
+def test_scene_is_visible_only_when_complete(
     server: FileServer, replica: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     served = server.files["/Replica.zip"]
@@ -264,14 +262,14 @@ else:
 
 
 def assert_is_read(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was fetched is what was served, byte by byte, and datasets finds frames and truth in it."""
+    """The fetched files equal the served ones byte by byte, and contain frames and ground truth for datasets."""
     for path in (folder / "made/scans" / SCAN).iterdir():
         assert (folder / "data/scans" / SCAN / path.name).read_bytes() == path.read_bytes()
     out = called(["datasets", "check", f"scannet/{SCAN}"], capsys)[1]
     assert "5 (all read)" in out and "nyu40-vertices: 861 points" in out
 
 
-def test_scans_come_by_the_users_own_script_and_are_read(
+def test_scans_are_fetched_by_the_users_script_and_read(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_scan(tmp_path / "made", SCAN)
@@ -280,7 +278,7 @@ def test_scans_come_by_the_users_own_script_and_are_read(
     words = ["datasets", "fetch", "scannet", SCAN, "--script", script]
     assert called(words, capsys)[0] == 2  # the terms
     code, _, err = called([*words, "--accept", "scannet", "--quiet"], capsys)
-    assert code == 2 and f"did not bring {SCAN}.sens (exit code 1); it said last: the server does not answer" in err
+    assert code == 2 and f"did not download {SCAN}.sens (exit code 1); its last output: the server" in err
     assert not (tmp_path / "data/scans").exists()
     script.write_text(SCRIPT.format(made=str(tmp_path / "made"), lacks="none"))
     code, out, _ = called([*words, "--accept", "scannet"], capsys)
@@ -290,7 +288,7 @@ def test_scans_come_by_the_users_own_script_and_are_read(
     assert not server.asked
 
 
-def test_scans_come_out_of_the_users_own_link(
+def test_scans_are_fetched_from_the_users_link(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = write_scan(tmp_path / "made", SCAN)
@@ -304,21 +302,21 @@ def test_scans_come_out_of_the_users_own_link(
     words = ["datasets", "fetch", "scannet", SCAN, "--from", f"{server.url}/given/", "--accept", "scannet"]
     words += ["--retries", "0"]
     code, _, err = called([*words, "--quiet"], capsys)
-    assert code == 2 and "500 bytes of it are here" in err and not (tmp_path / "data/scans").exists()
+    assert code == 2 and "500 bytes were downloaded" in err and not (tmp_path / "data/scans").exists()
     assert called(words, capsys)[0] == 0
     assert_is_read(tmp_path, capsys)
     assert left(tmp_path / "data") <= {*NOTHING_LEFT, "scannet"}
 
 
-def test_without_script_or_link_it_says_how_the_terms_are_signed(
+def test_without_script_or_link_the_error_explains_the_terms(
     server: FileServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, _, err = called(["datasets", "fetch", "scannet"], capsys)
     assert code == 2 and "ScanNet_TOS.pdf and send it to scannet@googlegroups.com" in err
     assert len(err.splitlines()) == 1
     for words, said in [
-        (["datasets", "fetch", "scannet", "scene0"], "'scene0' is no scan"),
-        (["datasets", "fetch", "scannet", "--script", "none.py", "--accept", "scannet"], "there is no such file"),
+        (["datasets", "fetch", "scannet", "scene0"], "unknown scan 'scene0'"),
+        (["datasets", "fetch", "scannet", "--script", "none.py", "--accept", "scannet"], "no such file; give"),
         (
             ["datasets", "fetch", "scannet", "--from", "http://kaldir.vc.in.tum.de", "--accept", "scannet"],
             "is not encrypted",
@@ -328,7 +326,7 @@ def test_without_script_or_link_it_says_how_the_terms_are_signed(
         assert code == 2 and said in err, err
 
 
-def test_a_table_or_record_that_is_damaged_is_one_line(
+def test_damaged_table_or_record_is_a_one_line_error(
     server: FileServer, replica: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table, record = tmp_path / "wrong.toml", tmp_path / "data/.fetched/record.json"

@@ -1,4 +1,4 @@
-"""The table of what can be fetched, held against what the rest of the program says of the same things."""
+"""The table of sources, compared with the model catalogue."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from su3d_bench.fetching.sources import built_in, check_address
 from su3d_bench.perception.models.catalogue import MODELS
 
 
-def test_every_model_can_be_fetched_and_nothing_else_is_called_one() -> None:
+def test_sources_of_models_match_the_catalogue_names() -> None:
     assert {source.name for source in built_in().of("models")} == set(MODELS)
 
 
 @pytest.mark.parametrize("name", list(MODELS))
-def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
+def test_source_facts_match_the_model_catalogue(name: str) -> None:
     source, form = built_in().named(name), MODELS[name].fetched
     assert source.licence.name == MODELS[name].licence
     assert source.n_bytes is not None and abs(source.n_bytes / 1e6 - form.size_mb) < 2
@@ -26,7 +26,7 @@ def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
     assert stated == dict(form.sha256)
 
 
-def test_every_fact_says_where_it_was_read_and_every_file_comes_encrypted() -> None:
+def test_every_fact_has_a_reference_and_every_file_uses_https() -> None:
     for source in built_in().entries.values():
         assert source.licence.read_at and (source.n_bytes is not None or source.group == "scannet")
         for file in source.files:
@@ -37,15 +37,15 @@ def test_every_fact_says_where_it_was_read_and_every_file_comes_encrypted() -> N
     ("address", "said"),
     [
         ("http://example.org/a", "is not encrypted"),
-        ("file:///etc/passwd", "is no address"),
-        ("https://", "is no address"),
-        ("https://[::1", "is no address"),
-        ("https://example.org/a b\n", "is no address"),
-        ("https://user@example.org/a", "a name or password"),
-        ("https://evil-hf.co/a", "is not named for it"),
-        ("https://hf.co.example.org/a", "is not named for it"),
+        ("file:///etc/passwd", "is not an address"),
+        ("https://", "is not an address"),
+        ("https://[::1", "is not an address"),
+        ("https://example.org/a b\n", "is not an address"),
+        ("https://user@example.org/a", "a user name or password"),
+        ("https://evil-hf.co/a", "is not allowed for it"),
+        ("https://hf.co.example.org/a", "is not allowed for it"),
     ],
 )
-def test_an_address_that_cannot_be_trusted_is_refused(address: str, said: str) -> None:
+def test_unsafe_address_is_rejected(address: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         check_address(address, ["huggingface.co", "*.hf.co"])

@@ -1,4 +1,4 @@
-"""Archives as publishers pack them, and as somebody may who wants to write where he should not."""
+"""Archives as packed by publishers, and hostile ones that try to write outside the folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def of_room(path: PurePosixPath) -> PurePosixPath | None:
 
 
 def packed(folder: Path, form: str, contents: list[tuple[str, bytes]], kind: bytes = b"0") -> Path:
-    """An archive of the files; of links to /etc/passwd where ``kind`` is not that of a file."""
+    """An archive of the files, or of links to /etc/passwd if ``kind`` is not a file."""
     if form == "zip":
         with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in contents:
@@ -50,11 +50,11 @@ def unpacked(archive: Path, folder: Path) -> int:
 
 
 @pytest.mark.parametrize("form", ["zip", "gnu", "pax"])
-def test_wanted_members_come_and_no_others(tmp_path: Path, form: str) -> None:
+def test_only_wanted_members_are_unpacked(tmp_path: Path, form: str) -> None:
     contents = [("room/mesh.ply", bytes(range(256)) * 500), ("room/empty", b""), (f"room/{LONG}", b"z" * 512)]
     archive = packed(tmp_path, form, [*contents, ("b/c", b"no")])
     (tmp_path / "out/room").mkdir(parents=True)
-    (tmp_path / "out/room/mesh.ply").write_bytes(b"A" * 128_000)  # of an earlier call
+    (tmp_path / "out/room/mesh.ply").write_bytes(b"A" * 128_000)  # from an earlier call
     assert unpacked(archive, tmp_path / "out") == 3
     assert (tmp_path / "out/room/mesh.ply").read_bytes() == b"A" * 128_000
     assert (tmp_path / f"out/room/{LONG}").read_bytes() == b"z" * 512
@@ -74,20 +74,20 @@ def test_wanted_members_come_and_no_others(tmp_path: Path, form: str) -> None:
         (["."], "a file without a name"),
     ],
 )
-def test_a_member_that_would_leave_its_place_ends_it(tmp_path: Path, form: str, names: list[str], said: str) -> None:
+def test_member_outside_the_folder_is_an_error(tmp_path: Path, form: str, names: list[str], said: str) -> None:
     with pytest.raises(DataError, match=said):
         unpacked(packed(tmp_path, form, [(name, b"x") for name in names]), tmp_path / "out")
     assert not (tmp_path / "out.txt").exists()
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE])
-def test_a_link_or_device_in_the_place_of_a_wanted_file_ends_it(tmp_path: Path, kind: bytes) -> None:
+def test_link_or_device_in_place_of_a_wanted_file_is_an_error(tmp_path: Path, kind: bytes) -> None:
     for form in ("zip", "gnu"):
-        with pytest.raises(DataError, match="'room/habitat' is no plain file"):
+        with pytest.raises(DataError, match="'room/habitat' is not a regular file"):
             unpacked(packed(tmp_path, form, [("room/habitat", b"/etc/passwd")], kind), tmp_path / "out")
 
 
-def test_an_archive_that_swells_ends_before_it_fills_the_disk(tmp_path: Path) -> None:
+def test_archive_bomb_is_rejected_before_it_fills_the_disk(tmp_path: Path) -> None:
     info = tarfile.TarInfo("room/mesh.ply")
     info.size = 1 << 32
     (tmp_path / "a.tar.gz").write_bytes(gzip_of(info.tobuf(tarfile.GNU_FORMAT), 140))
@@ -98,7 +98,7 @@ def test_an_archive_that_swells_ends_before_it_fills_the_disk(tmp_path: Path) ->
     assert not [path for path in (tmp_path / "out").rglob("room/*") if path.is_file()]
 
 
-def test_a_damaged_archive_is_one_line(tmp_path: Path) -> None:
+def test_damaged_archive_is_a_one_line_error(tmp_path: Path) -> None:
     archive = packed(tmp_path, "gnu", [("room/a", bytes(range(256)) * 200)])
     whole = archive.read_bytes()
     for content in (whole[: len(whole) // 2], b"", b"no archive", whole[:-9] + b"\1" + whole[-8:], whole[:-8]):
@@ -107,7 +107,7 @@ def test_a_damaged_archive_is_one_line(tmp_path: Path) -> None:
             unpacked(archive, tmp_path / "out")
 
 
-def test_the_header_before_a_member_is_bounded(tmp_path: Path) -> None:
+def test_size_of_a_tar_header_is_limited(tmp_path: Path) -> None:
     info = tarfile.TarInfo("pax")
     info.type, info.size = tarfile.XHDTYPE, 1 << 33
     with gzip.open(tmp_path / "a.tar.gz", "wb") as stream:

@@ -1,6 +1,6 @@
-"""Small files that swell: every reader of what is packed, shared or run-length coded refuses them in little memory.
+"""Decompression bombs: every reader of compressed, shared or run-length data rejects them with little memory.
 
-Memory is measured by the peak of what is resident, beneath a limit on addresses that none may reach.
+Memory is measured as peak resident memory, under an address-space limit that no reader may reach.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LARGEST_BOMB = 4 * MIB
 
 
 def refused(read: Callable[[], object], *kinds: type[Exception]) -> str:
-    """What is said by the refusal of ``kinds`` that ``read`` ends with, in little memory."""
+    """The message of the error of ``kinds`` that ``read`` raises, with little memory."""
     with bounded_addresses(4 * MAX_GROWN):
         before = reset_peak()
         with pytest.raises(kinds or (Su3dError,)) as caught:
@@ -65,7 +65,7 @@ def kept(folder: Path, name: str, content: bytes) -> Path:
 
 
 def bz2_npz() -> bytes:
-    """An archive of a kilobyte that holds a gibibyte, packed as ``zipfile`` unpacks without a bound."""
+    """An archive of a kilobyte with a gibibyte, in a compression that ``zipfile`` unpacks without a limit."""
     packer = bz2.BZ2Compressor()
     parts = [packer.compress(npy_head((1 << 20, 1024)))]
     parts += [packer.compress(bytes(64 * MIB)) for _ in range(8)]
@@ -73,12 +73,12 @@ def bz2_npz() -> bytes:
 
 
 def lying_npz() -> bytes:
-    """A member that says it is small and whose stream goes on."""
+    """A member with a small declared size and a longer stream."""
     return zip_of([Member("pred_masks.npy", deflated(npy_head((10, 10)), 1500), 228)])
 
 
 def shared_npz() -> bytes:
-    """Members that all lie in the same bytes, each of a size that might be."""
+    """Members that share the same bytes, each of a plausible size."""
     content = npz_of_zeros("00000", 100)
     at = content.index(b"PK\x01\x02")
     entry = content[at : content.index(b"PK\x05\x06")]
@@ -97,7 +97,7 @@ NPZ = {
 
 
 @pytest.mark.parametrize("kind", [pytest.param(kind, marks=[pytest.mark.proof] * (kind == "bz2")) for kind in NPZ])
-def test_an_npz_that_swells_is_refused_by_each_of_its_readers(tmp_path: Path, kind: str) -> None:
+def test_npz_bomb_is_rejected_by_each_of_its_readers(tmp_path: Path, kind: str) -> None:
     content = NPZ[kind]()
     path = kept(tmp_path, "scene0001_00.npz", content)
     refused(lambda: read_npz(path), PredictionError)
@@ -108,7 +108,7 @@ def test_an_npz_that_swells_is_refused_by_each_of_its_readers(tmp_path: Path, ki
     refused(lambda: read_text_features(path), DataError)
 
 
-def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
+def test_torch_archive_with_a_pickle_bomb_is_rejected(tmp_path: Path) -> None:
     n = 1500 * MIB
     packed = deflated(b"\x80\x02B" + struct.pack("<I", n), 1500, last=b".")
     path = kept(tmp_path, "a.pt", zip_of([Member("a/data.pkl", packed, n + 8)]))
@@ -119,16 +119,16 @@ def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
     ("first", "n", "byte", "told"),
     [
         (b"\x80\x04\x8e" + struct.pack("<Q", 1500 * MIB), 1500, 0, "unpacks to more than"),  # one payload
-        (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # remembered again and again
+        (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # memoised again and again
     ],
 )
-def test_a_gzipped_pickle_that_swells_is_refused(tmp_path: Path, first: bytes, n: int, byte: int, told: str) -> None:
+def test_gzipped_pickle_bomb_is_rejected(tmp_path: Path, first: bytes, n: int, byte: int, told: str) -> None:
     path = kept(tmp_path, "a.pkl.gz", gzip_of(first, n, byte, b"."))
     assert told in refused(lambda: read_pickle_file(path), PredictionError)
 
 
 def a_map_of_one_cloud(n_objects: int) -> bytes:
-    """A map whose objects are one and the same, each but a reference."""
+    """A map whose objects are references to a single one."""
     cloud = np.zeros((100_000, 3), np.float64).tobytes()
     array = b"cnumpy.core.numeric\n_frombuffer\n(B" + struct.pack("<I", len(cloud)) + cloud
     array += (
@@ -139,7 +139,7 @@ def a_map_of_one_cloud(n_objects: int) -> bytes:
     return b"\x80\x04}X\x07\x00\x00\x00objects](" + one + b"h\x01" * (n_objects - 1) + b"esq\x02."
 
 
-def test_objects_that_share_one_cloud_are_counted_as_often_as_they_stand_there(tmp_path: Path) -> None:
+def test_objects_that_share_one_cloud_count_once_per_reference(tmp_path: Path) -> None:
     path = tmp_path / "pcd_x.pkl.gz"
     path.write_bytes(gzip.compress(a_map_of_one_cloud(3), 1))
     assert len(READERS["conceptgraphs"].read(path, "pcd_x").content.points) == 300_000  # type: ignore[union-attr]
@@ -158,7 +158,7 @@ def test_objects_that_share_one_cloud_are_counted_as_often_as_they_stand_there(t
     ],
     ids=["colour", "depth", "jpeg", "scans"],
 )
-def test_an_image_that_swells_is_refused_before_it_is_decoded(
+def test_image_bomb_is_rejected_before_decoding(
     decode: Callable[[bytes, str], object], content: Callable[[], bytes]
 ) -> None:
     made = content()
@@ -167,16 +167,16 @@ def test_an_image_that_swells_is_refused_before_it_is_decoded(
 
 
 @pytest.mark.parametrize("n", [MAX_MEMBERS + 1, 99_999_999])
-def test_runs_of_points_have_a_bound_together(n: int, tmp_path: Path) -> None:
-    assert "points together" in refused(lambda: run_members(10**8, f"1 {n}", "here"), PredictionError)
+def test_run_length_masks_have_a_total_limit(n: int, tmp_path: Path) -> None:
+    assert "points in total" in refused(lambda: run_members(10**8, f"1 {n}", "here"), PredictionError)
     for k in range(8):
         (tmp_path / f"{k}.json").write_text(f'{{"length": 100000000, "counts": "1 {MAX_MEMBERS // 4}"}}')
     (tmp_path / "scene0001_00.txt").write_text("".join(f"{k}.json 3 1.0\n" for k in range(8)))
     said = refused(lambda: READERS["scannet-text"].read(tmp_path, "scene0001_00"), PredictionError)
-    assert "points together" in said
+    assert "points in total" in said
 
 
-def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
+def test_member_is_read_completely_and_its_checksum_is_verified(tmp_path: Path) -> None:
     values = np.arange(300_000, dtype=np.int64)
     stream = io.BytesIO()
     np.savez_compressed(stream, a=values)
@@ -184,15 +184,15 @@ def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_npz(path)["a"], values)
     np.testing.assert_array_equal(read_arrays(path)["a"], values)
     content = bytearray(stream.getvalue())
-    content[14] ^= 1  # of the checksum in the member's own header
+    content[14] ^= 1  # a bit of the checksum in the member's own header
     at = content.index(b"PK\x01\x02") + 16
     content[at] ^= 1
     path.write_bytes(bytes(content))
-    with pytest.raises(PredictionError, match="not a whole zip archive"):
+    with pytest.raises(PredictionError, match="not a complete zip archive"):
         read_npz(path)
 
 
-def test_compressed_points_that_swell_are_refused(tmp_path: Path) -> None:
+def test_compressed_point_bomb_is_rejected(tmp_path: Path) -> None:
     n = 50_000_000
     packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * (3 * n // 264 + 1)
     lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 1 1 1", "TYPE U U U", "COUNT 1 1 1", f"WIDTH {n}", "HEIGHT 1"]

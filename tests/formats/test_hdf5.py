@@ -1,4 +1,4 @@
-"""Tables in HDF5 files: every usual form is read, every hostile one is one error of one line."""
+"""Tables in HDF5 files: every usual form is read, every hostile one is a one-line error."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def write(folder: Path, data: np.ndarray = ROWS, name: str = NAME, **options: An
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", ">f8"])
-def test_rows_come_back_as_they_were_written(tmp_path: Path, dtype: str) -> None:
+def test_hdf5_rows_are_read_unchanged(tmp_path: Path, dtype: str) -> None:
     data = ROWS.astype(dtype)
     found = read_rows(write(tmp_path, data), 3, WHERE)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, data.astype(np.float32))
 
 
-def test_the_first_maximum_wins_and_a_row_of_zeros_is_column_0(tmp_path: Path) -> None:
+def test_first_maximum_wins_and_row_of_zeros_gives_column_0(tmp_path: Path) -> None:
     table = np.zeros((4, 5), np.float32)
     table[1, [2, 4]] = 1
     table[2] = [-3, -2, -2, -9, -9]
@@ -44,13 +44,11 @@ def test_the_first_maximum_wins_and_a_row_of_zeros_is_column_0(tmp_path: Path) -
     assert largest_column(write(tmp_path, table), 5, WHERE).tolist() == [0, 2, 1, 4]
 
 
-def test_a_nan_anywhere_in_a_row_is_an_error_that_names_the_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nan_in_a_row_is_reported_with_the_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5, "BLOCK_BYTES", 16 * 12)
     table = ROWS.copy()
     table[35, 1] = np.nan
-    with pytest.raises(DataError, match=r"^replica/room0: pc_points\.h5: row 35 holds NaN; copy"):
+    with pytest.raises(DataError, match=r"^replica/room0: pc_points\.h5: row 35 contains NaN; copy"):
         largest_column(write(tmp_path, table), 3, WHERE)
 
 
@@ -112,14 +110,14 @@ def written(data: np.ndarray, **options: Any) -> Any:
         (lambda path: None, "cannot be read: No such file or directory"),
         (written(ROWS[:, :2]), "has the shape (40, 2); expected (N, 3)"),
         (written(ROWS[:, 0]), "has the shape (40,); expected (N, 3)"),
-        (written(ROWS.astype(np.int32)), "holds values of type int32; expected float16"),
+        (written(ROWS.astype(np.int32)), "contains values of type int32; expected float16"),
         (written(ROWS.astype(np.longdouble)), "expected float16, float32 or float64"),
-        (written(ROWS, compression="gzip"), "is stored in chunks or compressed"),
-        (written(ROWS, chunks=(16, 3)), "is stored in chunks or compressed"),
-        (unwritten((10**12, 3)), "promises 1000000000000 rows of 3 values"),
+        (written(ROWS, compression="gzip"), "is chunked or compressed"),
+        (written(ROWS, chunks=(16, 3)), "is chunked or compressed"),
+        (unwritten((10**12, 3)), "declares 1000000000000 rows of 3 values"),
     ],
 )
-def test_each_unfit_file_is_one_clear_line(tmp_path: Path, make: Any, message: str) -> None:
+def test_each_invalid_hdf5_file_is_a_one_line_error(tmp_path: Path, make: Any, message: str) -> None:
     path = tmp_path / f"{NAME}.h5"
     make(path)
     with pytest.raises(DataError) as caught:
@@ -150,7 +148,7 @@ FULL = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     ],
     ids=["halved chroma", "full chroma", "progressive", "grey JPEG", "PNG", "grey PNG", "alpha", "16 bits"],
 )
-def test_pixels_are_red_green_blue(suffix: str, pixels: np.ndarray, options: list[int]) -> None:
+def test_decoded_pixels_are_rgb(suffix: str, pixels: np.ndarray, options: list[int]) -> None:
     content = cv2.imencode(suffix, pixels, options)[1]
     rgb = decode_colour(content.tobytes(), "here")
     assert rgb.flags.c_contiguous

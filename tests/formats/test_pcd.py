@@ -1,4 +1,4 @@
-"""PCD files of every form come back to the last bit, and no damage gets past the reader but as one typed error."""
+"""PCD files of every form are read bit by bit, and every damaged file is a typed error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def header(
 
 
 def packed_as_runs(content: bytes) -> bytes:
-    """LZF that repeats nothing: runs of at most 32 bytes."""
+    """LZF without repetitions: runs of at most 32 bytes."""
     parts = [content[at : at + 32] for at in range(0, len(content), 32)]
     return b"".join(bytes([len(part) - 1]) + part for part in parts)
 
@@ -73,12 +73,12 @@ def refused(path: Path, content: bytes) -> str:
 
 
 @pytest.mark.parametrize("form", forms())
-def test_every_form_gives_the_points_back(tmp_path: Path, form: str) -> None:
+def test_every_pcd_form_is_read_unchanged(tmp_path: Path, form: str) -> None:
     np.testing.assert_array_equal(read(tmp_path / "a.pcd", forms()[form]), POINTS.astype(np.float64))
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_what_open3d_writes_is_read(tmp_path: Path, form: str) -> None:
+def test_pcd_files_of_open3d_are_read(tmp_path: Path, form: str) -> None:
     import open3d
 
     rng = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_what_open3d_writes_is_read(tmp_path: Path, form: str) -> None:
     np.testing.assert_allclose(read_pcd_points(path), points, rtol=0, atol=1e-9 if form != "ascii" else 1e-6)
 
 
-def test_what_is_written_is_read_by_us_and_by_open3d(tmp_path: Path) -> None:
+def test_written_pcd_is_read_here_and_by_open3d(tmp_path: Path) -> None:
     import open3d
 
     path = tmp_path / "a.pcd"
@@ -101,7 +101,7 @@ def test_what_is_written_is_read_by_us_and_by_open3d(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(open3d.io.read_point_cloud(str(path)).points), points.astype(np.float64))
 
 
-def test_other_fields_and_types_are_passed_over(tmp_path: Path) -> None:
+def test_other_pcd_fields_and_types_are_ignored(tmp_path: Path) -> None:
     kind = np.dtype([("intensity", "u1"), ("x", "<f8"), ("hist", "<f4", 3), ("z", "<i2"), ("y", "<f4")])
     rows = np.zeros(2, kind)
     rows["x"], rows["y"], rows["z"] = [0.1, 0.2], [1.5, 2.5], [-3, 4]
@@ -112,13 +112,13 @@ def test_other_fields_and_types_are_passed_over(tmp_path: Path) -> None:
     assert read(tmp_path / "a.pcd", text.encode()).tolist() == expected
 
 
-def test_points_that_an_organised_cloud_lacks_are_nan(tmp_path: Path) -> None:
+def test_missing_points_of_an_organised_cloud_are_nan(tmp_path: Path) -> None:
     content = header("ascii", 2, WIDTH="1", HEIGHT="2") + "nan nan nan\n1 2 3\n"
     found = read(tmp_path / "a.pcd", content.encode())
     assert np.isnan(found[0]).all() and found[1].tolist() == [1, 2, 3]
 
 
-def test_a_cloud_without_points_is_read(tmp_path: Path) -> None:
+def test_empty_cloud_is_read(tmp_path: Path) -> None:
     for content in forms(np.zeros((0, 3), np.float32)).values():
         assert read(tmp_path / "a.pcd", content).shape == (0, 3)
 
@@ -132,9 +132,9 @@ def test_a_cloud_without_points_is_read(tmp_path: Path) -> None:
     ],
     ids=str,
 )
-def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_each_invalid_pcd_header_is_a_one_line_error(tmp_path: Path, changes: dict[str, Any]) -> None:
     head = header("binary", **changes)
-    if "COLOUR" in changes or "COLUMNS" in changes:  # before the line that ends the header
+    if "COLOUR" in changes or "COLUMNS" in changes:  # before the last line of the header
         ((key, value),) = changes.items()
         head = header("binary").replace("DATA", f"{key} {value}\nDATA")
     refused(tmp_path / "a.pcd", head.encode() + POINTS.tobytes())
@@ -148,17 +148,17 @@ def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str,
         bytes([31]) + bytes(10),  # a run beyond the end
         bytes([0, 0, 7 << 5]),  # a repetition without its length
         bytes([0, 0, 32]),  # a repetition without its distance
-        bytes([0, 0, 7 << 5, 255, 0]),  # more than was promised
+        bytes([0, 0, 7 << 5, 255, 0]),  # more than declared
         bytes([0, 0]),  # less
     ],
 )
-def test_each_fault_of_compressed_points_is_one_line(tmp_path: Path, packed: bytes) -> None:
+def test_damaged_compressed_points_are_a_one_line_error(tmp_path: Path, packed: bytes) -> None:
     message = refused(tmp_path / "a.pcd", compressed(POINTS, packed))
-    assert "compressed points are damaged" in message or "cut short or damaged" in message
+    assert "compressed points are damaged" in message or "truncated or damaged" in message
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_promises_of_more_than_is_there_allocate_nothing(tmp_path: Path, form: str) -> None:
+def test_header_larger_than_the_file_allocates_nothing(tmp_path: Path, form: str) -> None:
     content = header(form, 10**12 - 1).encode() + struct.pack("<II", 100, 0xFFFFFFFF) + b"1 2 3\n" * 20
     with traced(1 << 22):
         refused(tmp_path / "a.pcd", content)

@@ -1,4 +1,4 @@
-"""Pickles of other programs are read as data: nothing in them runs, and no file makes the reader hold too much."""
+"""Pickles of other programs are read as data: no code in them is executed, and memory is limited."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def refused(folder: Path, content: bytes) -> str:
 
 
 def a_map(n: int = 3) -> dict[str, Any]:
-    """A map as ConceptGraphs pickles it, small."""
+    """A small map in the form of ConceptGraphs' pickles."""
     rng = np.random.default_rng(0)
     one = {
         "pcd_np": rng.random((n, 3)),
@@ -48,7 +48,7 @@ def a_map(n: int = 3) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_plain_values_arrays_and_scalars_come_back(tmp_path: Path, protocol: int) -> None:
+def test_plain_values_arrays_and_scalars_are_read_unchanged(tmp_path: Path, protocol: int) -> None:
     kinds = ("?", "u1", "i2", "<i4", ">i4", "u8", "f2", "f4", ">f8", "U7", "S3")
     value = {
         "numbers": [0, -1, 255, 256, 65536, -(1 << 31), 1 << 40, 1 << 70, 0.5, -1e300, True, False, None],
@@ -69,7 +69,7 @@ def test_plain_values_arrays_and_scalars_come_back(tmp_path: Path, protocol: int
     assert (ordered, default) == ({"a": 1}, {1: [2]}) and type(path) is Opaque and not vars(path)
 
 
-def test_settings_become_one_inert_place_and_gzip_is_unpacked(tmp_path: Path) -> None:
+def test_settings_become_one_inert_object_and_gzip_is_unpacked(tmp_path: Path) -> None:
     tree = b"\x80\x04comegaconf.dictconfig\nDictConfig\n)\x81}(X\x01\x00\x00\x00acomegaconf.base\nMetadata\n)\x81ub."
     assert type(read(tmp_path, tree)) is Opaque
     for content in (pickle.dumps(a_map()), gzip.compress(pickle.dumps(a_map()))):
@@ -77,7 +77,7 @@ def test_settings_become_one_inert_place_and_gzip_is_unpacked(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("protocol", [4, 5])
-def test_payloads_below_a_key_to_forget_are_not_kept(tmp_path: Path, protocol: int) -> None:
+def test_payloads_below_a_skipped_key_are_not_kept(tmp_path: Path, protocol: int) -> None:
     masks = [np.random.default_rng(k).random((500, 1000)) < 0.5 for k in range(5)]
     one = {"pcd": np.ones((1000, 3)), "mask": masks, "colours": np.ones(9000), "after": np.ones(2000)}
     content = pickle.dumps({"objects": [one]}, protocol)
@@ -100,13 +100,13 @@ class Call:
 @pytest.mark.parametrize(
     "function", [os.system, eval, exec, getattr, open, subprocess.Popen, np.load, os.unlink, bytearray, range, map]
 )
-def test_a_call_of_anything_else_is_refused_by_name_and_not_made(tmp_path: Path, function: Any) -> None:
+def test_any_other_call_is_rejected_by_name_and_not_executed(tmp_path: Path, function: Any) -> None:
     victim = tmp_path / "victim"
     victim.write_text("here")
     argument = f"rm {victim}" if function in {os.system, eval, exec} else str(victim)
     for protocol in PROTOCOLS:
         message = refused(tmp_path, pickle.dumps({"objects": [Call(function, argument)]}, protocol))
-        assert "which is no plain data" in message and (protocol < 4 or f".{function.__name__}, " in message)
+        assert "which is not plain data" in message and (protocol < 4 or f".{function.__name__}, " in message)
     assert victim.read_text() == "here"
 
 
@@ -149,7 +149,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_pickle_is_one_line(tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_invalid_pickle_is_a_one_line_error(tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pickles, "FREE_STEPS", 20_000)
     with traced(400 << 20):
         refused(tmp_path, FAULTS[fault])
@@ -160,16 +160,16 @@ def test_each_fault_of_a_pickle_is_one_line(tmp_path: Path, fault: str, monkeypa
     [
         b"]" * 200_000 + b"a" * 199_999 + b".",  # lists in lists
         b"N" + b"\x85" * 200_000 + b".",  # tuples in tuples
-        b"]\x94" + b"(" + b"h\x00" * 100_000 + b"e.",  # a list that holds itself
-        b"]" + b"r\xff\xff\xff\xff" + b".",  # remembered at place 4 billion
+        b"]\x94" + b"(" + b"h\x00" * 100_000 + b"e.",  # a list that contains itself
+        b"]" + b"r\xff\xff\xff\xff" + b".",  # memoised under key 4 billion
     ],
 )
-def test_odd_pickles_cost_no_more_than_their_bytes(tmp_path: Path, content: bytes) -> None:
+def test_unusual_pickles_take_memory_proportional_to_their_size(tmp_path: Path, content: bytes) -> None:
     with traced(300 * len(content) + 10_000_000):
         read(tmp_path, content)
 
 
-def test_a_gzip_bomb_stops_at_the_bound(tmp_path: Path) -> None:
+def test_gzip_bomb_stops_at_the_limit(tmp_path: Path) -> None:
     zeros = b"\x8e" + struct.pack("<Q", 256 << 20) + bytes(256 << 20) + b"."
     content = gzip.compress(zeros, 1)
     with traced(16 << 20):

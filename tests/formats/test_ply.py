@@ -1,4 +1,4 @@
-"""PLY files: every type in every format round-trips, quads and mixed faces, damage is one typed error."""
+"""PLY files: every type in every format round-trips, quads and mixed faces; a damaged file is a typed error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_ply_as(path: Path, elements: Sequence[PlyElement], format: str) -> Non
 
 
 def rows(element: PlyElement) -> Iterator[list[np.ndarray]]:
-    """The values of each row, those of a list behind their number."""
+    """The values of each row; lists are preceded by their length."""
     for row in range(element.n_rows):
         cells: list[np.ndarray] = []
         for column in element.columns.values():
@@ -41,7 +41,7 @@ def rows(element: PlyElement) -> Iterator[list[np.ndarray]]:
 
 
 def text(row: list[np.ndarray]) -> bytes:
-    """The shortest digits that give each value back."""
+    """The shortest digits that reproduce each value."""
     return (" ".join(str(value) for cell in row for value in cell) + "\n").encode()
 
 
@@ -56,7 +56,7 @@ MIXED = ListColumn(np.array([0, 4, 7, 7, 12]), np.array([0, 1, 2, 3, 4, 5, 6, 0,
 
 
 def extremes(kind: str) -> np.ndarray:
-    """Values at the ends of the range of a type, and some that need all its digits."""
+    """The smallest and largest values of a type, and some that need all its digits."""
     if kind.startswith("f"):
         info = np.finfo(kind)
         return np.array([info.max, -info.max, info.tiny, 1 / 3, -0.1], kind)
@@ -79,7 +79,7 @@ def mesh_bytes(tmp_path: Path, format: str, corners: ListColumn = MIXED) -> byte
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_every_scalar_type_keeps_its_values_to_the_ends_of_its_range(tmp_path: Path, format: str) -> None:
+def test_every_scalar_type_round_trips_over_its_full_range(tmp_path: Path, format: str) -> None:
     elements = [PlyElement("sample", 5, {f"value_{kind}": extremes(kind) for kind in TYPES})]
     write_ply_as(tmp_path / "a.ply", elements, format)
     assert_same(read_ply(tmp_path / "a.ply").elements, tuple(elements))
@@ -98,7 +98,7 @@ def test_lists_of_every_count_and_item_type_round_trip(tmp_path: Path, format: s
         assert_same(read_ply(tmp_path / "a.ply").elements, tuple(elements))
 
 
-def test_a_file_written_byte_by_byte_is_read_as_the_format_says(tmp_path: Path) -> None:
+def test_hand_written_ply_file_is_read_as_specified(tmp_path: Path) -> None:
     header = (
         b"ply\r\nformat binary_little_endian 1.0\r\nobj_info scanner\r\nelement vertex 1\r\nproperty double x\r\n"
         b"property uint8 red\r\nelement face 2\r\nproperty list uchar int vertex_indices\r\n"
@@ -120,7 +120,7 @@ def test_a_file_written_byte_by_byte_is_read_as_the_format_says(tmp_path: Path) 
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("corners", [QUADS, MIXED], ids=["quads", "mixed"])
-def test_a_file_cut_short_anywhere_is_a_data_error_that_names_it(
+def test_file_truncated_anywhere_is_a_data_error_that_names_it(
     tmp_path: Path, format: str, corners: ListColumn
 ) -> None:
     whole = (
@@ -134,7 +134,7 @@ def test_a_file_cut_short_anywhere_is_a_data_error_that_names_it(
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_bytes_behind_the_last_element_are_an_error(tmp_path: Path, format: str) -> None:
+def test_bytes_after_the_last_element_are_an_error(tmp_path: Path, format: str) -> None:
     (tmp_path / "long.ply").write_bytes(mesh_bytes(tmp_path, format) + b" 17 ")
     with pytest.raises(DataError, match="after the last element"):
         read_ply(tmp_path / "long.ply")
@@ -142,11 +142,11 @@ def test_bytes_behind_the_last_element_are_an_error(tmp_path: Path, format: str)
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("row", ["property float x", "property list uchar int vertex_indices"])
-def test_a_promise_of_a_trillion_rows_allocates_nothing(tmp_path: Path, format: str, row: str) -> None:
+def test_header_with_a_trillion_rows_allocates_nothing(tmp_path: Path, format: str, row: str) -> None:
     header = f"ply\nformat {format} 1.0\nelement vertex 1000000000000\n{row}\nend_header\n1 2 3 4\n"
     (tmp_path / "bomb.ply").write_text(header)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(DataError, match="promises 1000000000000 rows"):
+    with pytest.raises(DataError, match="declares 1000000000000 rows"):
         read_ply(tmp_path / "bomb.ply")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 10_000  # KiB
 
@@ -169,7 +169,7 @@ V = "ply\nformat ascii 1.0\nelement v 2\n"
         ),
     ],
 )
-def test_each_fault_of_a_file_is_one_line(tmp_path: Path, content: str) -> None:
+def test_each_invalid_ply_file_is_a_one_line_error(tmp_path: Path, content: str) -> None:
     (tmp_path / "bad.ply").write_text(content)
     with pytest.raises(DataError) as caught:
         read_ply(tmp_path / "bad.ply")
@@ -177,7 +177,7 @@ def test_each_fault_of_a_file_is_one_line(tmp_path: Path, content: str) -> None:
 
 
 @pytest.mark.parametrize("is_text", [False, True])
-def test_open3d_reads_our_files_and_we_read_its(tmp_path: Path, is_text: bool) -> None:
+def test_ply_files_are_exchanged_with_open3d(tmp_path: Path, is_text: bool) -> None:
     import open3d as o3d
 
     triangles = ListColumn(np.arange(3) * 3, np.array([0, 1, 2, 2, 3, 7], np.int32))

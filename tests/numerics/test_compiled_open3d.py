@@ -12,7 +12,7 @@ assert abs(scene.cast_rays(rays)["t_hit"].numpy()[0] - 2) < 1e-5
 """
 
 
-def test_the_compiled_module_casts_rays_and_the_package_may_follow() -> None:
+def test_compiled_module_casts_rays_and_the_package_can_be_imported_later() -> None:
     text = (
         "import sys; import numpy as np; from su3d_bench.numerics.open3d_core import compiled_open3d\n"
         f"o3d = compiled_open3d(){CAST}"

@@ -1,4 +1,4 @@
-"""What docs/numbers/statistics.md says of intervals, and the program that simulates it."""
+"""The coverage of intervals in docs/numbers/statistics.md, and the simulation behind it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def cells(table: str) -> dict[str, list[str]]:
     return {name.strip(): values for name, *values in rows if not name.startswith("-")}
 
 
-def test_the_page_holds_what_the_program_writes_with_enough_simulations_and_no_cell_below_90() -> None:
+def test_page_matches_the_simulation_and_coverage_is_at_least_90_percent() -> None:
     shown = PAGE.partition(coverage.BEGIN)[2].partition(coverage.END)[0]
     n_simulations = int(re.findall(r"(\d+) simulations per cell", shown)[0])
     assert n_simulations >= 2000
@@ -30,13 +30,13 @@ def test_the_page_holds_what_the_program_writes_with_enough_simulations_and_no_c
     assert set(over_scenes) == {*worlds, *(f"{name}, difference" for name in worlds)}
     values = {name: [float(value) for value in row] for name, row in over_scenes.items()}
     assert min(min(row) for row in values.values()) >= coverage.LEAST
-    for name, row in values.items():  # what misses the mark is named with its reason
+    for name, row in values.items():  # a coverage outside the range is listed with its reason
         missed = [n.removesuffix(" scenes") for n, value in zip(header, row, strict=True) if not 93 <= value <= 97]
         assert not missed or f"- {name} at {', '.join(missed)} scenes: " in shown
 
 
 @pytest.mark.proof
-def test_intervals_of_few_scenes_hold_the_truth_where_a_bootstrap_s_do_not() -> None:
+def test_intervals_of_few_scenes_have_coverage_where_bootstrap_fails() -> None:
     world = coverage.Shares()
     tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["share of questions"]
     assert 89 < (tally.per_cent(coverage.JACKKNIFE) or 0) < 98  # 93 of the page, within 3 standard errors

@@ -1,4 +1,4 @@
-"""Every rule of relations on both sides of each of its thresholds, by hand; and that there is one code of them."""
+"""Every relation rule on both sides of each threshold, by hand; all users of relations give the same answers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FLOOR = box(-5, -5, -0.1, 10, 10, 0.1)
 
 
 def holds(relation: Relation, a: Float64Array, b: Float64Array, *others: Float64Array, name: str = "thing") -> bool:
-    """Whether ``a`` stands in the relation to ``b``, which is called ``name``, on a floor at 0 among ``others``."""
+    """Whether ``a`` is in the relation to ``b``, which is named ``name``, on a floor at 0 among ``others``."""
     boxes = np.array([a, b, FLOOR, *others])
     names = ["thing", name, "floor", *["thing"] * len(others)]
     return bool(Relations(boxes, names).of(relation)[0, 1])
@@ -59,14 +59,14 @@ PICTURE = box(0.2, 0.97, 1.2, 0.6, 0.03, 0.5)
         ("on", moved(BOOK, z=-0.84), SHELF, True),  # 0.06 m above the foot: an inner board
         ("on", moved(BOOK, z=-0.86), SHELF, False),  # 0.04 m: it stands on the floor
         ("on", moved(BOOK, y=-0.12), SHELF, False),  # 0.65 of it inside
-        # under: what bears it, what has it above, what stands where it covers the ground
+        # under: what carries it, what has it above, what stands on the ground that it covers
         ("under", TABLE, CUP, True),
         ("under", CUP, TABLE, False),
         ("under", box(0.3, 0.3, 0, 0.3, 0.3, 0.4), TABLE, True),
         ("under", box(0.78, 0.3, 0, 0.3, 0.3, 0.4), TABLE, True),  # 0.73 of its ground is covered
         ("under", box(0.82, 0.3, 0, 0.3, 0.3, 0.4), TABLE, False),  # 0.6
         ("under", box(0.3, 0.3, 0, 0.3, 0.3, 0.8), TABLE, False),  # it reaches higher
-        # above: half of it or its centre, no more than a metre, not resting
+        # above: half of it or its centre, at most a metre, not resting
         ("above", PICTURE, TABLE, True),
         ("above", moved(PICTURE, z=0.49), TABLE, True),  # 0.99 m of air
         ("above", moved(PICTURE, z=0.51), TABLE, False),
@@ -89,25 +89,25 @@ PICTURE = box(0.2, 0.97, 1.2, 0.6, 0.03, 0.5)
         ("next to", PICTURE, moved(PICTURE, x=0.85), True),
         ("next to", PICTURE, moved(PICTURE, x=0.95), False),
         ("next to", PICTURE, moved(PICTURE, y=-0.05), False),  # one hangs before the other
-        # near: a metre from box to box
+        # near: at most a metre from box to box
         ("near", box(1.99, 0, 0, 0.5, 0.5, 0.9), TABLE, True),
         ("near", box(2.01, 0, 0, 0.5, 0.5, 0.9), TABLE, False),
     ],
 )
-def test_a_rule_on_both_sides_of_its_threshold(
+def test_each_relation_rule_on_both_sides_of_its_threshold(
     relation: Relation, a: Float64Array, b: Float64Array, is_so: bool
 ) -> None:
     assert holds(relation, a, b) is is_so
 
 
-def test_a_container_holds_what_a_shelf_carries() -> None:
+def test_object_is_in_a_container_but_on_a_shelf() -> None:
     holder, held = box(0, 0, 0, 0.5, 0.5, 0.4), box(0.1, 0.1, 0.1, 0.2, 0.2, 0.6)
     assert holds("in", held, holder, name="basket") and not holds("on", held, holder, name="basket")
     assert holds("on", held, holder, name="shelf") and not holds("in", held, holder, name="shelf")
     assert not holds("in", moved(held, x=0.31), holder, name="basket")  # 0.45 of it inside
 
 
-def test_what_is_deeper_is_under_the_first_that_bears() -> None:
+def test_lower_supports_are_under_the_first_support() -> None:
     slab, cabinet = box(0, 0, 0.7, 2, 1, 0.03), box(0, 0, 0, 1, 1, 0.7)
     cup = moved(CUP, z=0.03)
     assert holds("on", cup, slab, cabinet) and holds("on", slab, cabinet, cup)
@@ -115,7 +115,7 @@ def test_what_is_deeper_is_under_the_first_that_bears() -> None:
     assert not holds("under", cabinet, cup, slab)
 
 
-def test_nothing_stands_between_neighbours() -> None:
+def test_an_object_in_between_prevents_next_to() -> None:
     chair, bin_between = box(1.24, 0, 0, 0.5, 1, 0.9), box(1.05, 0.3, 0, 0.15, 0.15, 0.3)
     assert holds("next to", chair, TABLE)
     assert not holds("next to", chair, TABLE, bin_between)
@@ -123,7 +123,7 @@ def test_nothing_stands_between_neighbours() -> None:
     assert holds("next to", bin_between, TABLE, chair)
 
 
-def test_fixtures_rest_on_nothing_and_surfaces_stand_in_no_relation() -> None:
+def test_fixtures_rest_on_nothing_and_surfaces_have_no_relations() -> None:
     assert holds("on", box(0.2, 0.9, 0.71, 0.5, 0.1, 1), TABLE)
     boxes = np.array([box(0.2, 0.9, 0.71, 0.5, 0.1, 1), TABLE, FLOOR])
     relations = Relations(boxes, ["window", "table", "floor"])
@@ -131,7 +131,7 @@ def test_fixtures_rest_on_nothing_and_surfaces_stand_in_no_relation() -> None:
     assert not any(relations.of(name)[2].any() or relations.of(name)[:, 2].any() for name in RELATIONS)
 
 
-def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
+def test_relation_close_to_a_threshold_is_doubtful() -> None:
     chair = box(1, 0, 0, 0.5, 0.5, 0.9)
     # from 0.25 m less a quarter, half the chair's side, to 0.5 m and a quarter, half the table's
     for gap, is_doubtful in ((0.19, False), (0.21, True), (0.62, True), (0.63, False)):
@@ -149,7 +149,7 @@ def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
     ]
 
 
-def test_what_people_read_differently_is_doubtful() -> None:
+def test_ambiguous_relation_is_doubtful() -> None:
     door, switch = box(0, 0, 0, 0.9, 0.05, 2.0), box(1.1, 0, 1.2, 0.1, 0.03, 0.1)
     beside = Relations(np.array([door, switch, FLOOR]), ["door", "switch", "floor"])
     assert not beside.next_to.any() and beside.doubtful("next to")[0, 1] and beside.doubtful("next to")[1, 0]
@@ -161,30 +161,30 @@ def test_what_people_read_differently_is_doubtful() -> None:
         assert not small.next_to[0, 1] and small.doubtful("next to")[0, 1] == is_doubtful, aside
     chair = box(1.05, 0, 0, 0.5, 0.5, 0.9)
     by_table = Relations(np.array([moved(CUP, x=0.45), TABLE, chair, FLOOR]), ["cup", "table", "chair", "floor"])
-    assert by_table.next_to[1, 2] and not by_table.doubtful("next to")[0, 2]  # nobody calls the cup so
+    assert by_table.next_to[1, 2] and not by_table.doubtful("next to")[0, 2]  # the cup is never next to it
     held = np.array([BOOK, SHELF, FLOOR])
     for name, is_doubtful in (("shelf", False), ("sofa", False), ("stand", True), ("desk", True)):
         inner = Relations(held, ["book", name, "floor"])
         assert inner.on[0, 1] and inner.doubtful("on")[0, 1] == is_doubtful == inner.doubtful("under")[1, 0], name
 
 
-def test_between_lies_on_the_way_on_one_level() -> None:
+def test_between_requires_the_line_and_the_same_height() -> None:
     a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.5, -0.5, 0, 1, 1, 1)
     middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)
     assert is_between(middle, a, b)
-    assert is_between(moved(middle, y=0.04), a, b)  # the line leads over the inner half of its 0.2 m
+    assert is_between(moved(middle, y=0.04), a, b)  # the line crosses the inner half of its 0.2 m
     assert not is_between(moved(middle, y=0.06), a, b)
-    assert is_between(moved(middle, x=-1.7), a, b)  # a tenth of 4 m on the way
+    assert is_between(moved(middle, x=-1.7), a, b)  # at a tenth of the 4 m line
     assert not is_between(moved(middle, x=-1.85), a, b)
-    assert is_between(box(1.5, 1.5, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))  # aslant
+    assert is_between(box(1.5, 1.5, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))  # diagonal
     assert not is_between(box(2.6, 0.4, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))
-    assert not is_between(moved(middle, z=1.0), a, b)  # over their heads
+    assert not is_between(moved(middle, z=1.0), a, b)  # above them
     assert not is_between(moved(middle, x=1.9), a, b)
     assert not is_between(a, b, b)
     assert not is_between(box(1.9, -0.1, 0, 0.2, 0.2, 0.02), a, b)  # flat
 
 
-def test_what_stands_in_the_lane_may_be_between() -> None:
+def test_object_in_the_lane_may_be_between() -> None:
     a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.75, -0.25, 0, 0.5, 0.5, 1)  # the lane narrows from 1 m to 0.5 m
     middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)
     for aside in (0.0, 0.1, 0.5):  # half of the lane is 0.407 m where the thing begins, and half of the thing 0.1 m
@@ -196,17 +196,17 @@ def test_what_stands_in_the_lane_may_be_between() -> None:
     assert not may_be_between(box(3.0, 0.0, 0, 0.9, 0.9, 1), *aslant)
 
 
-def test_left_is_seen_from_an_eye() -> None:
+def test_left_depends_on_the_viewpoint() -> None:
     eye = np.zeros(3)
     assert bearing_rad(eye, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])) == pytest.approx(np.pi / 4)
-    # The angle goes over the line where bearings jump from -180 to 180 degrees.
+    # The angle crosses the jump of bearings from -180 to 180 degrees.
     assert is_left_of(np.array([-1.0, -0.1, 0.0]), np.array([-1.0, 0.1, 0.0]), eye)
     assert gap_m(box(1.25, 0, 0, 0.5, 0.5, 0.9), TABLE) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("scene", DEFAULT_SCENES[:2])
-def test_no_two_answers_differ_for_a_pair(scene: str, rooms_data: Path) -> None:
-    """The rooms' own truth, the relations of a map and the solver, over all pairs of a room."""
+def test_ground_truth_map_and_solver_agree_for_every_pair(scene: str, rooms_data: Path) -> None:
+    """The rooms' ground truth, the relations of a map and the solver, over all pairs of a room."""
     truth = Rooms(rooms_data).truth(scene)
     things = [known.whole() for known in truth.objects]
     objects = SceneMap(tuple(MapObject(t.id, t.name, "", t.box.mean(axis=0), t.box) for t in things))
@@ -223,8 +223,8 @@ def test_no_two_answers_differ_for_a_pair(scene: str, rooms_data: Path) -> None:
 
 
 @pytest.mark.parametrize("scene", DEFAULT_SCENES[:2])
-def test_what_a_room_was_built_with_is_found(scene: str, rooms_data: Path) -> None:
-    """On and in, as the room was put together; besides them only what stands on a rug."""
+def test_relations_of_generated_rooms_are_found(scene: str, rooms_data: Path) -> None:
+    """On and in, as the room was generated; besides them only objects on a rug."""
     rooms = Rooms(rooms_data)
     plan = rooms._room(scene).plan
     built = {(subject, relation, holder) for subject, (holder, relation) in plan.parent.items()}

@@ -59,5 +59,5 @@ def test_run_on_a_missing_gpu_fails_early_with_one_line(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["run", "--device", "cuda", "--scenes", "rooms/living0", "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "device 'cuda': torch sees no GPU here; use --device cpu" in error
+    assert error.count("\n") == 1 and "device 'cuda': torch finds no GPU; use --device cpu" in error
     assert not (tmp_path / "run").exists()

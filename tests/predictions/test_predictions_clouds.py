@@ -238,7 +238,7 @@ def test_rows_outside_the_float16_range_have_no_feature(tmp_path: Path) -> None:
         (np.zeros((4, 2)), np.ones((4, 2)), "pc_points.h5: has the shape (4, 2); expected (N, 3)"),
         (np.zeros((4, 3)), np.ones((5, 2)), "pc_embeddings.h5: has other rows than pc_points.h5 (4)"),
         (np.zeros((4, 3)), np.ones(4), "pc_embeddings.h5: has the shape (4,); expected (N, D)"),
-        (np.zeros((4, 3)), np.ones((4, 2), int), "pc_embeddings.h5: holds values of type int64"),
+        (np.zeros((4, 3)), np.ones((4, 2), int), "pc_embeddings.h5: contains values of type int64"),
     ],
 )
 def test_each_invalid_dense_map_is_one_line(tmp_path: Path, points: Any, features: Any, message: str) -> None:
@@ -286,7 +286,7 @@ def test_each_invalid_hovsg_map_is_one_line(tmp_path: Path) -> None:
     write_ply(scene / "objects/pcd_0.ply", [PlyElement("vertex", 1, {"x": np.zeros(1), "y": np.zeros(1)})])
     assert "pcd_0.ply: its vertices have no x, y and z" in made.refused(tmp_path, "room0", "hovsg")
     made.write_torch(scene / "mask_feats.pt", made.Tensor(np.ones(3, np.float32)))
-    assert "mask_feats.pt: holds an array of shape (3,)" in made.refused(tmp_path, "room0", "hovsg")
+    assert "mask_feats.pt: contains an array of shape (3,)" in made.refused(tmp_path, "room0", "hovsg")
 
 
 # ---- OpenLex3D
@@ -323,8 +323,8 @@ def test_cloud_that_the_original_reads_is_used_of_several(tmp_path: Path) -> Non
         (np.array([0, 2**63], np.uint64), np.ones((2, 4)), "point 1 is of object 9223372036854775808"),
         (np.array([0, 1, 1]), np.ones((2, 4)), "expected one integer for each of the 2 points of point_cloud.pcd"),
         (np.array([0.0, 1.0]), np.ones((2, 4)), "holds an array of shape (2,) float64"),
-        (np.array([0, 1]), np.ones(4), "embeddings.npy: holds an array of shape (4,)"),
-        (np.array([0, 1]), np.array([[{}]]), "embeddings.npy: not a whole .npy array"),
+        (np.array([0, 1]), np.ones(4), "embeddings.npy: contains an array of shape (4,)"),
+        (np.array([0, 1]), np.array([[{}]]), "embeddings.npy: not a complete .npy array"),
     ],
 )
 def test_each_invalid_openlex3d_file_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:

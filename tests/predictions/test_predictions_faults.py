@@ -31,10 +31,10 @@ from su3d_bench.store.predictions import prediction_arrays
         ("loop 5 0.5", "mask 'loop' cannot be read"),
         ("\x1b[31m" + "x" * 9000 + " 5 0.5", "cannot be read"),
         ("pred_mask/short.txt 5 0.5", "is of 2 points and 'pred_mask/a.txt' of 3;"),
-        ("pred_mask/word.txt 5 0.5", ":2: 'one' is not an integer"),
-        ("pred_mask/bad.json 5 0.5", "is not valid JSON"),
+        ("pred_mask/word.txt 5 0.5", ":2: 'one' is not a 64-bit integer"),
+        ("pred_mask/bad.json 5 0.5", "is not readable as JSON"),
         ("pred_mask/huge.json 5 0.5", "'length' is 1000000000000"),
-        ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 on, of 3 points"),
+        ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 in 3 points"),
     ],
 )
 def test_each_invalid_mask_list_is_one_line_with_its_position(tmp_path: Path, line: str, message: str) -> None:
@@ -61,7 +61,7 @@ def test_each_invalid_mask_list_is_one_line_with_its_position(tmp_path: Path, li
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("", "is empty"), ("3\nx\n", ":2: 'x' is not an integer"), ("1\n4294967296\n", ":2: 42949")],
+    [("", "is empty"), ("3\nx\n", ":2: 'x' is not a 64-bit integer"), ("1\n4294967296\n", ":2: 42949")],
 )
 def test_each_invalid_label_file_is_one_line(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "s.txt").write_text(content)
@@ -112,13 +112,13 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": np.array("Picture")}, "holds no 'kind' out of"),
+        ({"kind": np.array("Picture")}, "has no 'kind' of"),
         ({"points": np.zeros((6, 2), np.float32)}, "'points' is an array of shape (6, 2) float32"),
         ({"points": np.full((6, 3), np.nan, np.float32)}, "'points' has values that are NaN"),
         ({"scores": np.array([1.0, np.inf])}, "'scores' has values that are NaN"),
         ({"indptr": np.array([0, 5, 2])}, "indptr does not describe"),
-        ({"indices": np.array([0, 1, 2, 3, 6], np.int32)}, "mask holds index 6, the map has 6 points"),
-        ({"boxes": None}, "lacks 'boxes'"),
+        ({"indices": np.array([0, 1, 2, 3, 6], np.int32)}, "mask has index 6, the map has 6 points"),
+        ({"boxes": None}, "'boxes' is missing"),
     ],
 )
 def test_each_invalid_prediction_file_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

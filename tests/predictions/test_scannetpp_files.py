@@ -71,7 +71,7 @@ def test_ranked_classes_are_recognised_by_their_commas(text: str, rows: list[lis
     ("text", "message"),
     [
         ("1,2,3\n1,2\n", ":2: has 2 classes; expected one in every line, or 3 in each"),
-        ("1,2,3\n1,x,3\n", ":2: 'x' is not an integer"),
+        ("1,2,3\n1,x,3\n", ":2: 'x' is not a 64-bit integer"),
         ("1,2,3\n1,-1,3\n", ":2: 1,-1,3 is not a class index (0-based)"),
         ("1,2,99999999999\n", ":1: 1,2,99999999999 is not a class index"),
         ("", "is empty; expected one or three classes per line"),

@@ -83,7 +83,7 @@ CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-i
         ("missing-frame", "painted/b: frame 2 is missing; copy it again"),
         (
             "nan-pose",
-            f"painted/b: painted.py:{MADE}: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the "
+            f"painted/b: painted.py:{MADE}: frame 2: the pose is not a finite 4x4 matrix; drop the frame or fix the "
             "trajectory",
         ),
         ("crash", f"painted/b: painted.py:{CRASHES}: ZeroDivisionError: a mistake in a plug-in"),

@@ -1,4 +1,4 @@
-"""Where compiled code cannot be kept, a run says why it is slow and what to do."""
+"""If compiled code cannot be cached, a run reports why it is slow and what to do."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from su3d_bench.store import caches
 from su3d_bench.store.caches import kernel_folders
 
 
-def test_where_no_kernel_can_be_kept_the_reason_and_what_to_do_are_said(
+def test_unwritable_kernel_cache_gives_a_warning_with_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
     closed = tmp_path / "file" / "numba"
     monkeypatch.setattr(caches, "kernel_folders", lambda: (closed, Path("/dev/null/numba")))
     line = caches.cache_warning()
-    assert line is not None and line.startswith(f"compiled code cannot be kept in any of {closed}, /dev/null/numba: ")
+    assert line is not None and line.startswith(f"compiled code cannot be cached in any of {closed}, /dev/null/numba: ")
     monkeypatch.setattr(caches, "kernel_folders", lambda: (closed, tmp_path))
     assert caches.cache_warning() is None
 
 
-def test_the_folders_are_those_that_numba_tries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernel_folders_match_those_of_numba(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
         "from su3d_bench.numerics import clusters\n"
         "from numba.core.caching import UserProvidedCacheLocator as told, InTreeCacheLocator as own\n"

@@ -1,4 +1,4 @@
-"""Maps with one feature a point, within bounds: on disk as in memory, stored beside the map, resumed, cleared."""
+"""Maps with one feature per point: on disk equal to in memory, stored in a second file, read and scored in blocks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)
 
 
-# ---- on disk as in memory
+# ---- on disk and in memory
 
 
 def in_the_box(index: int) -> tuple[Frame, Detections]:
@@ -50,14 +50,14 @@ def fused(features_in: Any) -> ConceptFusion:
     return method
 
 
-def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_on_disk_equal_those_in_memory_bit_by_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feature_table, "BLOCK_ROWS", 100)  # many blocks
     on_disk, in_memory = fused("disk"), fused("memory")
     disk, memory = on_disk.finish(), in_memory.finish()
     assert disk.features.dtype == memory.features.dtype == np.float16
     np.testing.assert_array_equal(disk.features.view(np.uint16), memory.features.view(np.uint16))
     np.testing.assert_array_equal(disk.points, memory.points)
-    assert on_disk.n_points > 1.2 * 36 * 48  # it grew, so that the file was mapped at several sizes
+    assert on_disk.n_points > 1.2 * 36 * 48  # it grew, so the file was mapped at several sizes
     assert on_disk.map_bytes == in_memory.map_bytes
     for prediction in (disk, memory):
         assert not prediction.features.flags.writeable
@@ -67,7 +67,7 @@ def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.M
         fused("disk")
 
 
-def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() -> None:
+def test_mean_is_computed_in_float32_and_rounded_once_per_update() -> None:
     table = FeatureTable(2, "memory")
     first, second = np.array([[0.1, 1.0]], np.float16), np.array([[0.3, -1.0]], np.float16)
     table.append(first, np.zeros(1, np.int32), np.array([3.0]))
@@ -83,7 +83,7 @@ def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() 
 # ---- the store
 
 
-def test_the_features_of_a_dense_map_are_a_file_of_their_own_that_is_mapped_when_read(tmp_path: Path) -> None:
+def test_dense_features_are_a_separate_memory_mapped_file(tmp_path: Path) -> None:
     path = tmp_path / "prediction.npz"
     write_prediction(path, DenseFeatures(POINTS, ROWS))
     assert sorted(child.name for child in tmp_path.iterdir()) == ["prediction.features.npy", "prediction.npz"]
@@ -95,7 +95,7 @@ def test_the_features_of_a_dense_map_are_a_file_of_their_own_that_is_mapped_when
     np.testing.assert_array_equal(np.load(features_beside(path)), ROWS)
 
 
-def test_features_written_in_blocks_are_the_file_that_numpy_saves(
+def test_features_written_in_blocks_equal_the_file_of_numpy_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(predictions, "ROWS_AT_ONCE", 3)
@@ -108,7 +108,7 @@ def test_features_written_in_blocks_are_the_file_that_numpy_saves(
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "text", "rows", "integers"])
-def test_features_that_are_missing_or_damaged_are_one_line_for_both_readers(tmp_path: Path, damage: str) -> None:
+def test_missing_or_damaged_features_are_a_one_line_error_in_both_readers(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "prediction.npz"
     write_prediction(path, DenseFeatures(POINTS, ROWS))
     temporary_path = features_beside(path)
@@ -135,7 +135,7 @@ def test_features_that_are_missing_or_damaged_are_one_line_for_both_readers(tmp_
         b"__import__('os').abort()",
     ],
 )
-def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
+def test_hostile_feature_headers_are_rejected(tmp_path: Path, header: bytes) -> None:
     path = tmp_path / "prediction.npz"
     write_prediction(path, DenseFeatures(POINTS, ROWS))
     padded = header + b" " * (117 - len(header)) + b"\n"
@@ -148,7 +148,7 @@ def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
 # ---- scoring in blocks
 
 
-def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path: Path) -> None:
+def test_labels_of_a_mapped_table_equal_those_of_rows_in_memory(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(20_000, 16)).astype(np.float16)
     features[::7] = 0

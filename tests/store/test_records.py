@@ -1,4 +1,4 @@
-"""The records of a run: what is written is read again, and the page that describes them follows the code."""
+"""The records of a run: they round-trip, and invalid values are reported."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RESULT = ResultRecord(
 
 
 @pytest.mark.parametrize("anytime", [None, (), (MidwayRecord(0.5, {"mAcc": 0.25}),)])
-def test_what_is_written_is_read_again(tmp_path: Path, anytime: tuple[MidwayRecord, ...] | None) -> None:
+def test_metrics_record_round_trips(tmp_path: Path, anytime: tuple[MidwayRecord, ...] | None) -> None:
     metrics = MetricsRecord(limit=0, results=(replace(RESULT, anytime=anytime),))
     write_json(tmp_path / "metrics.json", plain(metrics))
     assert read_record(MetricsRecord, tmp_path / "metrics.json", "run") == metrics
@@ -53,12 +53,12 @@ def test_what_is_written_is_read_again(tmp_path: Path, anytime: tuple[MidwayReco
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ({"results": []}, "run: metrics.json: limit is not as a run writes it (Field required); run it again"),
-        ({"limit": 0, "results": 5}, "run: metrics.json: results is not as a run writes it ("),
-        ([], "run: metrics.json: it is not as a run writes it ("),
+        ({"results": []}, "run: metrics.json: limit is invalid (Field required); run it again"),
+        ({"limit": 0, "results": 5}, "run: metrics.json: results is invalid ("),
+        ([], "run: metrics.json: it is invalid ("),
     ],
 )
-def test_a_damaged_record_is_one_line_that_names_the_field(tmp_path: Path, value: object, message: str) -> None:
+def test_damaged_record_is_a_one_line_error_that_names_the_field(tmp_path: Path, value: object, message: str) -> None:
     write_json(tmp_path / "metrics.json", value)
     with pytest.raises(StoreError, match=f"^{re.escape(message)}"):
         read_record(MetricsRecord, tmp_path / "metrics.json", "run")
@@ -69,14 +69,14 @@ def test_a_damaged_record_is_one_line_that_names_the_field(tmp_path: Path, value
     [
         (
             {"metrics": {"mAcc": 7e300}},
-            "result.metrics is not as a run writes it ('mAcc' is 7e+300, a fraction",
+            "result.metrics is invalid ('mAcc' is 7e+300; a fraction",
         ),
-        ({"per_scene": {"d/a": {"mAcc": -0.5}}}, "'mAcc' is -0.5, a fraction lies from 0 to 1"),
-        ({"intervals": {"mAcc": (0.5, 100.0)}}, "result.intervals.mAcc.1 is not"),
-        ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a is not"),
+        ({"per_scene": {"d/a": {"mAcc": -0.5}}}, "'mAcc' is -0.5; a fraction must be from 0 to 1"),
+        ({"intervals": {"mAcc": (0.5, 100.0)}}, "result.intervals.mAcc.1 is invalid ("),
+        ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a is invalid ("),
     ],
 )
-def test_a_number_that_cannot_be_is_named(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_impossible_metric_value_is_reported(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
     result = replace(RESULT, result=replace(VALUES, **changed))
     write_json(tmp_path / "metrics.json", plain(MetricsRecord(limit=0, results=(result,))))
     with pytest.raises(StoreError) as caught:
@@ -87,12 +87,12 @@ def test_a_number_that_cannot_be_is_named(changed: dict[str, Any], said: str, tm
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("update,total_ms\n0,-1.0\n", "holds -1 and 0; times and sizes lie from 0 to 1e+18"),
-        ("update,total_ms\n0,7e300\n", "holds 0 and 7e+300; times"),
-        ("total_ms,total_ms\n1,2\n", "has two columns of one name"),
+        ("update,total_ms\n0,-1.0\n", "has -1 and 0; times and sizes must be from 0 to 1e+18"),
+        ("update,total_ms\n0,7e300\n", "has 0 and 7e+300; times"),
+        ("total_ms,total_ms\n1,2\n", "has two columns with the same name"),
     ],
 )
-def test_a_table_of_updates_that_no_run_wrote_is_refused(text: str, said: str, tmp_path: Path) -> None:
+def test_invalid_updates_table_is_rejected(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "updates.csv").write_text(text)
     with pytest.raises(DataError) as caught:
         records.read_updates(tmp_path / "updates.csv", "run")

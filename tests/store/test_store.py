@@ -56,7 +56,7 @@ def sealed_job(tmp_path: Path) -> JobFolder:
         ),
     )
 )
-def test_arrays_come_back_as_they_were_and_the_bytes_depend_on_them_alone(arrays: dict[str, NDArray[Any]]) -> None:
+def test_npz_round_trips_and_its_bytes_depend_only_on_the_arrays(arrays: dict[str, NDArray[Any]]) -> None:
     content = npz_bytes(arrays)
     assert content == npz_bytes({name: array.copy() for name, array in arrays.items()})
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -75,7 +75,7 @@ def test_arrays_come_back_as_they_were_and_the_bytes_depend_on_them_alone(arrays
     ],
     ids=lambda prediction: type(prediction).__name__,
 )
-def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances | Partition | DenseFeatures) -> None:
+def test_prediction_round_trips_unchanged(tmp_path: Path, prediction: Instances | Partition | DenseFeatures) -> None:
     write_prediction(tmp_path / "prediction.npz", prediction)
     again = read_prediction(tmp_path / "prediction.npz")
     assert type(again) is type(prediction)
@@ -86,23 +86,23 @@ def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances
         assert getattr(before, "dtype", None) == getattr(after, "dtype", None)
 
 
-def test_a_file_that_is_no_prediction_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_not_a_prediction_is_rejected(tmp_path: Path) -> None:
     write_npz(tmp_path / "other.npz", {"points": np.zeros(3)})
-    with pytest.raises(PredictionError, match=r"other.npz: holds no 'kind' out of Instances, Partition, DenseFeatures"):
+    with pytest.raises(PredictionError, match=r"other.npz: has no 'kind' of Instances, Partition, DenseFeatures"):
         read_prediction(tmp_path / "other.npz")
     write_npz(tmp_path / "short.npz", {"kind": np.array("Partition"), "points": np.zeros((0, 3), np.float32)})
-    with pytest.raises(PredictionError, match=r"short.npz: lacks 'instance'"):
+    with pytest.raises(PredictionError, match=r"short.npz: 'instance' is missing"):
         read_prediction(tmp_path / "short.npz")
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 and no more", b"text", npz_bytes({"x": np.zeros(100)})[:300]])
-def test_a_damaged_archive_is_one_line(tmp_path: Path, content: bytes) -> None:
+def test_damaged_npz_archive_is_a_one_line_error(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "x.npz").write_bytes(content)
     with pytest.raises(StoreError, match=r"x.npz: not a readable .npz file"):
         read_npz(tmp_path / "x.npz")
 
 
-def test_a_step_is_done_under_its_key_only(tmp_path: Path) -> None:
+def test_step_is_complete_only_under_its_key(tmp_path: Path) -> None:
     job = sealed_job(tmp_path)
     assert job.is_done("predict", KEY)
     assert not job.is_done("score", KEY)
@@ -117,7 +117,7 @@ def test_a_step_is_done_under_its_key_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b'{"schema": 1}', b'{"schema": 1, "steps": {"predict": 3}}', None]
 )
-def test_a_damaged_seal_means_that_the_step_runs_anew(tmp_path: Path, content: bytes | None) -> None:
+def test_step_with_a_damaged_completion_record_is_not_complete(tmp_path: Path, content: bytes | None) -> None:
     job = sealed_job(tmp_path)
     job.done.unlink() if content is None else job.done.write_bytes(content)
     assert not job.is_done("predict", KEY)
@@ -125,7 +125,7 @@ def test_a_damaged_seal_means_that_the_step_runs_anew(tmp_path: Path, content: b
 
 
 @pytest.mark.parametrize("damage", ["truncate", "flip", "remove"])
-def test_a_damaged_file_means_that_the_step_runs_anew(tmp_path: Path, damage: str) -> None:
+def test_step_with_a_damaged_file_is_not_complete(tmp_path: Path, damage: str) -> None:
     job = sealed_job(tmp_path)
     if damage == "truncate":
         job.prediction.write_bytes(b"predict")
@@ -136,7 +136,7 @@ def test_a_damaged_file_means_that_the_step_runs_anew(tmp_path: Path, damage: st
     assert not job.is_done("predict", KEY)
 
 
-def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
+def test_new_prediction_removes_the_completion_record_of_the_score(tmp_path: Path) -> None:
     job = sealed_job(tmp_path)
     write_bytes(job.counts, b"counts")
     job.mark_complete("score", {"protocol": "1"}, [job.counts], {"unscored": {"rooms-semantic": "no truth"}})
@@ -150,7 +150,7 @@ def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
     ("code", "reason"),
     [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "the folder is read-only"), (errno.EIO, "Input/output error")],
 )
-def test_a_failed_write_is_one_line_and_leaves_the_old_file(
+def test_failed_write_is_a_one_line_error_and_keeps_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, reason: str
 ) -> None:
     path = tmp_path / "metrics.json"
@@ -166,7 +166,7 @@ def test_a_failed_write_is_one_line_and_leaves_the_old_file(
     assert [child.name for child in tmp_path.iterdir()] == ["metrics.json"]
 
 
-def test_two_runs_on_one_folder_are_refused_until_the_first_is_killed(tmp_path: Path) -> None:
+def test_second_run_in_a_folder_is_rejected_until_the_first_is_killed(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from su3d_bench.store.run_folder import RunFolder\n"
         "with RunFolder(Path(sys.argv[1])).locked():\n    print('locked', flush=True); sys.stdin.read()"
@@ -184,7 +184,7 @@ def test_two_runs_on_one_folder_are_refused_until_the_first_is_killed(tmp_path: 
 
 
 @pytest.mark.parametrize("most_in_memory_bytes", [1 << 20, 1])
-def test_rows_come_out_as_they_were_put_in(most_in_memory_bytes: int) -> None:
+def test_scratch_rows_are_read_unchanged(most_in_memory_bytes: int) -> None:
     scratch = Scratch(most_in_memory_bytes)
     generator = np.random.default_rng(0)
     arrays: list[NDArray[Any]] = [
@@ -205,13 +205,13 @@ def test_rows_come_out_as_they_were_put_in(most_in_memory_bytes: int) -> None:
 
 
 def _open_files(folder: Path) -> list[str]:
-    """This process's open files that lay in ``folder``, nameless ones too."""
+    """This process's open files in ``folder``, including unnamed ones."""
     links = (os.path.realpath(link) for link in Path("/proc/self/fd").iterdir())
     return [link for link in links if link.startswith(str(folder))]
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are listed on Linux alone")
-def test_what_is_much_lies_on_disk_under_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are only listed on Linux")
+def test_large_scratch_data_is_in_an_unnamed_file_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     scratch = Scratch(1000)

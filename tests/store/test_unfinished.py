@@ -1,4 +1,4 @@
-"""What is being written: its name, its lock, and who may clear what a killed process left."""
+"""Unfinished files: their names, their locks, and the removal of those of killed processes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WRITERS = {
 
 @contextmanager
 def writer(kind: str, place: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that is in the midst of writing."""
+    """A process that is writing."""
     code = (
         "import sys; from pathlib import Path\nfrom su3d_bench.core.files.atomic import filling, replacing\n"
         "from su3d_bench.predictions.export import whole_folder\nplace = Path(sys.argv[1])\n"
@@ -52,14 +52,12 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_what_a_killed_writer_left_goes_with_the_next_and_what_a_living_one_writes_stays(
-    kind: str, tmp_path: Path
-) -> None:
+def test_next_writer_removes_unfinished_files_of_killed_but_not_of_running_processes(kind: str, tmp_path: Path) -> None:
     with writer(kind, tmp_path) as process:
         (left,) = names(tmp_path)
         assert is_unfinished(left)
         make_folder(tmp_path)
-        assert names(tmp_path) == [left], "its writer lives"
+        assert names(tmp_path) == [left], "its writer is running"
         process.kill()
         process.wait()
         assert names(tmp_path) == [left]
@@ -67,10 +65,10 @@ def test_what_a_killed_writer_left_goes_with_the_next_and_what_a_living_one_writ
         assert names(tmp_path) == []
 
 
-def test_only_our_own_names_are_cleared(tmp_path: Path) -> None:
+def test_only_unfinished_files_of_the_program_are_removed(tmp_path: Path) -> None:
     (tmp_path / "kept").write_text("kept")
     for name in (".notes.tmp", ".page.html.123.tmp", ".x.unfinished", "page.html.0123456789ab.unfinished"):
-        (tmp_path / name).write_text("somebody's")
+        (tmp_path / name).write_text("of another program")
     (tmp_path / ".link.0123456789ab.unfinished").symlink_to(tmp_path / "kept")
     os.mkfifo(tmp_path / ".pipe.0123456789ab.unfinished")
     before = names(tmp_path)
@@ -80,14 +78,12 @@ def test_only_our_own_names_are_cleared(tmp_path: Path) -> None:
     assert names(tmp_path) == before
 
 
-def test_a_disk_without_locks_is_written_and_nothing_is_cleared_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disk_without_locks_is_written_but_never_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_locks(handle: int, operation: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", without_locks)
-    (tmp_path / LEFT).write_text("half, or of somebody who writes it now")
+    (tmp_path / LEFT).write_text("half, or still being written")
     write_text(tmp_path / "page.html", "whole")
     with unfinished_folder(tmp_path / "x") as folder:
         assert folder.is_dir()
@@ -95,7 +91,7 @@ def test_a_disk_without_locks_is_written_and_nothing_is_cleared_there(
     assert names(tmp_path) == [LEFT, "page.html"]
 
 
-def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
+def test_lock_file_replaces_the_folder_lock_if_folders_cannot_be_locked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lock = fcntl.flock
@@ -122,7 +118,7 @@ def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
 
 
 @pytest.mark.parametrize("name", ["x" * 240, "\N{GREEK SMALL LETTER ALPHA}" * 120])
-def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
+def test_longest_file_names_can_be_written(name: str, tmp_path: Path) -> None:
     with replacing(tmp_path / name) as stream:
         (place,) = tmp_path.iterdir()
         assert is_unfinished(place.name)
@@ -136,20 +132,20 @@ ADDRESSES = st.tuples(
 
 
 @given(ADDRESSES)
-def test_a_scene_is_known_by_its_folder(address: str) -> None:
+def test_scene_address_is_recovered_from_its_folder_name(address: str) -> None:
     name = folder_of_scene(address)
     assert "/" not in name
     assert scene_of_folder(name) == address
 
 
 @pytest.mark.parametrize("part", ["scenes", "scenes/rooms.a", "scenes/rooms.a/m", "scenes/rooms.a/m/pictures"])
-def test_nothing_of_a_job_is_written_through_a_link(part: str, tmp_path: Path) -> None:
+def test_job_files_are_never_written_through_a_link(part: str, tmp_path: Path) -> None:
     job = RunFolder(tmp_path / "run").job("rooms/a", "m")
     (tmp_path / "elsewhere").mkdir()
     link = tmp_path / "run" / part
     link.parent.mkdir(parents=True)
     link.symlink_to(tmp_path / "elsewhere")
     for write in (job.prepare, lambda: job.picture("query-x.png")):
-        with pytest.raises(StoreError, match=f"{link}: is a link, and a run writes into folders of its own alone"):
+        with pytest.raises(StoreError, match=f"{link}: is a link, but a run writes only to its own folders"):
             write()
     assert not list((tmp_path / "elsewhere").iterdir())

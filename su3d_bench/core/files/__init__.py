@@ -1,1 +1,1 @@
-"""Files on this machine: written whole or not at all, locked, unpacked within limits, temporary."""
+"""Local files: atomic writes, locks, unpacking within limits, temporary folders."""

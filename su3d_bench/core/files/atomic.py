@@ -1,7 +1,7 @@
-"""Files that are whole or absent, however a process ends: written under a temporary name, then renamed.
+"""Atomic file writes: files are written under a temporary name and then renamed, so they are complete or absent.
 
-Those of a run, those of caches that several processes fill at once, and arrays out of files that may be damaged, of
-which no more is believed than they hold. How unfinished files are named and cleared: ``store.unfinished``.
+For files of a run, for caches that several processes fill at once, and for reading arrays from possibly damaged files,
+within the limits of their real size. For the names and removal of unfinished files see ``core.files.locks``.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from su3d_bench.core.files.locks import clear_unfinished, locked_folder, new_fil
 from su3d_bench.core.safe_output import escaped_json
 from su3d_bench.core.system.files import file_text, opened
 
-# What any file may unpack to: 600 masks of a scene's 120,000 points take 69 MiB, a byte a point.
+# Any file may unpack to this size: 600 masks of a scene's 120,000 points take 69 MiB, one byte per point.
 FREE_BYTES = 128 << 20
-# Beyond that so many bytes for one of the file; deflate alone reaches 1032. The masks above pack to a 95th.
+# Above that, this many bytes per byte of the file; deflate alone reaches 1032. The masks above pack to 1/95.
 MAX_RATIO = 100
 PIECE = 1 << 20
-# What readers raise on a damaged file, an .npz above all.
+# What readers raise for a damaged file, especially an .npz.
 DAMAGE = (
     OSError,
     EOFError,
@@ -48,7 +48,7 @@ DAMAGE = (
     TypeError,
     OverflowError,
     SyntaxError,
-    RuntimeError,  # zipfile's, of a compression unknown to it
+    RuntimeError,  # from zipfile, for an unknown compression
     tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
@@ -56,49 +56,49 @@ DAMAGE = (
 )
 ENCRYPTED = 0x1
 MIN_ZIP = 22  # bytes of an archive without members
-METHODS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # the others unpack without a bound
+METHODS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # the others unpack without a limit
 
 
 class UnpackingError(ValueError):
-    """A file would unpack to far more than it is, or nobody can bound to how much."""
+    """A file would unpack to far more than its size, or to an unknown size."""
 
 
 class Allowance:
-    """How many bytes may still be unpacked from a file of ``n_packed`` bytes, all its parts together."""
+    """The number of bytes that may still be unpacked from a file of ``n_packed`` bytes, over all its parts."""
 
     def __init__(self, n_packed: int) -> None:
         self.n_bytes = max(FREE_BYTES, n_packed * MAX_RATIO)
         self._n_left = self.n_bytes
 
     def spend(self, n: int) -> None:
-        """Count ``n`` bytes before they are made; ``UnpackingError`` where there are too many."""
+        """Count ``n`` bytes before they are unpacked; ``UnpackingError`` if there are too many."""
         if n > self._n_left:
             raise UnpackingError(
-                f"unpacks to more than {self.n_bytes >> 20} MiB, over {MAX_RATIO} times its size; write it without "
-                "compression if it is sound"
+                f"unpacks to more than {self.n_bytes >> 20} MiB, over {MAX_RATIO} times its size; if it is valid, "
+                "write it without compression"
             )
         self._n_left -= n
 
 
 def allowance_of(archive: zipfile.ZipFile) -> Allowance:
-    """What may be unpacked from a zip archive by its real bytes; damage where none of them is a member."""
+    """The allowance of a zip archive by its real size; ``BadZipFile`` if it has bytes but no member."""
     assert archive.fp is not None
     n_bytes = archive.fp.seek(0, io.SEEK_END)
     if not archive.infolist() and n_bytes > MIN_ZIP + len(archive.comment):
-        raise zipfile.BadZipFile("holds bytes and names no member")
+        raise zipfile.BadZipFile("contains bytes but lists no member")
     return Allowance(n_bytes)
 
 
 def check_member(info: zipfile.ZipInfo, allowance: Allowance) -> None:
-    """Count the bytes that a member promises, beyond which ``zipfile`` reads none; refuse what it cannot bound."""
+    """Count the declared bytes of a member, beyond which ``zipfile`` does not read; reject members without a limit."""
     if info.flag_bits & ENCRYPTED or info.compress_type not in METHODS:
         name = printable(info.filename, 80)
-        raise UnpackingError(f"'{name}' is encrypted or compressed in an unusual way; write it plainly")
+        raise UnpackingError(f"'{name}' is encrypted or has an unsupported compression; write it plain or with deflate")
     allowance.spend(info.file_size)
 
 
 def member_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo, allowance: Allowance) -> bytes:
-    """The content of a member, in pieces: asked for all at once, ``zipfile`` unpacks beyond what was promised."""
+    """The content of a member, read in pieces: in one read ``zipfile`` unpacks more than the declared size."""
     check_member(info, allowance)
     content = io.BytesIO()
     with archive.open(info) as member:
@@ -113,21 +113,21 @@ REASONS = {
     errno.EACCES: "the folder is read-only; choose another with --out",
     errno.EPERM: "the folder is read-only; choose another with --out",
     errno.EROFS: "the folder is read-only; choose another with --out",
-    errno.EFBIG: "the file grows beyond what this disk or account allows; raise the limit or choose another with --out",
-    errno.ENOLCK: "this disk has no locks to give; choose a folder on another disk with --out",
-    errno.ENOTDIR: "a file stands where a folder should be; choose another with --out",
-    errno.EEXIST: "a file stands where a folder should be; choose another with --out",
+    errno.EFBIG: "the file exceeds the size limit of the disk or account; raise the limit or choose another with --out",
+    errno.ENOLCK: "this disk has no locks available; choose a folder on another disk with --out",
+    errno.ENOTDIR: "a file is in the place of a folder; choose another with --out",
+    errno.EEXIST: "a file is in the place of a folder; choose another with --out",
 }
 
 
 def write_error(path: Path, error: OSError) -> StoreError:
-    """What is said where the system refuses to write ``path``."""
+    """The error to raise if the system refuses to write ``path``."""
     reason = REASONS.get(error.errno or 0, error.strerror or str(error))
     return StoreError(f"cannot write {path}: {reason}")
 
 
 def make_folder(path: Path) -> None:
-    """Make ``path`` and its parents, and clear from it what killed processes left unfinished."""
+    """Create ``path`` and its parents, and remove unfinished files of killed processes from it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -137,7 +137,7 @@ def make_folder(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
+    """A stream whose bytes replace ``path`` at the end, atomically."""
     try:
         with filling(path, is_durable=True) as stream:
             yield stream
@@ -147,32 +147,32 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def filling(path: Path, *, is_durable: bool = False) -> Iterator[IO[bytes]]:
-    """As ``replacing``, for what can be made again: an ``OSError`` where the disk refuses, and no wait for the disk."""
+    """As ``replacing``, for files that can be recreated: raises ``OSError`` and does not sync the disk."""
     if not is_durable:
         path.parent.mkdir(parents=True, exist_ok=True)
         clear_unfinished(path.parent)
     place, handle = new_file(path)
     try:
-        with open(place, "wb", opener=lambda *_: handle) as stream:  # whoever writes files by name finds one
+        with open(place, "wb", opener=lambda *_: handle) as stream:  # for libraries that need a stream with a name
             yield stream
             stream.flush()
             if is_durable:
                 os.fsync(handle)
             os.replace(place, path)
     except BaseException:
-        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
+        with suppress(OSError):  # a read-only disk refuses even to remove a missing file
             place.unlink(missing_ok=True)
         raise
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
+    """Write ``content`` to ``path`` atomically, even if the process or the machine stops meanwhile."""
     with replacing(path) as stream:
         stream.write(content)
 
 
 def remove_file(path: Path) -> None:
-    """Remove ``path`` where it exists."""
+    """Remove ``path`` if it exists."""
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
@@ -184,7 +184,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def json_text(value: Any) -> str:
-    """JSON as every file of a run has it: two spaces, full precision, no NaN."""
+    """JSON in the form of all files of a run: two spaces, full precision, no NaN."""
     return escaped_json(value, indent=2, allow_nan=False) + "\n"
 
 
@@ -193,9 +193,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """An .npz archive without pickle whose bytes depend on the arrays alone."""
+    """An .npz archive without pickle whose bytes depend only on the arrays."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)  # which dates every member 1980-01-01
+    np.savez(buffer, allow_pickle=False, **arrays)  # it dates every member 1980-01-01
     return buffer.getvalue()
 
 
@@ -212,7 +212,7 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; none has a name that no system could give, as a hostile record may say."""
+    """Whether the file exists; False for a name that the system rejects, as in a hostile record."""
     try:
         return path.is_file()
     except OSError:
@@ -225,14 +225,14 @@ def read_json(path: Path) -> Any:
         with reading(str(path), StoreError):
             return json.loads(file_text(path))
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
+        raise StoreError(f"{path}: not readable as JSON; run the same command again to repair it") from error
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
-    """The plain arrays of an .npz file; raises one of ``DAMAGE`` for anything else.
+    """The arrays of an .npz file, without objects; raises one of ``DAMAGE`` for anything else.
 
     Three times as fast as ``numpy.load`` for the thirty small arrays of a scene's counts, of which a run has thousands;
-    and a header that promises more than its member holds is damage, no terabyte to allocate.
+    a header that declares more than its member contains is an error, not an allocation.
     """
     whole = opened(source) if isinstance(source, Path) else nullcontext(source)
     with whole as stream, zipfile.ZipFile(stream) as archive:
@@ -247,14 +247,14 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, allowance: Allowance
     n_length = {b"\x01\x00": 2, b"\x02\x00": 4}[content[6:8]]
     start = 8 + n_length + int.from_bytes(content[8 : 8 + n_length], "little")
     shape, is_fortran, dtype = _header(content[:start])
-    # NumPy makes texts of no length one character long.
+    # NumPy makes empty strings one character long.
     if dtype.hasobject or math.prod(shape) * (dtype.itemsize or 1) != len(content) - start:
-        raise ValueError(f"{info.filename}: holds other than the {shape} of {dtype} that it promises")
+        raise ValueError(f"{info.filename}: its size does not match its header ({dtype} {shape})")
     if start == len(content):
         return np.empty(shape, dtype)
     array = np.frombuffer(content, dtype, offset=start)
     if dtype.kind == "U" and array.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)).max() > sys.maxunicode:
-        raise ValueError(f"{info.filename}: holds what is no text")
+        raise ValueError(f"{info.filename}: contains invalid Unicode text")
     return array.reshape(shape, order="F" if is_fortran else "C").copy("K")
 
 
@@ -271,7 +271,7 @@ MAX_IN_MEMORY_BYTES = 1 << 26  # a hundredth of a small machine's memory; most s
 
 
 def scratch_folder() -> Path:
-    """Where large temporary files go: TMPDIR, else /var/tmp, else what Python finds.
+    """The folder for large temporary files: TMPDIR, otherwise /var/tmp, otherwise Python's default.
 
     /tmp is memory on many systems; /var/tmp is not (Filesystem Hierarchy Standard 5.15).
     """
@@ -281,14 +281,14 @@ def scratch_folder() -> Path:
 
 
 class Scratch:
-    """A file without a name that takes arrays, ``n_bytes`` in all; it is gone with the process, however that ends."""
+    """An unnamed temporary file of arrays, ``n_bytes`` in total; it disappears with the process."""
 
     def __init__(self, most_in_memory_bytes: int = MAX_IN_MEMORY_BYTES) -> None:
         self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=str(scratch_folder()))  # noqa: SIM115
         self.n_bytes = 0
 
     def put(self, array: NDArray[Any]) -> StoredRows:
-        """Keeps a copy of ``array`` until ``close``."""
+        """Store a copy of ``array`` until ``close``."""
         stored = StoredRows(self, self.n_bytes, array.dtype, array.shape)
         content = np.ascontiguousarray(array).tobytes()
         try:
@@ -297,19 +297,19 @@ class Scratch:
             self._file.flush()
         except OSError as error:
             raise StoreError(
-                f"cannot write temporary data to {scratch_folder()}: {error.strerror or error}; set TMPDIR to a larger "
-                "disk"
+                f"cannot write temporary data to {scratch_folder()}: {error.strerror or error}; set TMPDIR to a folder "
+                "on a larger disk"
             ) from error
         self.n_bytes += len(content)
         return stored
 
     def read(self, offset: int, n_bytes: int) -> bytes:
-        """What lies at ``offset``."""
+        """The ``n_bytes`` bytes at ``offset``."""
         self._file.seek(offset)
         return self._file.read(n_bytes)
 
     def close(self) -> None:
-        """Gives memory and disk space back."""
+        """Free memory and disk space."""
         self._file.close()
 
 
@@ -332,7 +332,7 @@ class StoredRows:
 
 
 def row_blocks(table: NDArray[Any], n_rows: int) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """``table`` in blocks of ``n_rows``, each with the slice that it is; a block is good until the next is asked for.
+    """``table`` in blocks of ``n_rows``, each with its slice; a block is valid until the next is requested.
 
     >>> [(rows.start, rows.stop, block.tolist()) for rows, block in row_blocks(np.arange(3), 2)]
     [(0, 2, [0, 1]), (2, 3, [2])]
@@ -344,10 +344,10 @@ def row_blocks(table: NDArray[Any], n_rows: int) -> Iterator[tuple[slice, NDArra
 
 
 def release_pages(table: NDArray[Any]) -> None:
-    """Let go of what has been touched of a memory-mapped table; other arrays stay as they are.
+    """Release the pages of a memory-mapped table that were read or written; other arrays are unchanged.
 
-    What was touched counts as memory of the process until someone says so; it comes back when it is read, what was
-    written into the file included. Private maps (mode ``c``) hold changes that no file has, and are left alone.
+    These pages count as memory of the process until they are released; they are loaded again when read, with what was
+    written to the file. Private maps (mode ``c``) have changes that are in no file, and are not released.
     """
     if not isinstance(table, np.memmap) or table.mode == "c":
         return
@@ -364,7 +364,7 @@ SUFFIX = ".held"
 class TemporaryFolder:
     """The folder ``path``, below the system's folder for temporary files, until ``close`` or the end of a block.
 
-    ``prefix`` is ``su3d-``, a word and a hyphen.
+    ``prefix`` has the form ``su3d-<word>-``.
     """
 
     def __init__(self, prefix: str) -> None:
@@ -375,13 +375,13 @@ class TemporaryFolder:
             where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
             reason = error.strerror or str(error)
             raise StoreError(
-                f"cannot make a temporary folder{where}: {reason}; set TMPDIR to a folder that can be written"
+                f"cannot create a temporary folder{where}: {reason}; set TMPDIR to a writable folder"
             ) from error
 
     def close(self) -> None:
-        """Remove the folder; once is enough, twice is no fault."""
+        """Remove the folder; may be called twice."""
         shutil.rmtree(self.path, ignore_errors=True)
-        lock, self._lock = self._lock, None  # first, so that an interrupt here closes nothing twice
+        lock, self._lock = self._lock, None  # first, so that an interrupt here does not close it twice
         if lock is not None:
             os.close(lock)
 
@@ -393,7 +393,7 @@ class TemporaryFolder:
 
 
 def remove_abandoned() -> None:
-    """Remove the temporary folders of processes that were killed."""
+    """Remove the temporary folders of killed processes."""
     for folder in Path(tempfile.gettempdir()).glob(f"su3d-*{SUFFIX}"):
-        with suppress(OSError):  # in use, gone meanwhile, or somebody else's
+        with suppress(OSError):  # in use, already removed, or of another user
             remove_unheld(folder)

@@ -1,9 +1,9 @@
-"""What is being written: one form of name, held by a lock that ends with its writer, so that others can clear the rest.
+"""Locks on unfinished files and folders: a lock ends with its writer, so that others can remove what was left.
 
-While ``page.html`` is written it lies beside its place as ``.page.html.<12 hexadecimal digits>.unfinished``; so does a
-folder. Whoever makes a folder ready to write into (``make_folder``) removes what bears such a name there and is held
-by nobody. Other names, links and what a living process holds are left alone, and so is everything on a disk without
-locks. (``filelock`` 4.2 leaves a lock file in every folder, and without flock(2) its lock outlives its process.)
+``page.html`` is written in the same folder as ``.page.html.<12 hexadecimal digits>.unfinished``, and likewise a folder.
+The next writer in that folder (``make_folder``) removes unlocked files and folders with such names. Other names, links
+and whatever a running process has locked stay, and so does everything on a disk without locks. (``filelock`` 4.2 leaves
+a lock file in every folder, and without flock(2) its lock outlives its process.)
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FORM = re.compile(r"\..*\.[0-9a-f]{12}\.unfinished", re.DOTALL)
-MAX_NAME_BYTES = 200  # of the name that is written; with the rest it stays within the 255 of common disks
+MAX_NAME_BYTES = 200  # of the final name; with the rest it stays within the 255 bytes of common disks
 LOCK_FILE = ".lock"
-# What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
+# Errors for a lock on a folder on network disks, which lock only files that are open for writing: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
 NO_LOCKS = (*NO_FOLDER_LOCKS, errno.ENOLCK)
 
 
 def is_unfinished(name: str) -> bool:
-    """Whether a file or folder of this name is one that was being written.
+    """Whether this is the name of an unfinished file or folder.
 
     >>> is_unfinished(".page.html.0123456789ab.unfinished"), is_unfinished(".notes.tmp")
     (True, False)
@@ -37,14 +37,14 @@ def is_unfinished(name: str) -> bool:
 
 
 def temporary_path(path: Path) -> Path:
-    """Where ``path`` lies while it is written: another place at each call."""
+    """The temporary place of ``path`` while it is written, unique to each call."""
     start = os.fsencode(path.name)[:MAX_NAME_BYTES].decode(errors="ignore")
     return path.with_name(f".{start}.{secrets.token_hex(6)}.unfinished")
 
 
 def new_file(path: Path) -> tuple[Path, int]:
-    """An unfinished file for ``path``: its place, and the file open for writing, which holds the lock."""
-    while True:  # another process may clear the file in the moment between its making and its lock
+    """A new unfinished file for ``path``: its place, and the file descriptor for writing, which holds the lock."""
+    while True:  # another process may remove the file between its creation and its lock
         place = temporary_path(path)
         handle = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
         try:
@@ -62,9 +62,9 @@ def new_file(path: Path) -> tuple[Path, int]:
 
 
 def hold_folder(folder: Path, *, waits: bool = False) -> int:
-    """An open file that holds the lock of ``folder`` until it is closed; one of ``LOCK_FILE`` where folders have none.
+    """A file descriptor that locks ``folder`` until it is closed; of ``LOCK_FILE`` if folders cannot be locked.
 
-    Raises ``BlockingIOError`` where another process has it, unless this one ``waits``.
+    Raises ``BlockingIOError`` if another process holds the lock, unless ``waits``.
     """
     operation = fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB
     try:
@@ -85,7 +85,7 @@ def _locked(handle: int, operation: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> int:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a living process holds the lock of ``folder``; nothing is written to find out."""
+    """Whether a running process holds the lock of ``folder``; writes nothing."""
     for place, kind in ((folder, os.O_DIRECTORY), (folder / LOCK_FILE, os.O_NOFOLLOW)):
         try:
             handle = os.open(place, os.O_RDONLY | kind)
@@ -104,7 +104,7 @@ def is_locked(folder: Path) -> bool:
 
 @contextmanager
 def unfinished_folder(path: Path) -> Iterator[Path]:
-    """A folder in which ``path`` is written, gone at the end of the block unless it was renamed by then."""
+    """A temporary folder for writing ``path``, removed at the end of the block unless it was renamed."""
 
     def made() -> Path:
         place = temporary_path(path)
@@ -121,7 +121,7 @@ def unfinished_folder(path: Path) -> Iterator[Path]:
 
 
 def locked_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
-    """A folder that ``make`` made, and an open file that holds its lock; None on a disk without locks."""
+    """A folder created by ``make``, and the file descriptor of its lock; None on a disk without locks."""
     while True:  # as in ``new_file``
         place = make()
         try:
@@ -138,18 +138,18 @@ def locked_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
 
 
 def publish(place: Path, path: Path) -> None:
-    """Give the whole folder at ``place`` the name ``path`` once all of it is on the disk."""
+    """Rename the finished folder at ``place`` to ``path`` after its content is synced to disk."""
     for above, _, names in os.walk(place, topdown=False):
         for name in names:
             sync_to_disk(Path(above, name))
-        with suppress(OSError):  # not every disk brings folders to itself by request
+        with suppress(OSError):  # not every disk can sync folders
             sync_to_disk(Path(above))
     os.replace(place, path)
     (path / LOCK_FILE).unlink(missing_ok=True)
 
 
 def sync_to_disk(path: Path) -> None:
-    """Wait until what was written into the file or folder ``path`` is on its disk."""
+    """Sync the file or folder ``path`` to disk."""
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         os.fsync(handle)
@@ -158,15 +158,15 @@ def sync_to_disk(path: Path) -> None:
 
 
 def clear_unfinished(folder: Path) -> None:
-    """Remove what killed processes left unfinished in ``folder``."""
-    with suppress(OSError):  # what cannot be cleared is no fault of what is written next
+    """Remove unfinished files and folders of killed processes from ``folder``."""
+    with suppress(OSError):  # a failed removal must not stop the next write
         for name in filter(is_unfinished, os.listdir(folder)):
-            with suppress(OSError):  # held, gone meanwhile, somebody else's, or on a disk without locks
+            with suppress(OSError):  # locked, already removed, of another user, or on a disk without locks
                 remove_unheld(folder / name)
 
 
 def remove_unheld(place: Path) -> None:
-    """Remove a file or folder; raises ``OSError`` where a living process holds it, or where nobody can tell."""
+    """Remove a file or folder; raises ``OSError`` if a running process has locked it, or may have."""
     mode = place.lstat().st_mode
     if stat.S_ISDIR(mode):
         handle = hold_folder(place)

@@ -1,1 +1,1 @@
-"""What the machine gives: devices, files, signals at the end, clocks and memory."""
+"""The machine: devices, reading files, termination signals, timing and memory."""

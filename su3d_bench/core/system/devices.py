@@ -1,4 +1,4 @@
-"""Devices, precisions and batch sizes: what torch runs on, and how much at once."""
+"""Devices, precisions and batch sizes for torch."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CPU = "cpu"
 DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,2})?")
 EXPECTED_DEVICE = "expected cpu, cuda or cuda:N"
 LARGEST_BATCH = 256
-# float16 has units of its own from compute capability 7.0 (Volta) on; before it, half is no faster or not there.
+# float16 has its own units from compute capability 7.0 (Volta) on; before, half is not faster or not supported.
 HALF_CAPABILITY = (7, 0)
 EXTRA_PACKAGES = {"torch", "transformers", "safetensors", "onnx", "tokenizers", "openai", "huggingface_hub"}
 INSTALLED_AS = {"open_clip": "open_clip_torch", "ram": "git+https://github.com/xinyu1205/recognize-anything"}
@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 
 def require(package: str, needed_by: str) -> Any:
-    """The module ``package``; where it is not installed, one line that names the extra."""
+    """The module ``package``; if it is not installed, a one-line ``ModelMissing`` with the command to install it."""
     import importlib
 
     try:
@@ -37,7 +37,7 @@ def require(package: str, needed_by: str) -> Any:
 
 
 def require_installed(package: str, needed_by: str) -> None:
-    """The same line where ``package`` is not installed; it is not imported, which for torch takes seconds."""
+    """The same error if ``package`` is not installed, without importing it, which takes seconds for torch."""
     if find_spec(package) is None:
         raise _not_installed(package, needed_by)
 
@@ -48,8 +48,8 @@ def _not_installed(package: str, needed_by: str) -> ModelMissing:
 
 
 def require_transformers(needed_by: str) -> Any:
-    """The module transformers, without its progress bars and remarks, and never reaching out to the network."""
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # what is needed lies in the model's folder
+    """The module transformers, without progress bars, remarks and network access."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # all files are in the model's folder
     transformers = require("transformers", needed_by)
     transformers.utils.logging.disable_progress_bar()
     transformers.utils.logging.set_verbosity_error()
@@ -57,9 +57,9 @@ def require_transformers(needed_by: str) -> Any:
 
 
 def device_for(device: str, job_index: int) -> str:
-    """The device of job ``job_index``: ``cuda`` stands for all GPUs, which jobs take in turn.
+    """The device of job ``job_index``: ``cuda`` means all GPUs, which jobs use in turn.
 
-    Raises ``ConfigError`` for a GPU that is not here; torch is not asked where ``device`` is ``cpu``.
+    Raises ``ConfigError`` for a missing GPU; torch is not imported if ``device`` is ``cpu``.
     """
     if DEVICE.fullmatch(device) is None:
         raise ConfigError(f"device {device[:40]!r}: {EXPECTED_DEVICE}")
@@ -68,16 +68,16 @@ def device_for(device: str, job_index: int) -> str:
     torch = require("torch", f"device '{device}'")
     n_devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if n_devices == 0:
-        raise ConfigError(f"device '{device}': torch sees no GPU here; use --device cpu, or a torch build with CUDA")
+        raise ConfigError(f"device '{device}': torch finds no GPU; use --device cpu or a torch build with CUDA")
     if device == "cuda":
         return f"cuda:{job_index % n_devices}"
     if int(device.partition(":")[2]) >= n_devices:
-        raise ConfigError(f"device '{device}': there are {n_devices} GPUs here, cuda:0 to cuda:{n_devices - 1}")
+        raise ConfigError(f"device '{device}': this machine has {n_devices} GPUs, cuda:0 to cuda:{n_devices - 1}")
     return device
 
 
 def precision_for(precision: str, device: str) -> str:
-    """What ``precision`` stands for on ``device``; ``auto`` is half where the GPU has it and never on the CPU."""
+    """The precision to use on ``device``; ``auto`` is float16 if the GPU supports it, and float32 on the CPU."""
     if precision != "auto":
         return precision
     if device == CPU:
@@ -87,7 +87,7 @@ def precision_for(precision: str, device: str) -> str:
 
 
 def make_deterministic(device: str) -> None:
-    """Hold the GPU's libraries to one algorithm and to true float32 products; nothing on the CPU."""
+    """Make the GPU's libraries use deterministic algorithms and full float32 products; no effect on the CPU."""
     if device == CPU:
         return
     torch = require("torch", f"device '{device}'")
@@ -98,10 +98,10 @@ def make_deterministic(device: str) -> None:
 
 
 def first_batch(device: str, item_bytes: int, weights_bytes: int) -> int:
-    """The batch to begin with: 1 on the CPU, on a GPU the power of two that half of what the weights leave can hold.
+    """The initial batch size: 1 on the CPU; on a GPU the power of two that fits half of the memory besides the weights.
 
-    It follows from the GPU's total memory, not from what is free at the moment, so that the same machine takes the
-    same batches; ``in_batches`` halves it where others use the memory.
+    It depends on the GPU's total memory, not on what is free at the moment, so that the same machine uses the same
+    batches; ``Batches`` halves it if other programs use the memory.
     """
     if device == CPU:
         return 1
@@ -119,7 +119,7 @@ class Batches:
         self.size = size
 
     def run(self, items: Sequence[Item], work: Callable[[Sequence[Item]], Done]) -> list[Done]:
-        """What ``work`` makes of each batch of ``items``, in their order; one that does not fit alone is an error."""
+        """The results of ``work`` per batch of ``items``, in order; an item that does not fit alone is an error."""
         done: list[Done] = []
         start = 0
         while start < len(items):
@@ -137,20 +137,20 @@ class Batches:
     def _shrink(self, n_failed: int, error: RuntimeError) -> None:
         if n_failed == 1:
             raise ConfigError(
-                "the device has no memory for a batch of 1; use a smaller model, float16, or --device cpu"
+                "out of device memory with a batch of 1; use a smaller model, float16, or --device cpu"
             ) from error
         self.size = n_failed // 2
-        _log.info("the device ran out of memory; going on with batches of %d", self.size)
+        _log.info("out of device memory; continuing with batches of %d", self.size)
         empty_cache()
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether torch ran out of the device's memory; its class is told by name, so that torch need not be imported."""
+    """Whether torch ran out of device memory; the class is checked by name, so that torch need not be imported."""
     return type(error).__name__ == "OutOfMemoryError" and type(error).__module__.startswith("torch")
 
 
 def empty_cache() -> None:
-    """Give memory that torch holds in reserve back to the GPU."""
+    """Return memory that torch holds in reserve to the GPU."""
     import torch
 
     if torch.cuda.is_available():

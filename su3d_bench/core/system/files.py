@@ -1,7 +1,7 @@
-"""The door through which files are read: a regular file, or an ``OSError`` at once.
+"""Open files for reading: only regular files, otherwise an ``OSError`` at once.
 
-A pipe in the place of a file is waited for, for ever, and a device such as ``/dev/zero`` has no end. Nothing outside of
-this module opens a file for reading.
+Reading a pipe would wait for ever, and a device such as ``/dev/zero`` has no end. No other module opens a file for
+reading.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _NOTED: list[dict[Path, None]] = []
 
 @contextmanager
 def noted() -> Iterator[dict[Path, None]]:
-    """The files that are read in the block, each once, in the order in which they were opened first."""
+    """The files read in the block, without duplicates, in the order in which they were first opened."""
     files: dict[Path, None] = {}
     _NOTED.append(files)
     try:
@@ -38,7 +38,7 @@ def noted() -> Iterator[dict[Path, None]]:
 
 
 def regular(path: Path) -> Path:
-    """``path``, for a library that opens files itself; an ``OSError`` where no regular file is there."""
+    """``path``, for a library that opens files itself; an ``OSError`` if it is not a regular file."""
     _check_no_others(os.stat(path).st_mode, path)
     for files in _NOTED:
         files[path] = None
@@ -46,13 +46,11 @@ def regular(path: Path) -> Path:
 
 
 def opened(path: Path) -> io.BufferedReader:
-    """The content of ``path`` as a stream; an ``OSError`` where no regular file is there."""
-    regular(path)  # a device may act on being opened
+    """The content of ``path`` as a stream; an ``OSError`` if it is not a regular file."""
+    regular(path)  # opening a device may have side effects
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
-        _check_no_others(
-            os.fstat(handle).st_mode, path
-        )  # what was opened may have taken the place of what was looked at
+        _check_no_others(os.fstat(handle).st_mode, path)  # it may have been replaced since the check
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -60,7 +58,7 @@ def opened(path: Path) -> io.BufferedReader:
 
 
 def opened_text(path: Path, *, errors: str = "strict", newline: str | None = None) -> IO[str]:
-    """The UTF-8 text in ``path`` as a stream; ``newline`` as ``open`` has it."""
+    """The UTF-8 text in ``path`` as a stream; ``newline`` as in ``open``."""
     return io.TextIOWrapper(opened(path), "utf-8", errors, newline)
 
 
@@ -71,7 +69,7 @@ def file_bytes(path: Path) -> bytes:
 
 
 def file_text(path: Path, *, errors: str = "strict") -> str:
-    """The UTF-8 text in ``path``, its line ends as ``\\n``."""
+    """The UTF-8 text in ``path``, with line ends ``\\n``."""
     with opened_text(path, errors=errors) as stream:
         return stream.read()
 
@@ -82,28 +80,28 @@ def _check_no_others(mode: int, path: Path) -> None:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     kind = next((name for is_kind, name in KINDS if is_kind(mode)), "something else")
-    raise OSError(errno.EINVAL, f"{kind} stands where a file should be", str(path))
+    raise OSError(errno.EINVAL, f"{kind} is in the place of a file", str(path))
 
 
-MAX_PARTS = 64  # of a key; the deepest setting has five
+MAX_PARTS = 64  # of a dotted key; the deepest setting has five
 _PART = r"""(?:[A-Za-z0-9_-]{1,200}+|"(?:[^"\\\n]|\\.){0,200}+"|'[^'\n]{0,200}+')"""
-# tomllib takes time with the square of a key's parts, of which 60 kB can hold 30,000. Parts and gaps are of bounded
-# length here, so that the search itself takes time with the length of the text alone.
+# tomllib is quadratic in the number of a key's parts, and 60 kB can have 30,000 of them. Parts and gaps have bounded
+# lengths here, so that the search itself is linear in the length of the text.
 _LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?:{_PART}[ \t]{{0,50}}+\.[ \t]{{0,50}}+){{{MAX_PARTS}}}")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The table that ``text`` is; ``tomllib.TOMLDecodeError``, a ``ValueError``, where it is none or deeper than use.
+    """The table in a TOML ``text``; ``tomllib.TOMLDecodeError``, a ``ValueError``, if it is invalid or nested too deep.
 
     >>> parse_toml("a.b = 1")
     {'a': {'b': 1}}
     """
     if found := _LONG_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
-        raise tomllib.TOMLDecodeError(f"A key of more than {MAX_PARTS} parts (at line {line}, column 1)")
+        raise tomllib.TOMLDecodeError(f"Key has more than {MAX_PARTS} parts (at line {line}, column 1)")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         raise
-    except (RecursionError, ValueError) as error:  # nested beyond use, or an integer of thousands of digits
+    except (RecursionError, ValueError) as error:  # nested too deep, or an integer of thousands of digits
         raise tomllib.TOMLDecodeError(f"Cannot be read: {error}") from error

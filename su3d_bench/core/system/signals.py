@@ -1,4 +1,4 @@
-"""Signals that ask a process to end, as an exception that unwinds it: what it holds is let go of, as after Ctrl-C."""
+"""Termination signals as an exception, so that a process releases its resources as after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# What Slurm, systemd, CI and `kill` send, and what a terminal sends that is closed.
+# Sent by Slurm, systemd, CI and `kill`, and by a closed terminal.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
-# Those who send both send them at once: the second must not break into what the first began. One that comes later is
-# heard, for an exception may have been lost in a callback.
+# A sender of both sends them at once: the second must not interrupt the shutdown that the first began. A later one
+# counts, because an exception may have been lost in a callback.
 SIGNAL_IGNORE_S = 5.0
 
 
@@ -27,15 +27,15 @@ class Terminated(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """As shells have it."""
+        """The exit code, as in shells."""
         return 128 + self.number
 
 
 @contextmanager
 def ending_in_order() -> Iterator[None]:
-    """In the block, ``Terminated`` is raised in the main thread where a signal of ``ENDING`` comes.
+    """In the block, a signal of ``ENDING`` raises ``Terminated`` in the main thread.
 
-    One that is ignored, as after ``nohup``, stays so. In another thread than the main one the block changes nothing.
+    A signal that is ignored, as after ``nohup``, stays ignored. Outside the main thread this does nothing.
     """
     heard_s, ended = -SIGNAL_IGNORE_S, 0
 
@@ -55,7 +55,7 @@ def ending_in_order() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        if ended and not isinstance(interrupt, Terminated):  # Ray takes what a handler raises for a Ctrl-C
+        if ended and not isinstance(interrupt, Terminated):  # Ray treats what a handler raises as Ctrl-C
             raise Terminated(ended) from interrupt
         raise
     finally:
@@ -65,7 +65,7 @@ def ending_in_order() -> Iterator[None]:
 
 @contextmanager
 def restored_handlers() -> Iterator[None]:
-    """What hears the signals of ``ENDING`` before the block hears them after it, whatever a library puts there."""
+    """Restore the signal handlers of ``ENDING`` after the block, in case a library replaces them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -78,7 +78,7 @@ def restored_handlers() -> Iterator[None]:
 
 
 def _detach_from_terminals() -> None:
-    """What is said from now on goes nowhere where a closed terminal would refuse it: no error then hides the signal."""
+    """Discard output to a closed terminal from now on, so that a write error does not hide the signal."""
     for stream in (1, 2):
         with suppress(OSError):
             look = select.poll()

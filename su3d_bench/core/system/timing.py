@@ -1,4 +1,4 @@
-"""Stage timers and memory: what an update, a scene, a method costs."""
+"""Stage timers and memory: the cost of an update, a scene, a method."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from su3d_bench.core.types import Float64Array, Int64Array
 
 
 class Timer:
-    """Collects the milliseconds of each stage of the current update; ``take`` hands them over and starts anew.
+    """Collects the milliseconds of each stage of the current update; ``take`` returns and resets them.
 
-    Where a GPU is in use, each stage waits for it at both ends, so that work is booked where it was asked for.
+    If a GPU is in use, each stage waits for it at both ends, so that work counts in the stage that started it.
 
     >>> import su3d_bench as su3d
     >>> timer = su3d.Timer()
@@ -53,22 +53,22 @@ class Timer:
 
 @dataclass
 class Spent:
-    """Wall time of calls of a method, ``perception_ms`` of it in perception that the method asked for."""
+    """Wall time of calls of a method, ``perception_ms`` of it in perception that the method requested."""
 
     total_ms: float = 0.0
     perception_ms: float = 0.0
 
     @property
     def method_ms(self) -> float:
-        """What the method itself took."""
+        """The time of the method itself."""
         return max(0.0, self.total_ms - self.perception_ms)
 
 
 class MethodClock:
-    """The wall time of a method, part by part, measured around its calls: no stage that it names itself counts.
+    """The wall time of a method per part, measured around its calls; the stages that it times itself do not count.
 
-    Perception that it asks for is told apart where it is asked for by the thread that runs the method: what others do
-    meanwhile takes no time away from it.
+    Perception that it requests is measured separately, only in the thread that runs the method: work of other threads
+    is not subtracted.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class MethodClock:
 
     @contextmanager
     def perception(self) -> Iterator[None]:
-        """Perception runs inside, asked for by the method or not."""
+        """Perception runs inside, requested by the method or not."""
         running = self._running
         if running is None or running[1] != threading.get_ident():
             yield
@@ -105,14 +105,14 @@ class MethodClock:
             running[0].perception_ms += (time.perf_counter() - start) * 1e3
 
     def take(self, part: str) -> Spent:
-        """What ``part`` took since it was taken last."""
+        """The time of ``part`` since the last call of ``take``."""
         return self._spent.pop(part, Spent())
 
 
 def calibration_ms() -> float:
-    """Milliseconds of a fixed piece of work like a map's update: sorting, gathering, counting.
+    """Milliseconds of a fixed workload similar to a map's update: sorting, gathering, counting.
 
-    The cost of an update over this one travels from machine to machine better than milliseconds do.
+    The cost of an update relative to this is more comparable across machines than milliseconds are.
     """
     values, keys = _calibration_arrays()
     start = time.perf_counter()
@@ -128,14 +128,14 @@ def _calibration_arrays() -> tuple[Float64Array, Int64Array]:
 
 
 def synchronise_device() -> None:
-    """Wait for the GPU where this process has used one; torch is never imported for it."""
+    """Wait for the GPU if this process has used one; never imports torch."""
     torch = sys.modules.get("torch")
     if torch is not None and hasattr(torch, "cuda") and torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
 
 def device_memory_bytes() -> int | None:
-    """The most GPU memory that torch held since ``start_memory_watch``; None where no GPU is in use."""
+    """Peak GPU memory of torch since ``start_memory_watch``; None if no GPU is in use."""
     torch = sys.modules.get("torch")
     if torch is None or not hasattr(torch, "cuda") or not torch.cuda.is_initialized():
         return None
@@ -143,14 +143,14 @@ def device_memory_bytes() -> int | None:
 
 
 def memory_bytes() -> int:
-    """What this process holds in memory now (resident set)."""
+    """The present memory of this process (resident set)."""
     import psutil
 
     return int(psutil.Process().memory_info().rss)
 
 
 def start_memory_watch() -> None:
-    """Let ``peak_memory_bytes`` and ``device_memory_bytes`` start from what is held now."""
+    """Reset the peaks of ``peak_memory_bytes`` and ``device_memory_bytes`` to the present memory."""
     # 5 resets the peak of the resident set: proc_pid_clear_refs(5). Elsewhere the peak is that of the whole process.
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
@@ -160,7 +160,7 @@ def start_memory_watch() -> None:
 
 
 def peak_memory_bytes() -> int | None:
-    """The most that this process held in memory since ``start_memory_watch``; None where the system does not say."""
+    """Peak memory of this process since ``start_memory_watch``; None if the system does not report it."""
     status = Path("/proc/self/status")
     if not status.is_file():
         return None
@@ -171,7 +171,7 @@ def peak_memory_bytes() -> int | None:
 
 
 def hardware_line() -> str:
-    """One line on the machine: processor, cores, memory, system."""
+    """One line about the machine: processor, cores, memory, system."""
     import psutil
 
     memory_gib = psutil.virtual_memory().total / 2**30
@@ -180,7 +180,7 @@ def hardware_line() -> str:
 
 
 def processor_name() -> str:
-    """What the processor is called, with the numbers that tell those of one name apart: virtual ones have no other."""
+    """The name of the processor with its family numbers: virtual processors differ only in these."""
     about = _first_processor()
     name = about.get("model name") or platform.processor() or "unknown processor"
     numbers = [f"{key} {about[key]}" for key in about if key in ("cpu family", "model", "stepping")]
@@ -188,7 +188,7 @@ def processor_name() -> str:
 
 
 def processor_digest() -> str:
-    """A digest of the processor's kind, its instruction sets included: numerical kernels are chosen by them."""
+    """A digest of the processor model with its instruction sets, by which numerical kernels are selected."""
     fields = ("cpu family", "model", "stepping", "flags", "Features")
     name = _first_processor().get("model name") or platform.processor() or "unknown processor"
     kind = [platform.machine(), name, *(line for line in _cpu_info() if line.partition(":")[0].strip() in fields)]
@@ -196,7 +196,7 @@ def processor_digest() -> str:
 
 
 def _first_processor() -> dict[str, str]:
-    """What Linux says of the first processor, by key."""
+    """What Linux reports on the first processor, by key."""
     pairs = [line.partition(":") for line in _cpu_info()]
     return {key.strip(): value.strip() for key, _, value in pairs}
 

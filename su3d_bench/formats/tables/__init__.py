@@ -1,1 +1,1 @@
-"""Tables that people fill in: rows of separated text, and worksheets."""
+"""Result tables, and tables that annotators fill in: CSV rows and worksheets."""

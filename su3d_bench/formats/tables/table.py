@@ -1,4 +1,4 @@
-"""A table before it has a format: rows of cells that know the run or the print that they come from."""
+"""Format-independent tables: rows of cells that record the run or publication of their number; CSV and workbooks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Unit = Literal["percent", "fraction"]
 
 
 def percent(value: float | None) -> str:
-    """A fraction in per cent with one decimal, as papers of this field print it; ``-`` where there is none."""
+    """A fraction in per cent with one decimal, as usual in papers; ``-`` for None."""
     return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
 
 
 def signed(value: float | None) -> str:
-    """A difference of fractions in percentage points, with its sign; ``-`` where there is none.
+    """A difference of fractions in percentage points, with its sign; ``-`` for None.
 
     >>> signed(0.0123), signed(-0.00001), signed(None)
     ('+1.2', '0.0', '-')
@@ -38,7 +38,7 @@ def signed(value: float | None) -> str:
 
 
 def bracketed(interval: Sequence[float] | None, show: Callable[[float], str] = percent) -> str:
-    """The ends of an interval as ``show`` has them; nothing where there is none.
+    """The ends of an interval formatted by ``show``; empty for None.
 
     >>> bracketed((0.1, 0.25)), bracketed(None)
     ('[10.0, 25.0]', '')
@@ -47,20 +47,20 @@ def bracketed(interval: Sequence[float] | None, show: Callable[[float], str] = p
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
-    """A fraction in per cent, its interval behind it."""
+    """A fraction in per cent with its interval."""
     return f"{percent(value)} {bracketed(interval)}".rstrip()
 
 
 def is_count(metric: str) -> bool:
-    """Whether a metric is a number of something and no share, by its name as in ``metrics.json``."""
+    """Whether a metric is a count and not a fraction, by its name in ``metrics.json``."""
     return metric.startswith("n_")
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Which number of which run a cell shows; ``value`` is a fraction, or the number of scored scenes.
+    """The number of a run that a cell shows; ``value`` is a fraction, or the number of scored scenes.
 
-    ``unit``: in what the cell shows a share.
+    ``unit``: the unit in which the cell shows a fraction.
     """
 
     run: str
@@ -76,9 +76,9 @@ class Origin:
 
 @dataclass(frozen=True)
 class Cell:
-    """``text`` as it is shown, without the mark of the best, and ``beside`` it what is never marked, as an interval.
+    """The displayed ``text``, without the mark of the best, and ``beside`` it unmarked text such as an interval.
 
-    ``origin`` is None for what a paper reports.
+    ``origin`` is None for numbers reported in a paper.
     """
 
     text: str
@@ -93,7 +93,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """``mark`` points to the note that says where a reported row is from; ``group``: rows that are compared."""
+    """``mark`` refers to the note with the source of a reported row; ``group``: rows that are compared."""
 
     label: str
     cells: tuple[Cell, ...]
@@ -103,15 +103,15 @@ class TableRow:
 
     @property
     def title(self) -> str:
-        """The label, with what must stand beside it in any format."""
+        """The label, with the remark on reported rows that every format needs."""
         return f"{self.label} (as reported [{self.mark}])" if self.is_reported else self.label
 
 
 @dataclass(frozen=True)
 class Table:
-    """``name`` is short and for references; ``head`` titles the first column, ``columns`` those of the cells.
+    """``name`` is short, for references; ``head`` titles the first column, ``columns`` those of the cells.
 
-    ``heading`` begins the caption, and stands out where the format has bold type.
+    ``heading`` begins the caption, in bold if the format supports it.
     """
 
     name: str
@@ -125,7 +125,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Prose:
-    """What stands above, between or beneath tables: the lines of a paragraph, or of a list."""
+    """Text above, between or below tables: the lines of a paragraph, or of a list."""
 
     lines: tuple[str, ...]
     is_list: bool = False
@@ -134,14 +134,14 @@ class Prose:
 def text_table(
     name: str, rows: Sequence[Sequence[str]], *, heading: str = "", caption: str = "", notes: Iterable[str] = ()
 ) -> Table:
-    """A table of texts that stand for no number of a run alone; the first of ``rows`` is the header."""
+    """A table of texts without origins in a run; the first of ``rows`` is the header."""
     (head, *columns), *body = rows
     table_rows = tuple(TableRow(label, tuple(map(Cell, cells))) for label, *cells in body)
     return Table(name, caption, head, tuple(columns), table_rows, tuple(notes), heading)
 
 
 def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
-    """Rows that belong together, in order: measured before reported, one group after the other."""
+    """Blocks of adjacent rows with the same ``is_reported`` and ``group``, in order."""
     return [list(block) for _, block in groupby(rows, lambda row: (row.is_reported, row.group))]
 
 
@@ -149,17 +149,17 @@ MAX_ROWS = 200_000
 MAX_CELLS = 4_000_000
 
 MAX_CELL_CHARACTERS = 2000
-# A spreadsheet takes what begins so for a formula (OWASP, "CSV Injection"); an apostrophe before it makes it text.
+# Spreadsheets read cells with these beginnings as formulas (OWASP, "CSV Injection"); a leading apostrophe prevents it.
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-# Where the semicolon parts cells, as in half of Europe, one begins behind it.
+# If the semicolon separates cells, as in much of Europe, a cell begins after it.
 _CELL_WITHIN = re.compile(r"(?<=;)(?=[=+\-@])")
 _CELL_CORRECTED = re.compile(r"(?<=;)'(?=[=+\-@])")
 
 
 def separated_rows(text: str, separator: str = ",", most_rows: int = MAX_ROWS) -> list[list[str]]:
-    """The rows of a CSV text; ``csv.Error`` where it is none, or has more rows or cells than any that people fill in.
+    """The rows of a CSV text; ``csv.Error`` if it is invalid or has too many rows or cells.
 
-    They are counted as they are read: a row takes one byte in a file and fifty in memory.
+    They are counted while reading: a row takes one byte in a file and fifty in memory.
     """
     rows: list[list[str]] = []
     n_cells = 0
@@ -179,7 +179,7 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> str:
 
 
 def harmless(value: object) -> object:
-    """A cell on one line that no spreadsheet takes for a formula.
+    """A cell on one line that no spreadsheet reads as a formula.
 
     >>> harmless("=1+1"), harmless("-"), harmless(-1)
     ("'=1+1", '-', -1)
@@ -190,13 +190,13 @@ def harmless(value: object) -> object:
 
 
 def no_formula(text: str) -> str:
-    """``text`` as a spreadsheet takes it for text; ``meant`` gives it back."""
+    """``text`` escaped so that a spreadsheet reads it as text; ``meant`` reverses it."""
     apart = _CELL_WITHIN.sub("'", text)
     return f"'{apart}" if apart.startswith(FORMULA_STARTS) and apart != "-" else apart
 
 
 def meant(cell: str) -> str:
-    """What ``no_formula`` was given.
+    """The original text of a cell from ``no_formula``.
 
     >>> meant("'=1+1"), meant("'chair'")
     ('=1+1', "'chair'")
@@ -205,27 +205,27 @@ def meant(cell: str) -> str:
     return _CELL_CORRECTED.sub("", text)
 
 
-MAX_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, which do not shrink in it
+MAX_XML_BYTES = 32 << 20  # of the whole archive, besides pictures, which do not compress
 MAX_SHEET_CELLS = 2_000_000  # of all worksheets
-MAX_COLUMNS = 64  # beyond which nothing is looked at
-# What openpyxl raises on damaged workbooks, beside what zipfile does.
+MAX_COLUMNS = 64  # further columns are ignored
+# What openpyxl raises for damaged workbooks, besides the errors of zipfile.
 WORKBOOK_DAMAGE = (*ZIP_DAMAGE, LookupError, TypeError, AttributeError, OSError, SyntaxError, OverflowError)
 
-Row = tuple[int, list[str | None]]  # its number from 1 on, and its cells from column A on
+Row = tuple[int, list[str | None]]  # its number, counted from 1, and its cells from column A
 
 
 @dataclass(frozen=True)
 class Worksheet:
-    """The rows of a worksheet that have cells, in the order of the file."""
+    """The non-empty rows of a worksheet, in the order of the file."""
 
     name: str
     rows: list[Row]
 
 
 def read_workbook(content: bytes, where: str) -> list[Worksheet]:
-    """Every worksheet in the order of the workbook; ``DataError``, which begins with ``where``, for anything else."""
+    """Every worksheet in the order of the workbook; ``DataError``, beginning with ``where``, for any other file."""
     try:
-        import defusedxml  # without which openpyxl would define entities
+        import defusedxml  # without it openpyxl would expand entities
         import openpyxl
     except ImportError as error:
         raise DataError(f"{where}: reading .xlsx needs {error.name}; pip install 'su3d-bench[sheets]'") from error
@@ -234,12 +234,12 @@ def read_workbook(content: bytes, where: str) -> list[Worksheet]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             n_bytes = sum(info.file_size for info in archive.infolist())
         if n_bytes > 2 * len(content) + MAX_XML_BYTES:
-            raise DataError(f"{where}: unpacks to {n_bytes >> 20} MiB; no workbook of su3d-bench sheets make does")
+            raise DataError(f"{where}: unpacks to {n_bytes >> 20} MiB; workbooks of su3d-bench sheets make are smaller")
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, keep_links=False)
         n_cells, found = 0, []
         for sheet in book.worksheets:
             rows: list[Row] = []
-            sheet.reset_dimensions()  # the file may state any
+            sheet.reset_dimensions()  # the dimensions in the file may be wrong
             for number, cells in enumerate(sheet.iter_rows(max_row=MAX_ROWS, max_col=MAX_COLUMNS, values_only=True), 1):
                 texts = [_text(cell) for cell in cells]
                 n_cells += len(texts) - texts.count(None)
@@ -251,11 +251,11 @@ def read_workbook(content: bytes, where: str) -> list[Worksheet]:
         return found
     except WORKBOOK_DAMAGE as error:
         reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise DataError(f"{where}: is no whole .xlsx file ({reason}); save the workbook as .xlsx again") from error
+        raise DataError(f"{where}: not a readable .xlsx file ({reason}); save the workbook as .xlsx again") from error
 
 
 def _text(value: object) -> str | None:
-    """A cell as a text: of a formula itself, of a number as many digits as a spreadsheet shows."""
+    """A cell as a string: the text of a formula, a number with the digits that a spreadsheet shows."""
     if isinstance(value, bool):
         return str(value).upper()
     if isinstance(value, float):

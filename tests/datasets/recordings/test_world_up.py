@@ -96,7 +96,7 @@ def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
 ) -> None:
     write_recording(tmp_path, "y")
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
-    said = 'z is taken to be up, but y seems to be (the cameras were held so); set up = "y" in rgbd.toml, or up = "z"'
+    said = 'z is assumed to be up, but y seems to be (the cameras were held so); set up = "y" in rgbd.toml, or up = "z"'
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
     assert "  up            assumed z, but probably y: the cameras were held so" in out and said in out

@@ -68,6 +68,6 @@ def test_each_problem_of_a_scene_is_a_line_and_none_hides_another(tmp_path: Path
     path.write_text("\n".join(["nan " * 16, *path.read_text().splitlines()[1:], "1 2 3"]) + "\n")
     (tmp_path / "replica_v1/room_0/habitat/info_semantic.json").unlink()
     found = list(Replica(tmp_path).problems("room0"))
-    messages = "line 1: the pose holds 'nan'", "line 4 has 3 values", "has 4 poses but", "info_semantic.json is missing"
+    messages = "line 1: the pose has 'nan'", "line 4 has 3 values", "has 4 poses but", "info_semantic.json is missing"
     for message, line in zip(messages, found, strict=True):
         assert message in line and line.startswith("replica/room0: ")

@@ -173,7 +173,7 @@ def test_replicassg_annotation_is_on_face_centres(tmp_path: Path) -> None:
     [
         ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0; expected one"),
         ("objects.json", '"id": "5"', '"id": "five"', "objects: 1.id: Input should be a valid integer"),
-        ("objects.json", '"chair"', '"wall"', "a relation names object 1, which is none of the graph"),
+        ("objects.json", '"chair"', '"wall"', "a relation names object 1, which is not in the graph"),
         ("relationships.json", '"near"', "3", "relationships: 0.3: Input should be a valid string"),
         ("relationships.json", '"scans"', '"scan"', "scans: Field required"),
         ("replica_to_visual_genome.json", "VisualGenome_list", "list", "VisualGenome_list: Field required"),
@@ -249,7 +249,7 @@ def test_each_invalid_scene_graph_is_one_line(tmp_path: Path, change: dict[str, 
         ({"edges": np.zeros((1, 2), np.int32)}, "needs edges, edge_scores and predicates, all three"),
         (
             {"edges": np.full((1, 2), 9, np.int32), "edge_scores": np.ones((1, 1)), "predicates": ("on",)},
-            "an edge names the instance 9 of 1",
+            "an edge names instance 9 of 1",
         ),
         (
             {"edges": np.zeros((1, 2), np.int32), "edge_scores": np.ones((2, 1)), "predicates": ("on",)},

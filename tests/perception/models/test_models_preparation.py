@@ -127,7 +127,7 @@ def test_jobs_are_assigned_to_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0) if device == "cuda:0" else (6, 1))
     assert [device_for("cuda", k) for k in range(5)] == ["cuda:0", "cuda:1", "cuda:2", "cuda:0", "cuda:1"]
     assert device_for("cuda:1", 7) == "cuda:1"
-    with pytest.raises(ConfigError, match="there are 3 GPUs here"):
+    with pytest.raises(ConfigError, match="this machine has 3 GPUs"):
         device_for("cuda:3", 0)
     assert precision_for("auto", "cuda:0") == "float16"
     assert precision_for("auto", "cuda:1") == "float32"
@@ -140,5 +140,5 @@ def test_cpu_uses_float32_and_missing_gpu_gives_one_line_error(monkeypatch: pyte
     assert device_for("cpu", 3) == "cpu"
     assert precision_for("auto", "cpu") == "float32"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match="torch sees no GPU here"):
+    with pytest.raises(ConfigError, match="torch finds no GPU"):
         device_for("cuda", 0)

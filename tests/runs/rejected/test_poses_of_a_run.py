@@ -109,5 +109,6 @@ def test_up_axis_other_than_z_gives_a_warning(root: Path) -> None:
     assert main(words.split()) == 0
     (line,) = json.loads(Path("up/run.json").read_text())["warnings"]
     assert (
-        line.startswith("rgbd/bath: z is taken to be up, but -y seems to be (") and 'set up = "-y" in rgbd.toml' in line
+        line.startswith("rgbd/bath: z is assumed to be up, but -y seems to be (")
+        and 'set up = "-y" in rgbd.toml' in line
     )

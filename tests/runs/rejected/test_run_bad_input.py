@@ -82,7 +82,7 @@ INFO = "replica_v1/bathroom_0/habitat/info_semantic.json"
     ("spoil", "line"),
     [
         (remove("Replica/bathroom0/results/frame000002.jpg"), "results/frame000002.jpg is missing; copy results/"),
-        (pose("nan " * 16), "traj.txt line 3: the pose holds 'nan'; mend the trajectory or leave the scene out"),
+        (pose("nan " * 16), "traj.txt line 3: the pose has 'nan'; fix the trajectory or exclude the scene"),
     ],
 )  # fmt: skip
 def test_damaged_scene_is_a_one_line_error_and_does_not_affect_others(

@@ -138,7 +138,7 @@ def test_killed_run_resumed_by_several_workers_gives_the_same_bytes() -> None:
 def test_out_of_memory_fails_only_its_scene_and_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--set", "painted.fault=memory") == 3
     line = "painted/b: out of memory (Unable to allocate 512. PiB for an array with shape (72057594037927936,) and data"
-    assert f"{line} type float64); try fewer --jobs, or a machine with more\n" in capsys.readouterr().err
+    assert f"{line} type float64); try fewer --jobs or a machine with more memory\n" in capsys.readouterr().err
     assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
 
 
@@ -147,7 +147,7 @@ def test_disk_without_locks_is_rejected(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", without_locks)
-    with pytest.raises(StoreError, match="this disk has no locks to give"), RunFolder(tmp_path).locked():
+    with pytest.raises(StoreError, match="this disk has no locks available"), RunFolder(tmp_path).locked():
         pass
 
 
