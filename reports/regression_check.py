@@ -1,4 +1,4 @@
-"""The gate's verdict for a pull request: Markdown, JUnit XML, GitHub annotations, plain lines."""
+"""The verdict of the regression check: Markdown for pull requests, JUnit XML, GitHub annotations, plain lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from su3d_bench.reports.tables.formats import markup_free
 class Finding:
     """A difference; every kind but ``better`` fails. ``reference`` and ``measured`` are fractions, or costs.
 
-    ``group``: what many of a kind are told as.
+    ``group``: the name under which many similar findings are summarised.
     """
 
     kind: Literal["regression", "missing", "changed", "cost", "better"]
@@ -36,8 +36,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class Compared:
-    """A number beside the reference's: a fraction that may differ by ``tolerance``, or a cost that may be so many
-    ``times`` as large; ``where`` as in a finding."""
+    """A number and its reference: a fraction that may differ by ``tolerance``, or a cost that may grow by the factor
+    ``times``; ``where`` as in a finding."""
 
     where: str
     name: str
@@ -55,7 +55,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Verdict:
-    """All findings of one run; ``n_compared`` headline values were looked at, and stand with costs in ``numbers``."""
+    """All findings of one run; ``numbers`` are the ``n_compared`` compared headline values, and costs."""
 
     run: str
     findings: tuple[Finding, ...]
@@ -72,25 +72,25 @@ class Verdict:
         return not self.failures
 
 
-SCENES = "scenes"  # the group of those that the run lacks
-MAX_LISTED_SIMILAR = 4  # findings of a group that are told one by one
-MAX_NAMES = 8  # of a group that are named
-MAX_ROWS = 60  # a comment on a pull request may hold 65,536 characters
+SCENES = "scenes"  # the group of missing scenes
+MAX_LISTED_SIMILAR = 4  # findings of a group that are listed individually
+MAX_NAMES = 8  # named per group
+MAX_ROWS = 60  # comments on pull requests are limited to 65,536 characters
 
 
 def headline(verdict: Verdict) -> str:
-    """One line: passed or failed, with counts."""
+    """Return one line: passed or failed, with counts."""
     n_better = len(verdict.findings) - len(verdict.failures)
     better = f", {n_better} better" if n_better else ""
     if verdict.is_passed:
         values = counted(verdict.n_compared, "headline value")
-        are, them = ("is", "it") if verdict.n_compared == 1 else ("are", "them")
-        return f"passed: {values} {are} as the reference has {them}{better}"
+        are, them = ("matches", "its") if verdict.n_compared == 1 else ("match", "their")
+        return f"passed: {values} {are} {them} reference{better}"
     return f"failed: {counted(len(verdict.failures), 'difference')} from the reference{better}"
 
 
 def plain_parts(verdict: Verdict) -> list[Table | Prose]:
-    """The headline, each number beside the reference's, then a line a finding or group of them, failures first."""
+    """Return the headline, each number with its reference, then one line per finding or group, failures first."""
     lines = plain_lines(verdict)
     return [Prose((lines[0],)), *_numbers(verdict), *([Prose(tuple(lines[1:]))] if lines[1:] else [])]
 
@@ -111,12 +111,12 @@ def _numbers(verdict: Verdict) -> list[Table | Prose]:
 
 
 def plain_lines(verdict: Verdict) -> list[str]:
-    """The headline, then one line a finding or group of them, failures first."""
+    """Return the headline, then one line per finding or group, failures first."""
     return [headline(verdict), *(f"{_mark(row)} {row.where}: {_sentence(row)}" for row in _merged(verdict))]
 
 
 def markdown(verdict: Verdict) -> str:
-    """A comment for a pull request: the headline, a table of findings, each number, remarks."""
+    """Return a comment for a pull request: the headline, a table of findings, each number, remarks."""
     lines = [f"**su3d-bench {headline(verdict)}**", ""]
     rows = _merged(verdict)
     if rows:
@@ -132,7 +132,7 @@ def markdown(verdict: Verdict) -> str:
 
 
 def junit_xml(verdict: Verdict) -> str:
-    """A test case a finding, failed or not, and one for all values that are as they were."""
+    """Return one test case per finding, failed or not, and one for all compared values."""
     suite = ElementTree.Element("testsuite", name="su3d-bench check")
     suite.set("tests", str(len(verdict.findings) + 1))
     suite.set("failures", str(len(verdict.failures)))
@@ -152,7 +152,7 @@ def junit_xml(verdict: Verdict) -> str:
 
 
 def github_lines(verdict: Verdict) -> list[str]:
-    """Workflow commands: an error a failure, a notice an improvement; GitHub shows ten of a kind."""
+    """Return workflow commands: errors for failures, notices for improvements; GitHub shows ten of each."""
     return [
         f"::{'error' if row.is_failure else 'notice'} title=su3d-bench::{_workflow(f'{row.where}: {_sentence(row)}')}"
         for row in _merged(verdict)
@@ -160,12 +160,12 @@ def github_lines(verdict: Verdict) -> list[str]:
 
 
 def _ordered(verdict: Verdict) -> Sequence[Finding]:
-    """Failures first, and of these first the scenes that are missing."""
+    """Return the findings, failures first, and among them missing scenes first."""
     return sorted(verdict.findings, key=lambda one: (not one.is_failure, one.group != SCENES))
 
 
 def _merged(verdict: Verdict) -> list[Finding]:
-    """``_ordered``, many of a group as one."""
+    """Return the ordered findings, with large groups summarised."""
     alike: dict[tuple[str, ...], list[Finding]] = {}
     for n, one in enumerate(_ordered(verdict)):
         alike.setdefault((one.kind, one.group, one.text) if one.group else (str(n),), []).append(one)
@@ -173,7 +173,7 @@ def _merged(verdict: Verdict) -> list[Finding]:
 
 
 def _as_one(alike: Sequence[Finding]) -> Finding:
-    """One finding for several of a group and text, with their names."""
+    """Return one finding for several with the same group and text, with their names."""
     first = alike[0]
     names = some([one.where.removeprefix(f"{first.group.rpartition(' / ')[0]} / ") for one in alike], MAX_NAMES)
     return Finding(first.kind, first.group, f"{first.text} ({len(alike)}: {names})")
@@ -197,7 +197,7 @@ def _number(finding: Finding, value: float | None) -> str:
 
 
 def _shown(value: float | None, pair: tuple[float | None, float | None], *, is_cost: bool) -> str:
-    """Fractions in per cent, as many digits as tell the two of ``pair`` apart; costs as ratios."""
+    """Format fractions in per cent, with enough digits to distinguish the ``pair``; costs as ratios."""
     if value is None:
         return NOT_MEASURED
     if is_cost:
@@ -210,5 +210,5 @@ def _shown(value: float | None, pair: tuple[float | None, float | None], *, is_c
 
 
 def _workflow(text: str) -> str:
-    """Text as workflow commands take it: on one line, percent signs encoded."""
+    """Return text for a workflow command: on one line, percent signs encoded."""
     return one_line(text).replace("%", "%25")

@@ -1,10 +1,10 @@
 """Pack a map for the HTML page: downsampled, quantised, sorted along a Z-order curve and deflated.
 
-The content of a map is ``JSON length (uint32, little endian) | JSON | tree | planes``. The tree says where the points
-are: level after level a byte a cell, whose bits are the eighths of the cell that hold any (1 the half along x, 2 along
-y, 4 along z), ``depth`` levels down to cells of ``step`` metres from ``origin``, the middle of the first, and a point
-a cell. The JSON names the planes in order; a plane of 16 bits is its low bytes and then its high bytes, which deflate
-far better apart.
+The content of a map is ``JSON length (uint32, little endian) | JSON | tree | planes``. The tree is an octree of the
+points, stored level by level: one byte per cell, whose bit k is set if octant k (+1 for the upper half along x, +2
+along y, +4 along z) contains points; ``depth`` levels down to cells of ``step`` metres with one point each; ``origin``
+is the centre of the first cell. The JSON names the planes in order; a 16-bit plane stores its low bytes, then its high
+bytes, which compresses far better.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.metrics.matching.nearest import Candidates, first_rows
 from su3d_bench.reports.pictures.maps import map_cloud
 
-MIN_SPACING_M = 0.015  # of drawn points; finer spacing is invisible on a screen
-COARSER = 1.15  # ratio between consecutive spacings that are tried
-STEPS_PER_SPACING = 2  # a point stands in the middle of one of these, so the grid itself does not show
-MAX_CELLS = 1 << 16  # along an axis, in which a page counts
+MIN_SPACING_M = 0.015  # between drawn points; finer spacing is invisible on a screen
+COARSER = 1.15  # ratio between consecutive candidate spacings
+STEPS_PER_SPACING = 2  # points are at the centres of these finer cells, so that the grid is not visible
+MAX_CELLS = 1 << 16  # per axis: positions are 16-bit integers
 NO_GROUND_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
 NEAR_M = 0.05  # maximum distance between a map point and its ground truth
-COLOUR_NEAR_M = 0.06  # frames are sampled every few centimetres
-DEFLATE_LEVEL = 7  # level 9 takes five times as long for maps that are a fiftieth smaller
+COLOUR_NEAR_M = 0.06  # the points of frames are sampled every few centimetres
+DEFLATE_LEVEL = 7  # level 9 takes five times as long and saves only 2 %
 COLOUR_BITS = 5  # per channel; more is invisible on single points
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points of a map that are drawn: ``rows`` (n,) of the map's points, ``spacing_m`` apart, in drawing order."""
+    """The drawn points of a map: ``rows`` (n,) are indices into its points, ``spacing_m`` apart, in drawing order."""
 
     rows: Int64Array
     points: Float32Array
@@ -48,9 +48,9 @@ class Cloud:
 
 
 def thinned(points: Float32Array, most: int) -> Cloud:
-    """At most ``most`` of ``points``, one of each cell, at the least spacing of those that are tried.
+    """Downsample ``points`` to at most ``most``, one per voxel, at the smallest sufficient candidate spacing.
 
-    Coarser grids are laid over what the finest has left.
+    Coarser grids are applied to the points kept by the finest one.
     """
     extent_m = max((float(np.ptp(column)) for column in points.T), default=0.0) if len(points) else 0.0
     finest_m = max(MIN_SPACING_M, STEPS_PER_SPACING * extent_m / (MAX_CELLS - 2))
@@ -62,10 +62,10 @@ def thinned(points: Float32Array, most: int) -> Cloud:
     left = points[finest]
     n_steps, rows = 0, np.arange(len(finest))
     if len(rows) > most:
-        # Points lie on surfaces: their cells are as the inverse square of the spacing.
+        # Points lie on surfaces: the number of cells falls with the square of the spacing.
         n_steps = max(1, round(math.log(len(rows) / most) / (2 * math.log(COARSER))))
         rows = _first_of_cells(left, spacing(n_steps))
-        is_above = len(rows) > most  # then the last that is tried is the first that is few enough
+        is_above = len(rows) > most  # then the loop below ends at the smallest sufficient spacing
         while len(rows) > most:
             n_steps += 1
             rows = _first_of_cells(left, spacing(n_steps))
@@ -95,9 +95,9 @@ def _curve(cells: Int64Array) -> Int64Array:
 
 
 def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
-    """The instance of each of the points ``rows``, -1 for none; of masks that overlap the smaller one is seen.
+    """Return the instance of each of the points ``rows``, -1 for none; where masks overlap, the smaller one.
 
-    Dense features have no instance.
+    Dense features have no instances.
     """
     if isinstance(prediction, DenseFeatures):
         return np.full(len(rows), -1, np.int32)
@@ -105,7 +105,7 @@ def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
 
 
 def nearest_colours(points: Float32Array, seen: Candidates, seen_rgb: UInt8Array) -> UInt8Array | None:
-    """The colour (n, 3) of what frames saw nearest to each point, grey where nothing is near; None without frames."""
+    """Return the colour (n, 3) of the nearest point seen in frames, grey if none is near; None without frames."""
     if not len(seen) or not len(points):
         return None
     _, nearest_row = seen.nearest(points, COLOUR_NEAR_M)
@@ -113,7 +113,7 @@ def nearest_colours(points: Float32Array, seen: Candidates, seen_rgb: UInt8Array
 
 
 def nearest_classes(points: Float32Array, truth: Candidates, classes: Int64Array) -> Int64Array:
-    """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_GROUND_TRUTH_NEAR``."""
+    """Return the ground-truth class (n,) near each point, ``NOT_SCORED`` without class or ``NO_GROUND_TRUTH_NEAR``."""
     _, nearest_row = truth.nearest(points, NEAR_M)
     if not len(truth):
         return np.full(len(points), NO_GROUND_TRUTH_NEAR)
@@ -127,7 +127,7 @@ def jpeg_text(rgb: UInt8Array, quality: int) -> str:
 
 
 def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
-    """A map in base64. ``planes`` (n,) or (n, 3) uint8 or uint16 go beside the positions; ``about`` is plain values."""
+    """Return a map in base64. ``planes``: attributes (n,) or (n, 3), uint8 or uint16; ``about``: plain values."""
     step = cloud.spacing_m / STEPS_PER_SPACING
     cells = voxel_coordinates(cloud.points, step)
     levels = _tree(_curve(cells))
@@ -154,7 +154,7 @@ def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[st
 
 
 def _tree(places: Int64Array) -> list[bytes]:
-    """The levels of the tree that holds cells at these ``places`` of the curve, each once and ascending; root first."""
+    """Return the octree levels, root first, of cells at these Morton indices ``places`` (unique, ascending)."""
     levels: list[bytes] = []
     while len(places) and places[-1] > 0:
         parents = places >> 3
@@ -165,7 +165,7 @@ def _tree(places: Int64Array) -> list[bytes]:
 
 
 def _plane_bytes(plane: NDArray[Any]) -> bytes:
-    """Column after column; of 16 bits the low bytes of a column first."""
+    """Return the bytes column by column; for 16 bits the low bytes of each column, then its high bytes."""
     columns = plane.reshape(len(plane), -1).T if len(plane) else plane.reshape(1, 0)
     if plane.dtype == np.uint16:
         halves = ((column & 255, column >> 8) for column in columns)
@@ -174,20 +174,20 @@ def _plane_bytes(plane: NDArray[Any]) -> bytes:
 
 
 def colour_plane(colours: UInt8Array) -> UInt8Array:
-    """Colours (n, 3) with ``COLOUR_BITS`` a channel, spread over 0..255 again."""
+    """Quantise colours (n, 3) to ``COLOUR_BITS`` per channel, rescaled to 0..255."""
     kept = colours >> (8 - COLOUR_BITS)
     return ((kept << (8 - COLOUR_BITS)) | (kept >> (2 * COLOUR_BITS - 8))).astype(np.uint8)
 
 
 def index_plane(values: Int32Array | Int64Array) -> NDArray[np.uint16]:
-    """Indices from 0, -1 and whatever does not fit as 65535."""
+    """Return indices as uint16; -1 and values that do not fit become 65535."""
     return np.where((values >= 0) & (values < 0xFFFF), values, 0xFFFF).astype(np.uint16)
 
 
 def frame_cover(views: Sequence[Sequence[int]], most: int) -> list[int]:
-    """At most ``most`` frames in which as many as possible of the instances are seen, the frame with most first.
+    """Choose at most ``most`` frames that together show as many instances as possible (greedy set cover).
 
-    ``views`` holds the frames of each instance; of equal frames the earlier one is taken.
+    ``views`` lists the frames of each instance; ties go to the earlier frame.
 
     >>> frame_cover([[0, 5], [5], [9], []], 2)
     [5, 9]
@@ -206,7 +206,7 @@ def frame_cover(views: Sequence[Sequence[int]], most: int) -> list[int]:
 
 
 def extent_of(points: Float32Array) -> dict[str, list[float]]:
-    """The centre and size in metres of the box around ``points``, as a page has them; nothing of none."""
+    """Return the centre and size in metres of the bounding box of ``points``; an empty dict without points."""
     if not len(points):
         return {}
     low, high = points.min(axis=0), points.max(axis=0)
@@ -219,9 +219,9 @@ def extent_of(points: Float32Array) -> dict[str, list[float]]:
 def box_in_view(
     points: Float32Array, camera_to_world: Float64Array, intrinsics: Float64Array, width: int, height: int
 ) -> list[float] | None:
-    """Where points are in an image, as left, top, right, bottom in 0..1; None where nothing of them is in it."""
+    """Return the box of projected points as left, top, right, bottom in 0..1; None if no point is in the image."""
     relative = (points.astype(np.float64) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
-    relative = relative[relative[:, 2] > 0.05]  # m before the camera
+    relative = relative[relative[:, 2] > 0.05]  # m in front of the camera
     pixels = relative @ intrinsics.T
     place = pixels[:, :2] / pixels[:, 2:] / np.array([width, height])
     place = place[((place >= 0) & (place <= 1)).all(axis=1)]

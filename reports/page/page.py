@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of runs and registries; all text is data, never markup."""
+"""Self-contained HTML pages of runs and registries; all text is inserted as data, never as markup."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from su3d_bench.reports.tables.formats import html_tables
 
 HERE = Path(__file__).parent
 REGISTRY = HERE.parent / "registry"
-SCRIPTS = (  # in the order in which they run
+SCRIPTS = (  # in execution order
     *("elements", "maps/shaders", "maps/view", "maps/cloud", "sections", "maps/paint", "maps/link", "maps/pane"),
     *("maps/scene", "gallery", "errors", "timing", "compare", "page"),
 )
@@ -25,7 +25,7 @@ STYLE = "page.css"
 TEMPLATE = "page.html.j2"
 MAX_NAME_CHARACTERS = 80
 _ENDS_WITH_DIGITS = re.compile(r"(^|-)[0-9a-f]{8}$")
-PAGE = re.compile(r"[a-z0-9][a-z0-9-]{0,100}\.html")  # of every page of a site
+PAGE = re.compile(r"[a-z0-9][a-z0-9-]{0,100}\.html")  # file names of the pages of a site
 Kind = Literal["index", "method", "scene"]
 
 
@@ -36,7 +36,7 @@ def page_html(
     maps: Sequence[str],
     galleries: Sequence[Mapping[str, Any]] = (),
 ) -> str:
-    """The page. All but ``maps`` are plain values; those are in base64, in the order of ``numbers``."""
+    """Return the HTML report. ``maps`` are in base64, in the order of ``numbers``; all else is plain values."""
     script = (
         "(() => {\n'use strict';\n"
         + "\n".join(file_text(HERE / f"scripts/{name}.js") for name in SCRIPTS)
@@ -56,7 +56,7 @@ def page_html(
 def registry_page_html(
     kind: Kind, title: str, data: Mapping[str, Any], without_scripts: Sequence[Table | Prose] = ()
 ) -> str:
-    """A page of the site; ``data`` are plain values, ``without_scripts`` what stands there where no script runs."""
+    """Return a page of a registry site. ``data``: plain values; ``without_scripts``: shown without JavaScript."""
     parts = (file_text(HERE / "scripts" / "elements.js"), file_text(REGISTRY / "page.js"))
     script = "(() => {\n'use strict';\n" + "\n".join(parts) + "\n})();\n"
     return rendered(
@@ -72,7 +72,7 @@ def registry_page_html(
 
 
 def page_name(name: str) -> str:
-    """What a page about ``name`` is called on disk, without suffix; no two names have one, whatever the system.
+    """Return the file name, without suffix, of the page about ``name``; unique even on case-insensitive file systems.
 
     >>> page_name("opensu3d"), page_name("rooms/living0"), page_name("Rooms/living0")
     ('opensu3d', 'rooms-living0-75a7be8c', 'rooms-living0-07d100aa')
@@ -85,9 +85,9 @@ def page_name(name: str) -> str:
 
 
 def rendered(folder: Path, script: str, *, begins_with: str = "", **values: Any) -> str:
-    """The template of ``folder`` with its style: nothing loads, goes out or runs but what stands in it, by digest.
+    """Render the template of ``folder``; its content security policy allows only its own script and style.
 
-    ``begins_with``: what stands before the style of the folder, such as that of another page.
+    ``begins_with``: CSS placed before the style of the folder, such as that of another page.
     """
     from jinja2 import Environment
 
@@ -101,7 +101,7 @@ def rendered(folder: Path, script: str, *, begins_with: str = "", **values: Any)
 
 
 def embedded_json(value: Any) -> str:
-    """JSON that may stand in a script element: no ``<``, so that no text ends the element or begins a comment.
+    """Return JSON that is safe in a script element: without ``<``, no text can end the element or begin a comment.
 
     >>> embedded_json({"name": "</script><!--"})
     '{"name":"\\\\u003c/script>\\\\u003c!--"}'

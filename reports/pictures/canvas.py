@@ -1,4 +1,4 @@
-"""A page on which pictures and words are put, colours of classes, instances and similarities, and rendered clouds."""
+"""A page for pictures and text, colours for classes, instances and similarities, and point cloud rendering."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from su3d_bench.metrics.protocols.loading import class_names
 
 DPI = 100
 DARK, GREY = "#222222", "#666666"
-METADATA = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}  # one figure, one file
+METADATA = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}  # without dates
 
 
 class Canvas:
-    """A page of ``width`` by ``height``, of which ``per_inch`` make an inch: pixels unless it is told otherwise."""
+    """A page of ``width`` by ``height`` units, ``per_inch`` units per inch; by default, units are pixels."""
 
     def __init__(self, width: float, height: float, *, per_inch: float = DPI, dpi: int = DPI) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -35,19 +35,19 @@ class Canvas:
         FigureCanvasAgg(self.figure)
 
     def text(self, x: float, y: float, text: str, size: float, *, colour: str = DARK, **more: Any) -> None:
-        """Write ``text``, never as mathematics, its upper left corner at this place."""
+        """Write ``text``, without math mode, with its upper left corner at this position."""
         style: dict[str, Any] = {"va": "top", "fontsize": size, "color": colour, "parse_math": False} | more
         self.figure.text(x / self.width, 1 - y / self.height, drawable(text), **style)
 
     def axes(self, x: float, y: float, width: float, height: float) -> Any:
-        """Axes without a frame at this place."""
+        """Return axes without a frame at this position."""
         box = (x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height)
         axes = self.figure.add_axes(box)
         axes.set_axis_off()
         return axes
 
     def picture(self, x: float, y: float, width: float, height: float, pixels: UInt8Array) -> Any:
-        """Axes at this place whose unit is a pixel of the picture that fills them."""
+        """Return axes at this position filled by the picture, in units of its pixels."""
         axes = self.axes(x, y, width, height)
         axes.imshow(pixels, interpolation="nearest", aspect="auto")
         axes.set_xlim(-0.5, pixels.shape[1] - 0.5)
@@ -61,14 +61,14 @@ class Canvas:
 
 
 def figure_bytes(figure: Any, kind: str, dpi: float | None = None) -> bytes:
-    """The file of a figure: the same bytes for the same figure."""
+    """Return the file of a figure: the same bytes for the same figure."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=METADATA[kind])
     return buffer.getvalue()
 
 
 def drawable(text: str) -> str:
-    """``text`` with what the font cannot draw written as its escape."""
+    """Replace characters that the font cannot draw by escapes."""
     from matplotlib.font_manager import findfont, get_font
 
     known = get_font(findfont("DejaVu Sans")).get_charmap()
@@ -76,12 +76,12 @@ def drawable(text: str) -> str:
 
 
 def paper(edge: str = "none", pad: float = 0.15, alpha: float = 0.85, **more: Any) -> dict[str, Any]:
-    """The white box with round corners on which words stand in a picture."""
+    """Return the style of the white rounded box behind text in a picture."""
     return {"boxstyle": f"round,pad={pad}", "facecolor": "white", "edgecolor": edge, "alpha": alpha} | more
 
 
 def hex_of(colour: tuple[int, ...]) -> str:
-    """A colour as matplotlib takes it.
+    """Return a colour in matplotlib's format.
 
     >>> hex_of((255, 0, 16))
     '#ff0010'
@@ -94,16 +94,16 @@ Scale = Literal["paper", "cividis"]
 SCALES: tuple[Scale, ...] = ("paper", "cividis")
 STEPS = 256
 NO_INSTANCE = (214, 214, 210)
-# Surfaces of the room stay pale, so that the things in it stand out.
+# Room surfaces are pale, so that objects stand out.
 ROOM_SURFACES = {"wall": (226, 222, 214), "floor": (208, 203, 196), "ceiling": (236, 236, 232)}
 # The most similar instance dark red, the least similar dark blue, as in the paper's heat maps.
 HEAT_STOPS = np.array(
     [[0, 0, 128], [0, 80, 255], [90, 215, 190], [250, 190, 40], [230, 50, 10], [128, 0, 0]], np.float64
 )
-N_OTHERS = 199  # colours for names that no class table has, a prime so that sums of letters spread
-GRID = np.arange(24, 256, 11)  # of each channel, among which colours are chosen
-LIGHTNESS, MIN_CHROMA = (0.42, 0.86), 0.16  # as below: neither black nor white, and told from the pale surfaces
-HUE_WEIGHT = 2.0  # against lightness, which shading moves
+N_OTHERS = 199  # colours for names in no class table; a prime, so that hashes spread
+GRID = np.arange(24, 256, 11)  # candidate values per channel
+LIGHTNESS, MIN_CHROMA = (0.42, 0.86), 0.16  # in Oklab: neither black nor white, and distinct from the pale surfaces
+HUE_WEIGHT = 2.0  # relative to lightness, which shading changes
 TO_CONES = np.array(
     [
         [0.4122214708, 0.5363325363, 0.0514459929],
@@ -118,14 +118,14 @@ TO_OKLAB = np.array(
         [0.0259040371, 0.7827717662, -0.8086757660],
     ]
 )
-FIRST = (46, 112, 222)  # the first colour of all
+FIRST = (46, 112, 222)  # the first colour of the palette
 
 
 def class_colours(names: Sequence[str]) -> dict[str, Colour]:
-    """Name -> colour, which is that of the name in whatever picture it stands; surfaces of the room pale.
+    """Return name -> colour, the same for a name in every picture; room surfaces are pale.
 
-    Names of the class tables have the most distinct colours, all different. Any other has one by its letters, or the
-    next where another of these ``names`` has that one.
+    Names of the class tables have the most distinct colours, all different. Other names have a colour by their hash, or
+    the next one if another of these ``names`` has it.
 
     >>> class_colours(["book", "lamp"])["lamp"] == class_colours(["lamp"])["lamp"]
     True
@@ -144,27 +144,27 @@ def class_colours(names: Sequence[str]) -> dict[str, Colour]:
 
 
 def instance_colours(names: Sequence[str]) -> list[Colour]:
-    """One colour an instance, the first ones most distinct; surfaces of the room pale."""
+    """Return one colour per instance, the first ones most distinct; room surfaces are pale."""
     many = distinct_colours(len(names))
     return [ROOM_SURFACES.get(name) or many[k] for k, name in enumerate(names)]
 
 
 @cache
 def _place_of_class() -> dict[str, int]:
-    """Where each known class that is no surface of the room stands among the colours."""
+    """Return the palette index of each known class except room surfaces."""
     things = (name for name in class_names() if name not in ROOM_SURFACES)
     return {name: place for place, name in enumerate(things)}
 
 
 def distinct_colours(n: int) -> tuple[Colour, ...]:
-    """The first ``n`` of a row of colours, each as far from those before it as can be; a long row repeats itself."""
+    """Return the first ``n`` colours of a palette of maximally distinct colours, repeated if ``n`` is large."""
     row = _palette(min(n, len(_place_of_class()) + N_OTHERS))
     return tuple(row[k % len(row)] for k in range(n))
 
 
 @cache
 def _palette(n: int) -> tuple[Colour, ...]:
-    """``n`` colours: each the farthest in Oklab from all before it and from the pale ones."""
+    """Return ``n`` colours, each the farthest in Oklab from all before it and from the pale ones."""
     grid = np.stack(np.meshgrid(GRID, GRID, GRID, indexing="ij"), -1).reshape(-1, 3)
     places = _oklab(grid)
     is_strong = np.hypot(places[:, 1], places[:, 2]) > MIN_CHROMA
@@ -180,7 +180,7 @@ def _palette(n: int) -> tuple[Colour, ...]:
 
 
 def _oklab(colours: Int64Array) -> Float64Array:
-    """sRGB (N, 3) of 0..255 as lightness and two weighted axes of colour (Oklab, Ottosson 2020)."""
+    """Convert sRGB (N, 3) in 0..255 to Oklab (Ottosson 2020) with weighted colour axes."""
     share = colours / 255.0
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     places: Float64Array = np.cbrt(linear @ TO_CONES.T) @ TO_OKLAB.T * (1.0, HUE_WEIGHT, HUE_WEIGHT)
@@ -188,7 +188,7 @@ def _oklab(colours: Int64Array) -> Float64Array:
 
 
 def heat_colours(similarity: Float64Array) -> list[Colour]:
-    """Dark blue for the least, dark red for the greatest of ``similarity``; all alike: the middle."""
+    """Return colours from dark blue (minimum) to dark red (maximum); the middle if all values are equal."""
     if len(similarity) == 0:
         return []
     place = _places(similarity)
@@ -198,13 +198,13 @@ def heat_colours(similarity: Float64Array) -> list[Colour]:
 
 
 def _places(similarity: Float64Array) -> Float64Array:
-    """Where each value lies between the least and the greatest of them; all alike: in the middle."""
+    """Scale the values from minimum to maximum to 0..1; 0.5 if all are equal."""
     low, high = float(similarity.min()), float(similarity.max())
     return np.full(len(similarity), 0.5) if high == low else (similarity - low) / (high - low)
 
 
 def scale_stops(scale: Scale) -> UInt8Array:
-    """The colours (256, 3) of a scale, the least similar first."""
+    """Return the colours (256, 3) of a scale, from least to most similar."""
     if scale == "cividis":  # Nunez, Anderton, Renslow 2018
         from matplotlib import colormaps
 
@@ -214,7 +214,7 @@ def scale_stops(scale: Scale) -> UInt8Array:
 
 
 def similarity_colours(similarity: Float64Array, scale: Scale = "paper") -> UInt8Array:
-    """A colour (K, 3) a value, from the least to the greatest of them; all alike: the middle.
+    """Return one colour (K, 3) per value, scaled from minimum to maximum; the middle if all are equal.
 
     >>> similarity_colours(np.array([0.2, 0.1, 0.3]))[1:].tolist()
     [[0, 0, 128], [128, 0, 0]]
@@ -227,9 +227,9 @@ def similarity_colours(similarity: Float64Array, scale: Scale = "paper") -> UInt
 
 @njit(cache=True)
 def averaged_colours(point: Any, shade: Any, palette: Any, steps: int) -> Any:
-    """The mean colour (h / steps, w / steps, 3) of blocks of pixels, in the order in which numpy would add them.
+    """Return the mean colours (h / steps, w / steps, 3) of pixel blocks, summed in numpy's order.
 
-    ``palette`` (N + 1, 3) float32 ends with the background, which is shown where ``point`` (h, w) is -1.
+    ``palette`` (N + 1, 3) float32 ends with the background colour, used where ``point`` (h, w) is -1.
     """
     height, width = point.shape[0] // steps, point.shape[1] // steps
     background = palette.shape[0] - 1
@@ -253,13 +253,13 @@ def averaged_colours(point: Any, shade: Any, palette: Any, steps: int) -> Any:
 
 BACKGROUND = (252, 252, 250)
 OVERSAMPLING = 2
-CUT_BELOW_TOP_M = 0.3  # what hangs at the ceiling goes with it
-ROOM_HEIGHT_M = 1.8  # a lower cloud has no ceiling to cut away
+CUT_BELOW_TOP_M = 0.3  # also removes lamps and other things at the ceiling
+ROOM_HEIGHT_M = 1.8  # lower clouds have no ceiling to cut away
 CUT_BEHIND_WALL_M = 0.25
 ELEVATION = np.deg2rad(38.0)
 AZIMUTHS = (np.deg2rad(-125.0), np.deg2rad(55.0))
 FIELD_OF_VIEW = np.deg2rad(38.0)
-DEPTH_BINS = 3  # near points are drawn larger than far ones, in this many steps
+DEPTH_BINS = 3  # near points are drawn larger than far ones, in this many size steps
 MAX_SQUARE = 15
 SHADE_STRENGTH = 60.0
 SHADE_REACH = 2  # pixels of the oversampled image
@@ -270,8 +270,8 @@ MAX_STEP_BEHIND = 0.02  # of log2 of depth
 class Camera:
     """A view of a box of the world.
 
-    ``rotation`` has the camera's right, down and forward axes as rows; ``focal`` is in pixels, or pixels a metre where
-    ``is_perspective`` is false. Points outside ``box`` (2, 3) are cut away.
+    ``rotation``: the camera's right, down and forward axes as rows; ``focal``: in pixels, or pixels per metre if not
+    ``is_perspective``. Points outside ``box`` (2, 3) are cut away.
     """
 
     rotation: Float64Array
@@ -292,12 +292,12 @@ class View:
 
 
 def room_bounds(points: Float32Array) -> Float64Array:
-    """Lowest and highest corner (2, 3) of a cloud, stray points left aside."""
+    """Return the lowest and highest corner (2, 3) of a cloud, ignoring outliers."""
     return np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
 
 
 def view_cameras(bounds: Float64Array, width: int, height: int) -> tuple[Camera, Camera, Camera]:
-    """A top view and views from two opposite corners of ``bounds``, ceiling and near walls cut away; z is up."""
+    """Return a top view and views from two opposite corners of ``bounds``, without ceiling and near walls; z is up."""
     width, height = width * OVERSAMPLING, height * OVERSAMPLING
     low, high = bounds[0] - 0.1, bounds[1] + 0.1
     size = high - low
@@ -325,14 +325,14 @@ def _corner_camera(open_top: Float64Array, azimuth: float, width: int, height: i
     focal = 0.5 * height / np.tan(FIELD_OF_VIEW / 2)
     corners = np.array(list(itertools.product(*open_top.T)))
     relative = (corners - open_top.mean(axis=0)) @ rotation.T
-    # The least distance at which all corners are inside the image.
+    # The smallest distance at which all corners are inside the image.
     reach = np.abs(relative[:, :2]) * focal / (0.48 * np.array([width, height])) - relative[:, 2:]
     eye = open_top.mean(axis=0) + outward * float(reach.max())
     return Camera(rotation, eye, float(focal), True, box, width, height)
 
 
 def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
-    """The visible point of each pixel, every point drawn as a square of ``spacing_m`` across."""
+    """Return the visible point of each pixel, with points drawn as squares of ``spacing_m`` width."""
     from scipy.ndimage import minimum_filter
 
     inside = np.flatnonzero(((points >= camera.box[0]) & (points <= camera.box[1])).all(axis=1))
@@ -342,8 +342,8 @@ def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
     column = np.floor(relative[:, 0] * scale + camera.width / 2).astype(np.int64)
     row = np.floor(relative[:, 1] * scale + camera.height / 2).astype(np.int64)
     seen = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    order = np.flatnonzero(seen)[np.argsort(-depth[seen], kind="stable")]  # far first: of equal pixels the last stays
-    rank = np.arange(len(order), 0, -1, dtype=np.float64)  # 1 is the nearest; float64, which the filter works in
+    order = np.flatnonzero(seen)[np.argsort(-depth[seen], kind="stable")]  # far first: the last point of a pixel stays
+    rank = np.arange(len(order), 0, -1, dtype=np.float64)  # 1 is the nearest; float64, as in the filter
     nearest = np.full((camera.height, camera.width), np.inf)
     for part in np.array_split(np.arange(len(order)), DEPTH_BINS):
         if len(part) == 0:
@@ -362,7 +362,7 @@ def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
 
 
 def project(camera: Camera, points: Float64Array) -> Float64Array:
-    """Columns and rows (N, 2) in the picture of ``camera``; NaN for what lies behind it."""
+    """Project points to columns and rows (N, 2) of the picture of ``camera``; NaN for points behind it."""
     relative = (points - camera.eye) @ camera.rotation.T
     depth = np.where(relative[:, 2] > 0, relative[:, 2], np.nan)
     scale = camera.focal / depth if camera.is_perspective else np.full(len(points), camera.focal)
@@ -372,7 +372,7 @@ def project(camera: Camera, points: Float64Array) -> Float64Array:
 
 
 def _shade(depth: Float64Array) -> Float32Array:
-    """How much each pixel lies behind its neighbours, as a factor: 1 on open surfaces, darker at depth edges.
+    """Return the shading factor (eye-dome lighting): 1 on open surfaces, darker behind depth edges.
 
     ``depth`` is NaN where nothing is drawn.
     """
@@ -383,7 +383,7 @@ def _shade(depth: Float64Array) -> Float32Array:
 
 @njit(cache=True)
 def depth_steps(padded: Any, reach: int, max_step: float) -> Any:
-    """How far each pixel lies behind its eight neighbours ``reach`` pixels away, each up to ``max_step``.
+    """Sum how far each pixel is behind its eight neighbours ``reach`` pixels away, each up to ``max_step``.
 
     ``padded`` has a border of ``reach`` pixels around the image; NaN adds nothing.
     """
@@ -399,7 +399,7 @@ def depth_steps(padded: Any, reach: int, max_step: float) -> Any:
 
 
 def colour(view: View, colours: UInt8Array) -> UInt8Array:
-    """The picture (h / 2, w / 2, 3) of a view, point i in ``colours[i]``, averaged down to size."""
+    """Return the picture (h / 2, w / 2, 3) of a view, point i in ``colours[i]``, downsampled by averaging."""
 
     palette = np.concatenate([colours, np.array([BACKGROUND], np.uint8)]).astype(np.float32)
     averaged: UInt8Array = averaged_colours(view.point, view.shade, palette, OVERSAMPLING)

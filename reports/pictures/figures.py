@@ -1,4 +1,4 @@
-"""A figure of a paper: pictures in rows and columns, with all words as text that can be searched and edited."""
+"""Figures for papers: pictures in rows and columns, with searchable and editable text."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
 LEGEND_WIDTH_IN = 2.6
 DPI = 200  # of pictures within the figure
-CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 47, 3  # height of a line, its characters, how many of them
+CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 47, 3  # line height, characters per line, number of lines
 MAX_ROW_TITLE, MAX_TAGS = 110, 40
-FEW_TAGS, AWAY = 6, 0.11  # so few names stand beside what they name, this share of the height away
+FEW_TAGS, AWAY = 6, 0.11  # up to so many names are placed this fraction of the height away from their objects
 INK, SOFT_INK = "#1a1a1a", "#606060"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A picture and the names in it; ``caption`` stands below it."""
+    """A picture with the names in it and the ``caption`` below it."""
 
     picture: UInt8Array
     tags: tuple[Tag, ...] = ()
@@ -39,7 +39,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class GridRow:
-    """``title`` stands above the row, ``note`` behind it in grey."""
+    """A row with its ``title`` above and a grey ``note`` after the title."""
 
     title: str
     note: str
@@ -47,13 +47,13 @@ class GridRow:
 
 
 def draw_grid(path: Path, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> None:
-    """Write the figure as PDF, PNG or SVG by the name of ``path``; ``scale`` (256, 3) is the legend of similarity."""
+    """Write the figure as PDF, PNG or SVG by the suffix of ``path``; ``scale`` (256, 3): colour bar of similarity."""
     suffix = path.suffix.lower().removeprefix(".")
     if suffix not in FORMATS:
-        raise ConfigError(f"--out {printable(str(path), 200)}: unknown form; name a file {', '.join(FORMATS)}")
+        raise ConfigError(f"--out {printable(str(path), 200)}: unknown format; use a suffix of {', '.join(FORMATS)}")
     from matplotlib import rc_context
 
-    # 42: fonts as TrueType, so that text in a PDF stays text; no salt by time in an SVG
+    # 42: TrueType fonts, so that text in a PDF stays text; a fixed hash salt makes the SVG reproducible
     with rc_context(
         {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench", "font.family": "DejaVu Sans"}
     ):
@@ -94,7 +94,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
 
 
 def _caption_lines(row: GridRow) -> list[list[str]]:
-    """The lines below each picture of a row; what does not fit ends in dots."""
+    """Return the caption lines below each picture of a row; longer captions are truncated."""
     return [
         textwrap.wrap(printable(cell.caption, 1000), CAPTION_LINE, max_lines=CAPTION_LINES, placeholder=" ...")
         for cell in row.cells
@@ -102,12 +102,12 @@ def _caption_lines(row: GridRow) -> list[list[str]]:
 
 
 def _covers(taken: Sequence[tuple[float, float, float]], x: float, row: float, half: float) -> bool:
-    """Whether a name of this half width would cover one of those that stand there."""
+    """Whether a name of this half width would overlap a placed one."""
     return any(abs(row - other[1]) < 0.045 and abs(x - other[0]) < half + other[2] for other in taken)
 
 
 class _Page(canvas.Canvas):
-    """A figure of a paper, measured in inches."""
+    """A figure for a paper, measured in inches."""
 
     def cell(self, x: float, y: float, cell_height: float, cell: Cell) -> None:
         axes = self.axes(x, y, CELL_WIDTH_IN, cell_height)
@@ -122,7 +122,7 @@ class _Page(canvas.Canvas):
             while is_beside and _covers(taken, tag.x, row, half) and 0 < row < 0.95:
                 row += 0.05
             if _covers(taken, tag.x, row, half):
-                continue  # a name that covers another tells nothing
+                continue  # overlapping names are unreadable
             taken.append((tag.x, row, half))
             shade = canvas.hex_of(tag.colour)
             if is_beside:
@@ -148,16 +148,16 @@ PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 760, 640, 14
 LINE_HEIGHT, CHARACTERS_A_LINE, MAX_LINES = 22, 165, 5
 ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
 MAX_LABELS, LABEL_HEIGHT = 14, 20
-MAX_CHARACTERS = 40  # of a label
-FEW = 4  # more boxes than these are drawn with thin lines
-PALE = 0.22  # how much of its colour an object keeps that is not spoken of
-# The corners of a box, bit i for axis i, that its twelve edges join.
+MAX_CHARACTERS = 40  # per label
+FEW = 4  # more boxes than this are drawn with thin lines
+PALE = 0.22  # fraction of the colour that objects outside the answer keep
+# The twelve edges of a box as pairs of corners; bit i of a corner is axis i.
 EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1)
 
 
 @dataclass(frozen=True)
 class AnswerRows:
-    """Rows of the map that are the answer, and rows that it was held against."""
+    """Rows of the map that are the answer, and the reference rows that it was compared with."""
 
     answer: tuple[int, ...]
     reference: tuple[int, ...] = ()
@@ -173,7 +173,7 @@ class AnswerRows:
 def draw_reasoning(
     instances: Instances, spoken_of: AnswerRows, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
 ) -> None:
-    """Write the picture of an answer: ``names`` label the instances, ``lines`` stand under the ``question``."""
+    """Write the picture of an answer: ``names`` of the instances, ``lines`` shown below the ``question``."""
     names = [canvas.drawable(printable(name, MAX_CHARACTERS)) for name in names]
     written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MAX_LINES]
     header = 52 + LINE_HEIGHT * len(written)
@@ -193,7 +193,7 @@ def draw_reasoning(
 
 
 def _palette(names: Sequence[str], spoken_of: AnswerRows) -> UInt8Array:
-    """A colour a row: strong for what is spoken of, pale for the rest; the last one is that of no instance."""
+    """Return one colour per row: saturated for answer and reference, pale otherwise; the last: no instance."""
     own = np.array([*canvas.instance_colours(names), canvas.NO_INSTANCE], np.float64)
     pale = PALE * own + (1 - PALE) * 235.0
     for row in spoken_of.rows:
@@ -202,18 +202,18 @@ def _palette(names: Sequence[str], spoken_of: AnswerRows) -> UInt8Array:
 
 
 def _two_views(cloud: Cloud, spoken_of: AnswerRows) -> list[tuple[canvas.Camera, canvas.View, str]]:
-    """The view from above, and that from the corner where most of what is spoken of is seen."""
+    """Return the view from above, and the corner view that shows most of answer and reference."""
     cameras = canvas.view_cameras(canvas.room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
     above, *corners = [(camera, canvas.render(cloud.points, SQUARE_M, camera)) for camera in cameras]
     wanted = np.isin(cloud.owner, spoken_of.rows)
     camera, view = max(corners, key=lambda pair: wanted[pair[1].point[pair[1].point >= 0]].sum())
-    return [(*above, "from above"), (camera, view, "from the corner that shows most of it")]
+    return [(*above, "from above"), (camera, view, "from the corner with the best view")]
 
 
 def _draw_spoken_of(
     axes: Any, camera: canvas.Camera, instances: Instances, spoken_of: AnswerRows, names: Sequence[str]
 ) -> None:
-    """Boxes and names of what is spoken of, and a line from each answer to the nearest reference."""
+    """Draw boxes and names of answer and reference, and a line from each answer to its nearest reference."""
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=3, foreground="white")]
@@ -251,7 +251,7 @@ def _touch(instances: Instances, a: int, b: int) -> bool:
 
 
 def _free_place(corners: Float64Array, name: str, placed: list[Float64Array]) -> tuple[float, float]:
-    """Where the label of a box goes: above its middle, or as near to that as labels ``placed`` before leave room."""
+    """Return the position of a box's label: above its centre, or as close as labels already ``placed`` allow."""
     half = np.array([4.0 * len(name) + 6.0, LABEL_HEIGHT / 2])
     seen = corners[np.isfinite(corners).all(axis=1)]
     start = np.array([seen[:, 0].mean(), seen[:, 1].min() - 10.0]) if len(seen) else half

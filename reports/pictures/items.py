@@ -1,4 +1,4 @@
-"""The picture of one item of an annotation sheet, to be judged in two seconds: photograph, zoom, room and place.
+"""The picture of one item of an annotation sheet: photo, zoom, room view and location.
 
 Composed with Pillow: a sheet has hundreds of pictures, and a plotting library takes half a second for each.
 """
@@ -22,20 +22,20 @@ from su3d_bench.reports.pictures.canvas import BACKGROUND, drawable
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
 TOP_HEIGHT, LOW_HEIGHT = 420, 320
-TITLE_SIZE, TITLE_LINE, MAX_TITLE_LINES = 25, 33, 4  # two lines each of a question and its answer
-FIRST_WIDE, REST_WIDE = 60, 88  # characters of a line of the title
+TITLE_SIZE, TITLE_LINE, MAX_TITLE_LINES = 25, 33, 4  # two lines each for a question and its answer
+FIRST_WIDE, REST_WIDE = 60, 88  # characters per title line
 MAX_TAGS, MAX_TAG_TEXT, TAG_LINE = 8, 28, 19
-OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that no heat scale has, on white
+OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink not in any heat scale, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
-ROOM_COLUMNS, ROOM_GAP = 3, 6  # photographs of the room side by side, pixels between them
-ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
-PNG_COLOURS = 160  # of the palette; more make the file larger and the picture no clearer
-PALETTE_WIDTH, COMMON_COLOURS = 160, 96  # pixels of each picture from which a palette is chosen; its frequent colours
+ROOM_COLUMNS, ROOM_GAP = 3, 6  # room photos per row, pixels between them
+ZOOM_GROWTH = 1.7  # size of the zoomed part relative to the object
+PNG_COLOURS = 160  # palette size; more enlarge the file without visible gain
+PALETTE_WIDTH, COMMON_COLOURS = 160, 96  # size of pictures from which a palette is chosen; its frequent colours
 
 
 @dataclass(frozen=True)
 class Tag:
-    """A name at a place of a picture."""
+    """A name at a position in a picture."""
 
     text: str
     x: float
@@ -45,10 +45,10 @@ class Tag:
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture (h, w, 3) with where the object is in it (h, w), and the words above it.
+    """A picture (h, w, 3) with the ``mask`` (h, w) of the object, and the title above it.
 
-    ``tags``: names in it, at shares of its width and height. ``ring``: around the object, centre and radius in shares
-    of width, height and width; ``eye``: where the camera of the photograph was, in shares.
+    ``tags``: names, at fractions of width and height. ``ring``: circle around the object, as fractions: centre of width
+    and height, radius of width; ``eye``: camera position of the photo, as fractions.
     """
 
     title: str
@@ -62,10 +62,10 @@ class Panel:
 
 @dataclass(frozen=True)
 class ItemParts:
-    """What stands in the picture of an item.
+    """The parts of the picture of an item.
 
-    ``title``: lines at the top, the first one large. ``photo`` is None where there is no object to be seen, and then
-    ``room`` are photographs of the room.
+    ``title``: lines at the top, the first one large. ``photo``: None if no object is visible; ``room`` then holds
+    photos of the room.
     """
 
     title: tuple[str, ...]
@@ -76,7 +76,7 @@ class ItemParts:
 
 
 def compose(parts: ItemParts) -> UInt8Array:
-    """The picture (h, 960, 3) of an item."""
+    """Return the picture (h, 960, 3) of an item."""
     from PIL import Image, ImageDraw
 
     lines = title_lines(parts.title)
@@ -99,7 +99,7 @@ def compose(parts: ItemParts) -> UInt8Array:
 
 
 def _place_room(page: Any, draw: Any, photos: tuple[UInt8Array, ...], top: int) -> None:
-    """Photographs of the room where nothing can be outlined."""
+    """Draw photos of the room if there is no object to outline."""
     if not photos:
         box = (MARGIN, top + CAPTION, WIDTH - MARGIN, top + CAPTION + TOP_HEIGHT)
         draw.rectangle(box, fill=PANEL)
@@ -111,18 +111,18 @@ def _place_room(page: Any, draw: Any, photos: tuple[UInt8Array, ...], top: int) 
     for k, photo in enumerate(photos):
         row, column = divmod(k, ROOM_COLUMNS)
         at = (MARGIN + column * (wide + ROOM_GAP), top + row * (high + ROOM_GAP))
-        _place(page, draw, Panel("nothing to outline; the room" if k == 0 else "", photo), at, (wide, high))
+        _place(page, draw, Panel("no object to outline; photos of the room" if k == 0 else "", photo), at, (wide, high))
 
 
 def zoomed(photo: Panel) -> Panel:
-    """The part of a photograph around the object, as wide for its height as its panel."""
+    """Return the part of a photo around the object, with the aspect ratio of its panel."""
     assert photo.mask is not None
     part = window_around(photo.mask, ZOOM_WIDTH / TOP_HEIGHT)
-    return Panel("closer", photo.picture[part], photo.mask[part])
+    return Panel("zoom", photo.picture[part], photo.mask[part])
 
 
 def window_around(mask: BoolArray, aspect: float, least_rows: float = 72.0) -> tuple[slice, slice]:
-    """Rows and columns of the part of an image around ``mask``, ``aspect`` times as wide as high; all without one."""
+    """Return rows and columns of an image part around ``mask`` with this aspect ratio; the whole image if empty."""
     height, width = mask.shape
     rows, columns = np.nonzero(mask)
     if not len(rows):
@@ -137,7 +137,7 @@ def window_around(mask: BoolArray, aspect: float, least_rows: float = 72.0) -> t
 
 
 def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int], line: int = 3) -> UInt8Array:
-    """``picture`` at ``size`` (width, height) with a line around ``mask``, light on both sides so that it shows."""
+    """Resize ``picture`` to ``size`` (width, height) and outline ``mask``, with a white halo for contrast."""
     shown = fitted(picture, size)
     if mask is not None and mask.any():
         draw_outline(shown, mask, line)
@@ -145,7 +145,7 @@ def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int],
 
 
 def fitted(picture: UInt8Array, size: tuple[int, int]) -> UInt8Array:
-    """``picture`` at ``size`` (width, height)."""
+    """Resize ``picture`` to ``size`` (width, height)."""
     import cv2
 
     is_smaller = size[0] < picture.shape[1]
@@ -157,7 +157,7 @@ def fitted(picture: UInt8Array, size: tuple[int, int]) -> UInt8Array:
 def draw_outline(
     shown: UInt8Array, mask: BoolArray, line: int, colour: tuple[int, int, int] = OUTLINE, halo: int = 3
 ) -> None:
-    """Draw a line around ``mask``, of whatever size, into a picture; ``halo`` is how much wider the white below is."""
+    """Outline ``mask``, of any resolution, in a picture; ``halo``: extra width of the white line below."""
     import cv2
 
     size = shown.shape[1], shown.shape[0]
@@ -168,7 +168,7 @@ def draw_outline(
 
 
 def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[float, float] | None) -> None:
-    """A ring around the object, and the way to it from where the photograph was taken."""
+    """Draw a ring around the object, and an arrow to it from the camera position of the photo."""
     import cv2
 
     size = np.array([shown.shape[1], shown.shape[0]])
@@ -189,9 +189,9 @@ def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[f
 
 
 def palette_of(pictures: Sequence[UInt8Array], shades: Sequence[tuple[int, int, int]]) -> UInt8Array:
-    """Colours (n, 3), at most 256, for items whose photographs and views are like ``pictures`` (h, w, 3).
+    """Return a palette (n, 3) of at most 256 colours for items with photos and views like ``pictures`` (h, w, 3).
 
-    Beside theirs it has those of what is written and outlined, and ``shades`` from light to dark.
+    It also contains the colours of texts and outlines, and ``shades`` from light to dark.
     """
     from PIL import Image
 
@@ -206,7 +206,7 @@ def palette_of(pictures: Sequence[UInt8Array], shades: Sequence[tuple[int, int, 
 
 
 def _with_rare(common: UInt8Array, pixels: UInt8Array) -> UInt8Array:
-    """``common`` and the colours of ``pixels`` farthest from all before: few, and asked about."""
+    """Extend ``common`` by the colours of ``pixels`` farthest from it: rare, but questions may be about them."""
     _, first = np.unique(pixels >> 3, axis=0, return_index=True)
     left = pixels[first].astype(np.float64)
     distance = np.min([((left - one) ** 2).sum(axis=1) for one in common.astype(np.float64)], axis=0)
@@ -219,15 +219,15 @@ def _with_rare(common: UInt8Array, pixels: UInt8Array) -> UInt8Array:
 
 
 def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> tuple[int, int, int]:
-    """The colour between two, ``share`` of the way to the ``other``."""
+    """Blend two colours; ``share`` is the weight of ``other``."""
     red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(one, other, strict=True))
     return red, green, blue
 
 
 def png_bytes(picture: UInt8Array, *, palette: UInt8Array | None = None) -> bytes:
-    """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
+    """Return a PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
 
-    ``palette`` (n, 3): of these colours instead, each pixel in the nearest, whatever the others are.
+    ``palette`` (n, 3): use these colours instead, each pixel independently in the nearest one.
     """
     from PIL import Image
 
@@ -239,7 +239,7 @@ def png_bytes(picture: UInt8Array, *, palette: UInt8Array | None = None) -> byte
         image = whole.quantize(palette=of_palette, dither=Image.Dither.NONE)
     else:
         image = whole.quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    image.save(buffer, format="PNG", compress_level=6)  # 9: a twentieth smaller in four times the time
+    image.save(buffer, format="PNG", compress_level=6)  # level 9: 5 % smaller in four times the time
     return buffer.getvalue()
 
 
@@ -259,7 +259,7 @@ def _place(page: Any, draw: Any, panel: Panel, at: tuple[int, int], size: tuple[
 
 
 def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple[int, int]) -> None:
-    """Names at their places, moved down where they would cover each other."""
+    """Draw names at their positions, moved down where they would overlap."""
     taken: list[tuple[float, float, float]] = []
     for tag in tags:
         text = printable(tag.text, MAX_TAG_TEXT)
@@ -278,7 +278,7 @@ def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple
 
 
 def title_lines(title: tuple[str, ...]) -> list[tuple[str, bool]]:
-    """Lines, and whether each is of the first of ``title``, which is large; what does not fit ends in dots."""
+    """Return lines and whether each belongs to the large first title; longer titles are truncated."""
     import textwrap
 
     lines: list[tuple[str, bool]] = []
@@ -309,18 +309,18 @@ def font(size: int, is_bold: bool) -> Any:
     return ImageFont.truetype(str(path), size, layout_engine=ImageFont.Layout.BASIC)
 
 
-PROBES = 300  # points of an instance that are looked for in every frame
-NEAR_M, NEAR_SHARE = 0.05, 0.03  # a point is seen where the depth image agrees with it within this much
-GOOD_AREA = 0.08  # share of the image from which a larger view of an object tells no more
-PIXEL_STEP = 2  # of the depth image, in which masks are found
-CAP_M = 0.05  # a pixel belongs to what owns the map point nearest to it within this distance
+PROBES = 300  # points per instance that are searched in every frame
+NEAR_M, NEAR_SHARE = 0.05, 0.03  # a point is visible if the depth image agrees within this tolerance
+GOOD_AREA = 0.08  # image fraction above which a larger view of an object adds nothing
+PIXEL_STEP = 2  # subsampling of the depth image for masks
+CAP_M = 0.05  # a pixel belongs to the instance of the nearest map point within this distance
 
 
 @dataclass(frozen=True)
 class BestView:
-    """``frame`` is the place in the list of frames, ``seen`` the share of the instance that it shows.
+    """``frame``: index in the list of frames; ``seen``: visible fraction of the instance.
 
-    ``box`` (4,) are the columns and rows x0 y0 x1 y1 of what is seen, in pixels; views are ranked by ``score``.
+    ``box`` (4,): columns and rows x0 y0 x1 y1 of the visible part, in pixels; views are ranked by ``score``.
     """
 
     frame: int
@@ -330,7 +330,7 @@ class BestView:
 
 
 def best_view(frames: Sequence[Frame], points: Float32Array) -> BestView | None:
-    """The frame that shows most of ``points`` (N, 3), large and not at the border; None where none shows any."""
+    """Return the frame that best shows ``points`` (N, 3): most of them, and large; None if none shows any."""
     if not len(points):
         return None
     probes = points[np.linspace(0, len(points) - 1, min(PROBES, len(points))).astype(np.int64)].astype(np.float64)
@@ -351,7 +351,7 @@ def best_view(frames: Sequence[Frame], points: Float32Array) -> BestView | None:
 
 
 def seen_in(frame: Frame, points: Float64Array) -> tuple[Float64Array, Float64Array, BoolArray]:
-    """Columns and rows (N,) of ``points`` (N, 3) in a frame, and which of them it sees, not hidden by anything."""
+    """Return columns and rows (N,) of ``points`` (N, 3) in a frame, and which of them are visible."""
     height, width = frame.depth_m.shape
     in_camera = (points - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, :3]
     depth = np.maximum(in_camera[:, 2], 1e-6)
@@ -366,10 +366,10 @@ def seen_in(frame: Frame, points: Float64Array) -> tuple[Float64Array, Float64Ar
 
 
 def mask_in_frame(frame: Frame, tree: object, is_member: BoolArray, bounds: Float64Array) -> BoolArray:
-    """Where the frame shows the instance: (h, w) bool, of every ``PIXEL_STEP``-th pixel.
+    """Return the mask (h, w) of the instance in a frame, on every ``PIXEL_STEP``-th pixel.
 
-    ``tree`` is the ``KDTree`` of the map's points, ``is_member`` (N,) marks those of the instance, which lie within
-    ``bounds`` (2, 3).
+    ``tree``: ``KDTree`` of the map's points; ``is_member`` (N,): points of the instance, which are within ``bounds``
+    (2, 3).
     """
     pixels = np.zeros(frame.depth_m.shape, np.bool_)
     pixels[::PIXEL_STEP, ::PIXEL_STEP] = True

@@ -1,4 +1,4 @@
-"""Pictures of a map for people: by instance, by class beside the ground truth, and as the heat map of a query."""
+"""Pictures of a map: by instance, by class next to the ground truth, and as the heat map of a query."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
 
 PALE_GREY = 232
-RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner
-BORDER = 4  # pixels around what is drawn
+RENDERED = 1.5  # render scale; a room fills only a part of a corner view
+BORDER = 4  # pixels around the content
 
 
 @dataclass(frozen=True)
 class MapView:
-    """One view of a map; ``point`` of ``view`` are rows of the drawn points, ``camera`` is at twice the size.
+    """One view of a map; ``view.point`` holds rows of the drawn points, ``camera`` renders at twice the size.
 
-    Of it the part ``box`` (x0, y0, x1, y1 in pixels of the picture) is shown.
+    Only the part ``box`` (x0, y0, x1, y1 in pixels of the picture) is shown.
     """
 
     camera: canvas.Camera
@@ -36,13 +36,13 @@ class MapView:
 
     @cached_property
     def shown(self) -> canvas.View:
-        """The part of ``view`` that is shown."""
+        """The visible part of ``view``."""
         x0, y0, x1, y1 = (canvas.OVERSAMPLING * side for side in self.box)
         part = slice(y0, y1), slice(x0, x1)
         return canvas.View(np.ascontiguousarray(self.view.point[part]), np.ascontiguousarray(self.view.shade[part]))
 
     def shows(self, is_member: BoolArray) -> BoolArray:
-        """Where the view shows a point of those that ``is_member`` marks: (h, w) of the picture."""
+        """Return the mask (h, w) of the picture pixels that show a point with ``is_member``."""
         point, known = self.shown.point, np.append(is_member, False)
         seen: BoolArray = (
             known[point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]]
@@ -51,7 +51,7 @@ class MapView:
         return seen
 
     def project(self, points: Float64Array) -> Float64Array:
-        """Columns and rows (N, 2) of world points as shares of the width and height that are shown."""
+        """Project world points to columns and rows (N, 2), as fractions of the shown width and height."""
         x0, y0, x1, y1 = self.box
         shares: Float64Array = (canvas.project(self.camera, points) - np.array([x0, y0])) / np.array([x1 - x0, y1 - y0])
         return shares
@@ -59,14 +59,14 @@ class MapView:
 
 @dataclass(frozen=True)
 class DrawnMap:
-    """A map thinned for drawing: ``rows`` of its points that are drawn, ``owner`` the smallest instance of each."""
+    """A map downsampled for drawing: ``rows`` of the drawn points, ``owner``: the smallest instance of each."""
 
     instances: Instances
     rows: Int64Array
     owner: Int32Array
 
     def members(self, instance_rows: Sequence[int]) -> BoolArray:
-        """Which drawn points belong to any of these instances."""
+        """Return the mask of the drawn points that belong to any of these instances."""
         is_member = np.zeros(len(self.instances.points), np.bool_)
         for k in instance_rows:
             is_member[self.instances.mask(int(k))] = True
@@ -77,38 +77,38 @@ class DrawnMap:
         return view_of(self.instances.points[self.rows], camera)
 
     def cameras(self, width: int, height: int) -> tuple[canvas.Camera, canvas.Camera, canvas.Camera]:
-        """From above and from two opposite corners, for views of the shape of this size and at least as large."""
+        """Return cameras from above and from two opposite corners, for views of this aspect and at least this size."""
         return cameras_of(self.instances.points, width, height)
 
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
-        """The picture of a view, instance k in ``colours[k]``."""
+        """Return the picture of a view, instance k in ``colours[k]``."""
         palette = np.concatenate([colours.reshape(-1, 3), np.array([canvas.NO_INSTANCE], np.uint8)])
         return self.paint_points(view, palette[self.owner])
 
     def paint_points(self, view: MapView, colours: UInt8Array) -> UInt8Array:
-        """The picture of a view, each drawn point in a colour (N, 3) of its own."""
+        """Return the picture of a view, each drawn point in its colour (N, 3)."""
         return canvas.colour(view.shown, colours)
 
 
 def view_of(points: Float32Array, camera: canvas.Camera) -> MapView:
-    """What a camera shows of ``points``."""
+    """Render ``points`` with a camera, cropped to the content."""
     view = canvas.render(points, SQUARE_M, camera)
     return MapView(camera, view, _filled_part(view, camera.width / camera.height))
 
 
 def cameras_of(points: Float32Array, width: int, height: int) -> tuple[canvas.Camera, canvas.Camera, canvas.Camera]:
-    """From above and from two opposite corners, for views of the shape of this size and at least as large."""
+    """Return cameras from above and from two opposite corners, for views of this aspect and at least this size."""
     return canvas.view_cameras(canvas.room_bounds(points), round(RENDERED * width), round(RENDERED * height))
 
 
 def drawn_map(instances: Instances) -> DrawnMap:
-    """The map of ``instances`` thinned to what a picture shows; of masks that overlap, the smaller one is seen."""
+    """Downsample the map of ``instances`` for drawing; where masks overlap, the smaller one is visible."""
     rows = thinned_rows(instances.points)
     return DrawnMap(instances, rows, map_cloud(instances).owner[rows])
 
 
 def _filled_part(view: canvas.View, aspect: float) -> tuple[int, int, int, int]:
-    """The smallest part of a view of that shape, width by height, that holds all that is drawn."""
+    """Return the smallest part of a view, with this aspect ratio, that contains everything drawn."""
     height, width = (side // canvas.OVERSAMPLING for side in view.point.shape)
     rows, columns = np.nonzero(view.point >= 0)
     if not len(rows):
@@ -123,34 +123,34 @@ def _filled_part(view: canvas.View, aspect: float) -> tuple[int, int, int, int]:
 
 
 def pale(colours: UInt8Array, share: float) -> UInt8Array:
-    """``colours`` with this share of them left, the rest a light grey."""
+    """Blend ``colours`` with light grey; ``share`` of the colour remains."""
     return np.rint(share * colours.astype(np.float64) + (1 - share) * PALE_GREY).astype(np.uint8)
 
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
-DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn
-SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
-LEGEND_STEP, COLUMN_WIDTH, MAX_COLUMNS = 22, 250, 10  # pixels; of names and their colours
-MAX_NAME = 26  # characters of a legend's name
-HEAT_WIDTH, BAR_HEIGHT = 290, 16  # of what stands beside a heat map
-MAX_RANKS = 20  # written at instances; more would hide what they name
-RANK_RADIUS, SMALL_PIXELS = 12, 2500  # a rank hides an instance of fewer pixels
+DRAWN_SPACING_M = 0.015  # one point per cell of this size is drawn
+SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps between surface points up to two cells apart
+LEGEND_STEP, COLUMN_WIDTH, MAX_COLUMNS = 22, 250, 10  # pixels; layout of the legend
+MAX_NAME = 26  # characters per name in the legend
+HEAT_WIDTH, BAR_HEIGHT = 290, 16  # of the colour bar next to a heat map
+MAX_RANKS = 20  # drawn on instances; more would hide them
+RANK_RADIUS, SMALL_PIXELS = 12, 2500  # a rank would hide an instance with fewer pixels
 PALE = "#555555"
 VIEW_TITLES = ("from above", "from one corner", "from the other corner")
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points to draw and, a point each, the row of what they belong to (-1: nothing)."""
+    """Points to draw and, per point, the row of its instance or class (-1: none)."""
 
     points: Float32Array
     owner: Int32Array
 
 
 def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, title: str) -> list[Path]:
-    """Write ``instances.png`` and, where the map has names, ``classes.png`` with the truth below; their paths.
+    """Write ``instances.png`` and, for maps with names, ``classes.png`` with ground truth below; return the paths.
 
-    Nothing is drawn of an empty map or of dense features, which have no instances.
+    Nothing is written for an empty map or dense features, which have no instances.
     """
     if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
         return []
@@ -174,23 +174,23 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     if truth_cloud is not None:
         colours = [palette.get(name, canvas.NO_INSTANCE) for name in truth_names]
         rows.append(("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
-    legend = {name or "without a name": palette[name] for name in used}
+    legend = {name or "unnamed": palette[name] for name in used}
     if (cloud.owner < 0).any():
-        legend["of no instance"] = canvas.NO_INSTANCE
+        legend["no instance"] = canvas.NO_INSTANCE
     _write_picture(classes, f"{title}: classes", rows, legend)
     return [instances, classes]
 
 
 def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, title: str, top: Sequence[str]) -> None:
-    """Write the picture of a query: each instance in the colour of its similarity, the best one outlined.
+    """Write the heat map of a query: each instance in the colour of its similarity, the best one outlined.
 
-    ``top``: what is said of the most similar instances, the best first; their ranks stand at them.
+    ``top``: texts of the most similar instances, best first; their ranks are drawn on them.
     """
     cloud = thinned(map_cloud(instances))
     views = _views(cloud, _cameras(cloud.points))
     order = np.argsort(-similarity, kind="stable")[: len(top)]
     pictures = _paint(views, cloud, canvas.heat_colours(similarity))
-    owner_of = np.append(cloud.owner, np.int32(-1))  # whose point each pixel (h, w) shows, -1 for nobody's
+    owner_of = np.append(cloud.owner, np.int32(-1))  # per pixel (h, w) the instance shown, -1 for none
     seen: list[Int32Array] = [owner_of[view.point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]] for view in views]
     for picture, owners in zip(pictures, seen, strict=True):
         for best in order[:1]:
@@ -205,14 +205,14 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
 
 
 def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
-    """The rank of each instance that is seen, at its middle or beside it, where ranks before leave room."""
+    """Draw the rank of each visible instance at its centre, or next to it if other ranks are in the way."""
     taken: list[Float64Array] = []
     for rank, row in enumerate(order, start=1):
         places = np.argwhere(owners == row)[:, ::-1]
         if not len(places):
             continue
         middle = np.median(places, axis=0)
-        middle = places[np.argmin(((places - middle) ** 2).sum(axis=1))].astype(np.float64)  # of a ring no hole
+        middle = places[np.argmin(((places - middle) ** 2).sum(axis=1))].astype(np.float64)  # on the instance
         at = _free_place(middle, taken, is_beside=len(places) < SMALL_PIXELS)
         taken.append(at)
         if not np.array_equal(at, middle):
@@ -223,9 +223,9 @@ def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
 
 
 def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_beside: bool) -> Float64Array:
-    """The place nearest to the one ``wanted``, on rings around it, that is clear of those that are ``taken``.
+    """Return the position nearest to ``wanted``, on rings around it, that does not overlap those ``taken``.
 
-    ``is_beside``: not that place itself, which the rank would hide.
+    ``is_beside``: not ``wanted`` itself, where the rank would hide the instance.
     """
     low, high = np.full(2, RANK_RADIUS), np.array([VIEW_WIDTH, VIEW_HEIGHT]) - RANK_RADIUS
     for ring in range(2 if is_beside else 0, 14):
@@ -240,7 +240,7 @@ def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_besid
 def _write_ranking(
     page: canvas.Canvas, left: float, top: float, similarity: Float64Array, lines: Sequence[str]
 ) -> None:
-    """The scale of similarity with its least and greatest value, and the most similar instances below it."""
+    """Draw the colour bar of similarity with its range, and the list of the most similar instances below."""
     wide = HEAT_WIDTH - 40
     page.text(left, top, "similarity to the text (cosine)", 10, colour=canvas.GREY)
     if len(similarity):
@@ -253,7 +253,7 @@ def _write_ranking(
         if not is_one:
             page.text(left + wide / 2, numbers, f"{(low + high) / 2:.3f}", 10, ha="center")
             page.text(left + wide, numbers, f"{high:.3f}", 10, ha="right")
-    page.text(left, top + 62, "grey: of no instance", 9, colour=canvas.GREY)
+    page.text(left, top + 62, "grey: no instance", 9, colour=canvas.GREY)
     first = top + 90
     room = int((VIEW_HEIGHT - 118) / LEGEND_STEP)
     for k, line in enumerate(lines[:room]):
@@ -266,7 +266,7 @@ def _write_ranking(
 
 
 def names_of(prediction: Prediction) -> tuple[str, ...]:
-    """What a person reads of each instance: the label that the method decided, else the name that perception gave."""
+    """Return the shown name of each instance: the method's label, otherwise the name given by perception."""
     if isinstance(prediction, Instances):
         labels = prediction.labels or prediction.names
         return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
@@ -274,7 +274,7 @@ def names_of(prediction: Prediction) -> tuple[str, ...]:
 
 
 def map_cloud(prediction: Prediction) -> Cloud:
-    """The points of a map with their instances; of masks that overlap, the smaller one is seen."""
+    """Return the points of a map with their instances; where masks overlap, the smaller one."""
     assert not isinstance(prediction, DenseFeatures)
     if not isinstance(prediction, Instances):
         return Cloud(prediction.points, prediction.instance)
@@ -285,7 +285,7 @@ def map_cloud(prediction: Prediction) -> Cloud:
 
 
 def truth_owner(truth: GroundTruth) -> Int32Array:
-    """Row of ``truth.labels`` a point; -1 where unannotated."""
+    """Return the row of ``truth.labels`` per point; -1 if unannotated."""
     row_of_id = {class_id: row for row, class_id in enumerate(truth.labels.ids)}
     ids, inverse = np.unique(truth.semantic, return_inverse=True)
     rows = np.array([row_of_id.get(int(class_id), -1) for class_id in ids], np.int32)
@@ -293,13 +293,13 @@ def truth_owner(truth: GroundTruth) -> Int32Array:
 
 
 def thinned(cloud: Cloud) -> Cloud:
-    """One point of each cell of ``DRAWN_SPACING_M``, which is all that a picture can show."""
+    """Downsample to one point per cell of ``DRAWN_SPACING_M``, the resolution of pictures."""
     rows = thinned_rows(cloud.points)
     return Cloud(cloud.points[rows], cloud.owner[rows])
 
 
 def thinned_rows(points: Float32Array) -> Int64Array:
-    """The rows of ``points`` that are drawn."""
+    """Return the rows of ``points`` that are drawn: one per cell."""
     cells = voxel_coordinates(points, DRAWN_SPACING_M)
     if len(cells) == 0:
         return np.zeros(0, np.int64)
@@ -323,7 +323,7 @@ def _paint(views: Sequence[canvas.View], cloud: Cloud, row_colours: Sequence[can
 
 
 def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
-    """Names of what is there, the largest surface first, each once."""
+    """Return the distinct names that have points, largest surface first."""
     counts = np.bincount(cloud.owner[cloud.owner >= 0], minlength=len(names))
     totals: dict[str, int] = {}
     for name, count in zip(names, counts, strict=True):
@@ -334,7 +334,7 @@ def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
 def _write_picture(
     path: Path, title: str, rows: Sequence[tuple[str, tuple[UInt8Array, ...]]], legend: Mapping[str, canvas.Colour]
 ) -> None:
-    """Compose views and legend into a PNG; the legend has as many columns as it needs."""
+    """Compose views and legend into a PNG; the legend uses as many columns as needed."""
     header = 46
     height = len(rows) * VIEW_HEIGHT + header
     a_column = (height - header) // LEGEND_STEP
@@ -356,7 +356,7 @@ def _write_picture(
 
 
 def _place_views(page: canvas.Canvas, top: float, name: str, pictures: Sequence[UInt8Array]) -> list[Any]:
-    """The axes of the three views of a row, with their words."""
+    """Return the axes of the three labelled views of a row."""
     placed = []
     for c, picture in enumerate(pictures):
         axes = page.picture(c * VIEW_WIDTH, top, VIEW_WIDTH, VIEW_HEIGHT, picture)

@@ -1,4 +1,4 @@
-"""What updates cost, as plots that read in black and white: against the map, by stage, and quality against time."""
+"""Plots, readable in black and white, of update times over map size, by stage, memory, and scores over time."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe and Ito's colours for the colour-blind; marker and dash tell the methods apart where there is no colour.
+# Okabe and Ito's colour-blind safe palette; marker and dash distinguish the methods in black and white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", ":")
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++", "ooo", "---")
-MAX_DRAWN = 2000  # points a method; more only make the file large
-N_SIZES = 10  # markers a method along the axis of sizes
+MAX_DRAWN = 2000  # points per method; more only enlarge the file
+N_SIZES = 10  # markers per method along the size axis
 PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
-LETTERS_PER_INCH = 15  # of a legend's type
+LETTERS_PER_INCH = 15  # at the font size of legends
 TITLE_LETTERS_PER_INCH = 12
 DPI = 150
 MIB = 2**20
 TITLE_SIZE = 10
-NARROW = 6  # times from one end of an axis to the other, where 1, 2 and 5 may be too few numbers
-POINTS, UPDATES = "points of the map", "updates so far"
-MAX_TITLE_NAMES = 3  # of methods; more are counted
+NARROW = 6  # ratio of axis limits below which 1, 2, 5 per decade are too few ticks
+POINTS, UPDATES = "number of map points", "number of updates"
+MAX_TITLE_NAMES = 3  # method names; more are counted
 
 
 def draw_timing(
     times: Sequence[Sequence[UpdateTimes]], anytime: Sequence[AnytimePoint], warm_up: int, folder: Path
 ) -> list[Path]:
-    """Write the plots as PNG and PDF; their paths.
+    """Write the plots as PNG and PDF and return their paths.
 
-    ``update-cost`` against the points of the map, ``update-course`` against the updates so far, ``memory``, ``stages``
-    and, where maps were scored midway, ``anytime``.
+    ``update-cost`` over map points, ``update-course`` over updates, ``memory``, ``stages`` and, if intermediate maps
+    were scored, ``anytime``.
     """
     figures = {
         "update-cost": _update_cost(times, warm_up, POINTS),
@@ -66,7 +66,7 @@ def draw_timing(
 
 
 def _figure(width: float, height: float, n_axes: int = 1) -> tuple[Figure, list[Axes]]:
-    """A figure of ``n_axes`` panels of ``width`` x ``height`` inches, at most ``PANELS_A_ROW`` beside each other."""
+    """Return a figure with ``n_axes`` panels of ``width`` x ``height`` inches, at most ``PANELS_A_ROW`` per row."""
     from matplotlib.figure import Figure
 
     columns = min(n_axes, PANELS_A_ROW)
@@ -79,38 +79,38 @@ def _figure(width: float, height: float, n_axes: int = 1) -> tuple[Figure, list[
 
 
 def _style(index: int) -> dict[str, Any]:
-    """Colour, marker and dash of the ``index``-th line; marker and dash together are of no other one."""
+    """Return colour, marker and dash of the ``index``-th line; the pair of marker and dash is unique."""
     dash = DASHES[(index + index // len(MARKERS)) % len(DASHES)]
     return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "linestyle": dash}
 
 
 def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
-    """The cost of an update against the points of the map, as a ``png`` or ``pdf`` file."""
+    """Return the plot of update time over map points, as a ``png`` or ``pdf`` file."""
     return figure_bytes(_update_cost(times, warm_up, POINTS), kind, DPI)
 
 
 def _label(method: str, run: str, several_runs: bool) -> str:
-    # A dollar sign would start mathematics.
+    # A dollar sign would start math mode.
     return printable(f"{method} ({run})" if several_runs else method, 60).replace("$", r"\$")
 
 
 def _labels(times: Sequence[Sequence[UpdateTimes]]) -> list[str]:
-    """The name of each method, with its run where one stands there more than once."""
+    """Return the name of each method, with its run if a method occurs more than once."""
     several_runs = len({of_method[0].method for of_method in times}) < len(times)
     return [_label(of_method[0].method, of_method[0].run, several_runs) for of_method in times]
 
 
 def _sizes(scene: UpdateTimes, against: str, warm_up: int) -> Float64Array | None:
-    """The size at each update after the first ``warm_up``; None where it was not counted."""
+    """Return the size at each update after the first ``warm_up``; None if it was not recorded."""
     if against == UPDATES:
         return np.arange(warm_up + 1, len(scene) + 1, dtype=np.float64)
     return scene.columns["n_points"][warm_up:] if "n_points" in scene.columns else None
 
 
 def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: str) -> Figure:
-    """Milliseconds of the map's share of an update ``against`` the size of the map, both axes logarithmic.
+    """Plot the time per update without perception over the size ``against``, on log-log axes.
 
-    Each update is a dot; a method's line runs through the medians of the updates of about one size.
+    Each update is a dot; a method's line connects the medians of updates of similar size.
     """
     figure, (axes,) = _figure(7.0, 4.0 + 0.16 * len(times))
     found: dict[str, list[str]] = {}
@@ -140,35 +140,35 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
 
 
 def cost_sentence(found: Mapping[str, Sequence[str]], against: str) -> str:
-    """What the methods' growth says together; ``found`` has the methods by the words of their growth.
+    """Return the sentence on the growth of all methods; ``found``: words of the growth -> methods.
 
     >>> cost_sentence({"grows": ["a", "b"], "constant per update": ["c"]}, POINTS)
-    'With the points of the map, the cost of an update grows for a and b; stays constant for c'
+    'Time per update over map points: grows for a and b; constant for c'
     """
-    said = {"grows": "grows for", "constant per update": "stays constant for", "not settled": "is not settled for"}
+    said = {"grows": "grows for", "constant per update": "constant for", "not settled": "growth undetermined for"}
     parts = [f"{words} {_listed(found[kind])}" for kind, words in said.items() if kind in found]
-    with_what = "With the points of the map" if against == POINTS else "In the course of a scene"
+    with_what = "Time per update over map points" if against == POINTS else "Time per update over updates"
     if not parts:
-        return f"{with_what}, nothing can be said of an update's cost: too few, or of too similar size"
-    return f"{with_what}, the cost of an update {'; '.join(parts)}"
+        return f"{with_what}: growth unknown (too few updates or too similar sizes)"
+    return f"{with_what}: {'; '.join(parts)}"
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The names as a sentence has them, or how many there are."""
+    """Return the names as a list in words, or their number if there are many."""
     if len(names) > MAX_TITLE_NAMES:
         return f"{len(names)} methods"
     return " and ".join([*([", ".join(names[:-1])] if len(names) > 1 else []), names[-1]])
 
 
 def _entitle(figure: Figure, axes: Axes, sentence: str) -> None:
-    """Write the sentence above the panel, in as many lines as its width asks for."""
+    """Write the sentence above the panel, wrapped to its width."""
     inches = figure.get_figwidth() * axes.get_position().width
     lines = textwrap.wrap(sentence, max(30, int(inches * TITLE_LETTERS_PER_INCH)))
     axes.set_title("\n".join(lines), loc="left", fontsize=TITLE_SIZE)
 
 
 def _number_by_1_2_5(axis: Axis) -> None:
-    """Numbers such as 0.5, 200 k and 5 M along a logarithmic axis: of a decade, powers of ten would name one value."""
+    """Label a logarithmic axis with numbers such as 0.5, 200 k and 5 M at 1, 2 and 5 per decade."""
     from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
     large = EngFormatter()
@@ -182,14 +182,14 @@ def _number_by_1_2_5(axis: Axis) -> None:
 def _draw_medians(
     axes: Axes, sizes: Float64Array, values: Float64Array, marker: float, label: str, style: Mapping[str, Any]
 ) -> float:
-    """Draw a method's line through the medians of about one size; the largest of them."""
+    """Draw a method's line through the medians of similar sizes and return the largest median."""
     x, y = medians_by_size(sizes, values)
     axes.plot(x, y, linewidth=1.2, markersize=marker, markerfacecolor="white", label=label, **style)
     return float(y.max())
 
 
 def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """The median size and cost of each of at most ``N_SIZES`` ranges of sizes, all of one width on a log axis."""
+    """Return the median size and cost in each of at most ``N_SIZES`` size ranges, equally wide on a log axis."""
     edges = np.geomspace(sizes.min(), sizes.max(), N_SIZES + 1)[1:-1]
     row = np.searchsorted(edges, sizes, side="right")
     filled = np.unique(row)
@@ -198,7 +198,7 @@ def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Ar
 
 
 def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
-    """The mean update of each method, stacked by stage."""
+    """Plot the mean update time of each method, stacked by stage."""
     figure, (axes,) = _figure(7.0, 1.6 + 0.45 * len(times))
     stages = list(dict.fromkeys(stage for of_method in times for scene in of_method for stage in scene.stages))
     left = np.zeros(len(times))
@@ -221,28 +221,26 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
 
 
 def stages_sentence(labels: Sequence[str], shares: Mapping[str, Float64Array]) -> str:
-    """Where most of the time of an update goes; ``shares`` has the mean ms (N,) of each of N methods by stage.
+    """Return the sentence on the slowest stages; ``shares``: stage -> mean ms (N,) of N methods.
 
     >>> stages_sentence(["a"], {"segment": np.array([75.0]), "match": np.array([25.0])})
-    'Most of an update of a is segment: 75 % of 100 ms'
+    'Most of the update time of a is segment: 75 % of 100 ms'
     """
     total = np.sum([*shares.values()], axis=0) if shares else np.zeros(0)
     if not np.any(total):
-        return "No update took a time that was measured"
+        return "No update times were measured"
     largest = [max(shares, key=lambda stage: shares[stage][row]) for row in range(len(labels))]
     if len(labels) == 1:
         share = 100 * shares[largest[0]][0] / total[0]
         most = "Most" if share > 50 else "The largest part"
-        return f"{most} of an update of {labels[0]} is {largest[0]}: {share:.0f} % of {_rounded(total[0])} ms"
+        return f"{most} of the update time of {labels[0]} is {largest[0]}: {share:.0f} % of {_rounded(total[0])} ms"
     slow, fast = int(np.argmax(total)), int(np.argmin(total))
-    slowest, fastest = (
-        f"{_rounded(total[row])} ms with {labels[row]} (most of it {largest[row]})" for row in (slow, fast)
-    )
-    return f"An update takes {fastest}, {slowest}"
+    slowest, fastest = (f"{_rounded(total[row])} ms ({labels[row]}, mostly {largest[row]})" for row in (slow, fast))
+    return f"Mean update: {fastest}; {slowest}"
 
 
 def _rounded(value: float) -> str:
-    """Three digits, and never a power of ten.
+    """Format with three significant digits, without an exponent.
 
     >>> _rounded(12345.6), _rounded(4.5678), _rounded(0.00001)
     ('12,346', '4.57', 'under 0.001')
@@ -253,7 +251,7 @@ def _rounded(value: float) -> str:
 
 
 def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
-    """Mebibytes of the map against its points, where a method tells them, and of the process against the updates.
+    """Plot MiB of the map over its points, if recorded, and MiB of the process over updates.
 
     Medians over the scenes.
     """
@@ -271,7 +269,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
                 continue
             most[label] = _draw_medians(axes, sizes[sizes > 0], values[sizes > 0] / MIB, 4.5, label, _style(index))
         what = "the map" if column == "map_bytes" else "the process"
-        axes.margins(y=0.12)  # the markers at the top stand whole
+        axes.margins(y=0.12)  # do not cut the markers at the top
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}")
         axes.set_ylim(bottom=0)
         _entitle(figure, axes, memory_sentence(most, what))
@@ -283,20 +281,20 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
 
 
 def memory_sentence(most: Mapping[str, float], what: str) -> str:
-    """How much memory was held at most; ``most`` has the largest median in MiB by method.
+    """Return the sentence on peak memory; ``most``: method -> largest median in MiB.
 
     >>> memory_sentence({"a": 210.4, "b": 95.0}, "the map")
-    'Memory of the map peaks at 210 MiB with a, at 95 MiB with b'
+    'Peak memory of the map: 210 MiB (a), 95 MiB (b)'
     """
     if not most:
-        return f"Memory of {what} was not told by any method"
+        return f"No method recorded the memory of {what}"
     high, low = max(most, key=most.__getitem__), min(most, key=most.__getitem__)
-    text = f"Memory of {what} peaks at {_rounded(most[high])} MiB with {high}"
-    return text if high == low else f"{text}, at {_rounded(most[low])} MiB with {low}"
+    text = f"Peak memory of {what}: {_rounded(most[high])} MiB ({high})"
+    return text if high == low else f"{text}, {_rounded(most[low])} MiB ({low})"
 
 
 def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """The lines of all ``panels``, each named once, beneath them."""
+    """Draw one legend below all ``panels``, each line once."""
     named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if not named:
         return
@@ -306,13 +304,13 @@ def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
 
 
 def _curves(points: Sequence[AnytimePoint]) -> list[tuple[str, str]]:
-    """The protocols and metrics that have a value at any time."""
+    """Return the protocols and metrics with a value for any intermediate map."""
     defined = ((point.protocol, name) for point in points for name, value in point.metrics.items() if value is not None)
     return list(dict.fromkeys(defined))
 
 
 def _anytime(points: Sequence[AnytimePoint]) -> Figure:
-    """Each headline metric of each protocol against the seconds until the map was there."""
+    """Plot each headline metric of each protocol over the seconds until the map was available."""
     panels = _curves(points)
     figure, all_axes = _figure(3.5, 3.4, len(panels))
     several = len({point.run for point in points}) > 1
@@ -326,7 +324,7 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
             if np.isfinite(values).any():
                 best[label] = float(np.asarray(values)[np.isfinite(values)][-1])
             axes.plot([point.seconds for point in mine], values, markersize=4, label=label, **_style(index))
-        axes.set(xlabel="seconds until the map was there", ylabel=f"{name} (%)")
+        axes.set(xlabel="seconds until the map was available", ylabel=f"{name} (%)")
         _entitle(figure, axes, anytime_sentence(protocol, name, best))
         axes.grid(True, color="0.85", linewidth=0.6)
     _one_legend(figure, all_axes)
@@ -334,20 +332,20 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
 
 
 def anytime_sentence(protocol: str, metric: str, last: Mapping[str, float]) -> str:
-    """Where the curves of a metric end; ``last`` has the last value of each method.
+    """Return the sentence on the final values of a metric; ``last``: method -> last value.
 
     >>> anytime_sentence("rooms-instance", "AP", {"a": 41.0, "b": 12.5})
-    'rooms-instance: AP ends highest with a, at 41.0 %'
+    'rooms-instance: final AP is highest for a (41.0 %)'
     """
     highest = max(last.values())
     best = _listed([name for name, value in last.items() if value == highest])
     if len(last) == 1:
-        return f"{protocol}: {metric} of {best} ends at {highest:.1f} %"
-    return f"{protocol}: {metric} ends highest with {best}, at {highest:.1f} %"
+        return f"{protocol}: final {metric} of {best} is {highest:.1f} %"
+    return f"{protocol}: final {metric} is highest for {best} ({highest:.1f} %)"
 
 
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
-# Grey and hatches tell bars apart on a printer without colours.
+# Shades and hatches distinguish the bars in black and white.
 STYLES: dict[str, dict[str, Any]] = {
     "gain": {"facecolor": "#4a7ab5", "edgecolor": "#1b2f4a"},
     "left": {"facecolor": "#ffffff", "edgecolor": "#555555", "hatch": "////"},
@@ -356,7 +354,7 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
-    """Write the plot as a PNG: a row of panels a protocol, a panel a metric."""
+    """Write the plot as a PNG: one row of panels per protocol, one panel per metric."""
     protocols = attribution["protocols"]
     n_columns = max(len(protocol["values"]) for protocol in protocols)
     heights = [
@@ -364,7 +362,7 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
     ]
     page = Canvas(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5, per_inch=1)
     figure = page.figure
-    title = f"What correcting one kind of error alone adds to {attribution['method']} in {attribution['run']}"
+    title = f"Gain from correcting one kind of error: {attribution['method']}, {attribution['run']}"
     figure.suptitle(drawable(title), fontsize=13, fontweight="bold", parse_math=False)
     grid = figure.add_gridspec(len(protocols), n_columns, height_ratios=heights)
     for row, protocol in enumerate(protocols):
@@ -374,7 +372,7 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
     page.write(path)
 
 
-Bar = tuple[str, float, str, str]  # name, length, style, what stands beside it
+Bar = tuple[str, float, str, str]  # name, length, style, label
 
 
 def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
@@ -388,7 +386,7 @@ def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
     ]
     for stage, values in protocol["stages"].items():
         change = None if values[metric] is None else values[metric] - value
-        bars.append((f"true {stage}", change or 0.0, "stage", signed(change)))
+        bars.append((f"GT {stage}", change or 0.0, "stage", signed(change)))
     return bars
 
 
@@ -399,7 +397,7 @@ def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_name
     for place, (_, length, style, text) in zip(places, bars, strict=True):
         axes.barh(place, 100 * length, left=value, height=0.62, linewidth=0.8, **STYLES[style])
         end = max(value, value + 100 * length)
-        free = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # the line at 100 does not cross the number
+        free = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # keeps the line at 100 from crossing the number
         axes.text(end + 0.02 * _span(value), place, text, va="center", fontsize=8.5, color="#222222", bbox=free)
     axes.axvline(value, color="black", linewidth=1.2)
     axes.axvline(100, color="black", linewidth=0.8, linestyle=":")
@@ -410,10 +408,10 @@ def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_name
     axes.set_yticks(list(places), [name for name, *_ in bars] if has_names else [""] * len(bars), fontsize=9.5)
     gains = {kind: cause["gains"][metric] or 0.0 for kind, cause in protocol["causes"].items()}
     worst = max(gains, key=gains.__getitem__, default=None)
-    most = f", the costliest kind: {worst}" if worst is not None and gains[worst] > 0 else ""
+    most = f", most costly: {worst}" if worst is not None and gains[worst] > 0 else ""
     title = drawable(f"{protocol['protocol']}: {metric} {value:.1f}{most}")
     axes.set_title(title, fontsize=10.5, loc="left", parse_math=False)
-    _without_frame(axes, "value with this alone corrected")
+    _without_frame(axes, "score with only this corrected")
 
 
 def _without_frame(axes: Any, title: str) -> None:
@@ -425,17 +423,17 @@ def _without_frame(axes: Any, title: str) -> None:
 
 
 def _span(value: float) -> float:
-    """The width that bars may take, at least one point."""
+    """Return the width available for bars, at least one point."""
     return max(1.0, 100 - value)
 
 
 SHIFT_PANEL_WIDTH, SHIFT_ROW_HEIGHT, NAMES_WIDTH, EXTRA = 4.4, 0.42, 3.2, 1.5  # inches
-ENDS, UP, DOWN = "#555555", "#2f6f4f", "#a4432f"  # hatches tell up and down apart without colours
+ENDS, UP, DOWN = "#555555", "#2f6f4f", "#a4432f"  # hatches distinguish up and down without colours
 MAX_NAME_CHARACTERS = 44  # characters
 
 
 def draw_walk(apart: Mapping[str, Any], path: Path) -> None:
-    """Write the plot as a PNG: a panel a value, from the first protocol's above to the second's below."""
+    """Write the plot as a PNG: one panel per metric, from the first protocol (top) to the second (bottom)."""
     walk = apart["walk"]
     names = list(walk["start"])
     n_rows = len(walk["steps"]) + 2
@@ -466,7 +464,7 @@ def _draw_shift_panel(axes: Any, apart: Mapping[str, Any], name: str, *, has_nam
         axes.text(max(places[row - 1 : row + 1]) + 0.03 * span, row, text, va="center", fontsize=9, color="#222222")
     axes.plot([places[-1]] * 2, [len(places) - 0.7, len(places)], color="#999999", linewidth=0.7)
     for row, value in ((0, start), (len(places), end)):
-        axes.plot(value, row, "D", color=ENDS, markersize=7)  # no bar, for the axis does not begin at 0
+        axes.plot(value, row, "D", color=ENDS, markersize=7)  # not a bar, because the axis does not start at 0
         axes.text(value + 0.03 * span, row, f"{value:.1f}", va="center", fontsize=9, fontweight="bold", color="#222222")
     axes.set_xlim(low - 0.1 * span, high + 0.3 * span)
     axes.set_ylim(len(places) + 0.6, -0.6)

@@ -1,4 +1,4 @@
-"""What a picture of a scene shows: some frames, where the cameras are, what they see in colour, and the truth."""
+"""The picture of a scene: some frames, the trajectory, the observed points in colour, and the ground truth."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from su3d_bench.core.types import (
 from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.maps import thinned_rows, truth_owner
 
-CAMERAS = 48  # enough for the shape of a walk
+CAMERAS = 48  # enough for the shape of a trajectory
 SHOWN_FRAMES = 6
-SEEN_POINTS = 250_000  # of all frames together: one each 2 cm on the surfaces of a room
-PERCENTILES = (1, 99)  # of a frame's depth: a stray pixel is no range
+SEEN_POINTS = 250_000  # over all frames: one per 2 cm on the surfaces of a room
+PERCENTILES = (1, 99)  # of a frame's depth, against outlier pixels
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class SceneView:
-    """A scene as a picture needs it.
+    """The data for the picture of a scene.
 
-    ``poses`` (n, 4, 4) camera-to-world of the cameras that were read, of ``n_frames`` in the scene; ``seen`` (m, 3) m
-    in the world, z up, and ``seen_rgb`` (m, 3) what they see; ``shown`` are some of the frames; ``depth_m`` the least
-    and the greatest depth; ``truth`` or the reason why there is none; ``up`` where the dataset's files may have any
-    world: where it is only guessed, the world of the picture is turned and that of the frames is not.
+    ``poses`` (n, 4, 4): camera-to-world of the frames read, of ``n_frames`` in the scene; ``seen`` (m, 3): observed
+    points in metres in the world frame, z up, and ``seen_rgb`` (m, 3) their colours; ``shown``: some of the frames;
+    ``depth_m``: minimum and maximum depth; ``truth``, or the reason why it is missing; ``up``: for datasets without a
+    fixed up axis; if it is only estimated, the world of the picture is rotated and that of the frames is not.
     """
 
     scene: str
@@ -56,7 +56,7 @@ class SceneView:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Points, objects and classes of the truth; nothing where there is none."""
+        """Points, objects and classes of the ground truth; empty without ground truth."""
         if self.truth is None:
             return {}
         n_objects, n_classes = (len(np.unique(ids[ids > 0])) for ids in (self.truth.instance, self.truth.semantic))
@@ -66,9 +66,9 @@ class SceneView:
 def look_at(
     dataset: Dataset, scene: str, stride: int | None = None, progress: Progress = lambda n_done, n: None
 ) -> SceneView:
-    """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its fullest truth.
+    """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its ground truth.
 
-    A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault, nor are frames.
+    A ``DataError`` for corrupted frames or ground truth, or if both are missing; one of them may be missing.
     """
     frames: Sequence[Frame] = ()
     n_frames = 0
@@ -107,12 +107,12 @@ def look_at(
 
 
 def evenly(n: int, most: int) -> Sequence[int]:
-    """At most ``most`` of the numbers below ``n``, as far from one another as can be."""
+    """Return at most ``most`` evenly spaced numbers below ``n``."""
     return sorted({int(place) for place in np.linspace(0, n - 1, min(n, most))})
 
 
 def spread(n: int, most: int) -> list[int]:
-    """The places of ``evenly``, so ordered that the first few lie far apart as well.
+    """Return the numbers of ``evenly``, ordered so that the first few are far apart as well.
 
     >>> spread(9, 9)
     [0, 8, 4, 2, 6, 1, 3, 5, 7]
@@ -125,7 +125,7 @@ def spread(n: int, most: int) -> list[int]:
 
 
 def chosen_pixels(frame: Frame, n_frames: int, n_points: int = SEEN_POINTS) -> BoolArray:
-    """Pixels (H, W) with a depth, spread over the image: about one frame's share of ``n_points``."""
+    """Return a mask (H, W) of pixels with depth, spread over the image: about ``n_points / n_frames`` of them."""
     most = max(1, n_points // n_frames)
     is_valid = valid_depth(frame.depth_m, 0.0, np.inf)
     step = int(np.ceil(np.sqrt(max(1.0, is_valid.sum() / most))))
@@ -135,7 +135,7 @@ def chosen_pixels(frame: Frame, n_frames: int, n_points: int = SEEN_POINTS) -> B
 
 
 def seen_points(frames: Sequence[Frame], n_points: int) -> tuple[Float32Array, UInt8Array]:
-    """Points (n, 3) m in the world and their colours (n, 3): about ``n_points`` of what all ``frames`` see."""
+    """Return about ``n_points`` observed world points (n, 3), in metres, of all ``frames``, and colours (n, 3)."""
     points, colours = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for frame in frames:
         pixels = chosen_pixels(frame, len(frames), n_points)
@@ -160,27 +160,27 @@ def _truth(dataset: Dataset, scene: str) -> tuple[GroundTruth | None, str]:
 WIDTH = 1920
 MARGIN, HEADER, CAPTION = 16, 76, 26
 PANEL_WIDTH, PANEL_HEIGHT = (WIDTH - 4 * MARGIN) // 3, 520
-LEGEND_COLUMNS, LEGEND_STEP = 6, 21  # of classes, below the panels
+LEGEND_COLUMNS, LEGEND_STEP = 6, 21  # class legend below the panels
 LEGEND_WIDTH = (WIDTH - 2 * MARGIN) // LEGEND_COLUMNS
-MAX_CLASSES = 600  # in the legend, thrice those of the largest label space
+MAX_CLASSES = 600  # in the legend; three times the largest label space
 REASON_LINES = 6
 FRAME_COLUMNS, SCALE_WIDTH = 6, 74
 FRAME_WIDTH = (WIDTH - 2 * MARGIN - SCALE_WIDTH) // FRAME_COLUMNS
-SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw this near to it
+SEEN_WITHIN_M = 0.12  # a ground-truth point takes the colour of an observed point within this distance
 MIN_DRAWN_M = 0.012
 UNSEEN = (214, 214, 210)
 SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-WALK_TITLE, NO_WALK_TITLE = "walk, over the ground truth in the frames' colours", "ground truth, without frames"
+WALK_TITLE, NO_WALK_TITLE = "trajectory over the ground truth in frame colours", "ground truth, without frames"
 WALK, START, END = "#d6246e", "#1a9850", "#111111"
-# Walks outside the truth are drawn where they are, up to this far; farther ones would leave no room for the scene.
+# Trajectories may extend this far beyond the ground truth; longer ones would leave no space for the scene.
 MAX_BEYOND_M = 10.0
 
 
-Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, and the camera of a view from above
+Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, camera of a top view
 
 
 def draw_scene_picture(look: SceneView, path: Path) -> None:
-    """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
+    """Write the picture of ``look`` as a PNG, ``WIDTH`` pixels wide."""
     frame_height = 0
     if look.shown:
         rows, columns = look.shown[0].rgb.shape[:2]
@@ -212,7 +212,7 @@ def draw_scene_picture(look: SceneView, path: Path) -> None:
 
 
 def facts_line(look: SceneView) -> str:
-    """The counts of the scene in one line."""
+    """Return the facts about the scene in one line."""
     words = ["no frames"]
     if look.shown:
         height, width = look.shown[0].rgb.shape[:2]
@@ -223,11 +223,11 @@ def facts_line(look: SceneView) -> str:
     if look.truth is not None:
         counts = look.counts
         words.append(f"{counted(counts['n_objects'], 'object')} of {counted(counts['n_classes'], 'class')}")
-        words.append(f"{counts['n_points']:,} points of ground truth ({printable(look.truth.variant, 40)})")
+        words.append(f"{counts['n_points']:,} ground-truth points ({printable(look.truth.variant, 40)})")
     else:
         words.append("no ground truth")
     if look.up is not None and look.up.axis is not None:
-        words.append(f"{look.up.axis} is up" + ("" if look.up.is_turned else " by guess"))
+        words.append(f"{look.up.axis} is up" + ("" if look.up.is_turned else " (estimated)"))
     return " \u00b7 ".join(words)
 
 
@@ -240,7 +240,7 @@ def _panels(look: SceneView) -> tuple[Panel, ...]:
         size_m = _drawn_size(points)
         pictures = [canvas.colour(canvas.render(points, size_m, camera), colours) for camera in cameras]
         return (
-            (f"walk, over what {len(look.poses)} frames see, from above", pictures[0], cameras[0]),
+            (f"trajectory over the points of {len(look.poses)} frames, from above", pictures[0], cameras[0]),
             ("the same points, from one corner", pictures[1], None),
             ("from the other corner", pictures[2], None),
         )
@@ -256,7 +256,7 @@ def _panels(look: SceneView) -> tuple[Panel, ...]:
 
 
 def _camera_above(look: SceneView, points: Float32Array) -> canvas.Camera:
-    """The view from above that holds the points and the walk, as far as it stays near."""
+    """Return the top view of the points and the trajectory, limited to ``MAX_BEYOND_M`` around the points."""
     bounds = canvas.room_bounds(points)
     if not len(look.poses):
         return canvas.view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
@@ -267,7 +267,7 @@ def _camera_above(look: SceneView, points: Float32Array) -> canvas.Camera:
 
 
 def _drawn_size(points: Float32Array) -> float:
-    """The width at which neighbours touch, for clouds as sparse as they may be."""
+    """Return the point width at which neighbours touch, also in sparse clouds."""
     from scipy.spatial import KDTree
 
     if len(points) < 2:
@@ -277,7 +277,7 @@ def _drawn_size(points: Float32Array) -> float:
 
 
 def _seen_colours(look: SceneView, points: Float32Array) -> UInt8Array:
-    """Of each point the colour that a camera saw at its place; pale where none did."""
+    """Return the observed colour at each point; pale if none was observed there."""
     from scipy.spatial import KDTree
 
     palette = np.concatenate([look.seen_rgb, np.array([UNSEEN], np.uint8)])
@@ -289,7 +289,7 @@ def _seen_colours(look: SceneView, points: Float32Array) -> UInt8Array:
 
 
 def _class_palette(truth: GroundTruth) -> UInt8Array:
-    """Colour of each point by its class."""
+    """Return the colour of each point by class."""
     palette = canvas.class_colours([name for name, _, _ in _classes(truth)])
     names = truth.labels.names
     colours = np.array([*(palette.get(name, canvas.NO_INSTANCE) for name in names), canvas.NO_INSTANCE], np.uint8)
@@ -297,7 +297,7 @@ def _class_palette(truth: GroundTruth) -> UInt8Array:
 
 
 def _instance_palette(truth: GroundTruth) -> UInt8Array:
-    """Colour of each point by its instance, the largest ones most distinct; surfaces of the room pale."""
+    """Return the colour of each point by instance, the largest ones most distinct; room surfaces are pale."""
     ids, first, inverse, n_points = np.unique(
         truth.instance, return_index=True, return_inverse=True, return_counts=True
     )
@@ -310,7 +310,7 @@ def _instance_palette(truth: GroundTruth) -> UInt8Array:
 
 
 def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
-    """(name, objects, points) of each class that is there, the largest first."""
+    """Return (name, objects, points) of each class with points, largest first."""
     owner = truth_owner(truth)
     n_points = np.bincount(owner[owner >= 0], minlength=len(truth.labels.names))
     pairs: Int32Array = np.unique(np.stack([owner, truth.instance])[:, truth.instance != 0], axis=1)[0]
@@ -324,7 +324,7 @@ def _legend_rows(n_classes: int) -> int:
 
 
 def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
-    """Every class with its numbers of objects and points, column after column, the largest first."""
+    """Draw every class with its numbers of objects and points, column by column, largest first."""
     classes = _classes(truth)
     n_rows = _legend_rows(len(classes))
     palette: dict[str, canvas.Colour] = canvas.class_colours([name for name, _, _ in classes])
@@ -344,7 +344,7 @@ def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
 
 
 def _draw_walk(axes: Any, camera: canvas.Camera, poses: Float64Array) -> None:
-    """The way of the cameras, short strokes where they look, start and end."""
+    """Draw the trajectory with viewing directions, start and end."""
     x, y = canvas.project(camera, poses[:, :3, 3]).T
     ahead_x, ahead_y = canvas.project(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2]).T
     axes.plot(x, y, color="white", linewidth=4.0, solid_capstyle="round")
@@ -368,7 +368,7 @@ def _draw_walk(axes: Any, camera: canvas.Camera, poses: Float64Array) -> None:
 
 
 def _draw_scale(axes: Any, camera: canvas.Camera) -> None:
-    """A bar of a round length in the lower left corner."""
+    """Draw a scale bar of a round length in the lower left corner."""
     pixels_a_metre = camera.focal / canvas.OVERSAMPLING
     length_m = max((length for length in SCALE_LENGTHS_M if length * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
     left, row = 14, PANEL_HEIGHT - 12
@@ -380,7 +380,7 @@ def _draw_scale(axes: Any, camera: canvas.Camera) -> None:
 
 
 def _draw_frames(page: canvas.Canvas, look: SceneView, top: int, height: int) -> None:
-    """Colour above depth, the scale of depth at the right."""
+    """Draw colour above depth images, with the depth scale on the right."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -404,7 +404,7 @@ def _draw_frames(page: canvas.Canvas, look: SceneView, top: int, height: int) ->
 
 
 def _thousands(n: int) -> str:
-    """A count in at most six characters."""
+    """Format a count in at most six characters."""
     return f"{n:,}" if n < 10_000 else f"{n / 1e3:.0f} k" if n < 1_000_000 else f"{n / 1e6:.1f} M"
 
 

@@ -1,5 +1,5 @@
-// The pages of a registry: all rankings with filters, one method, one scene. DATA is what
-// su3d_bench/reproducing/registry_site.py gathers.
+// The pages of a registry: all rankings with filters, one method, one scene. DATA is collected by
+// su3d_bench/reproducing/registry_site.py.
 
 const DATA = JSON.parse(byId('data').textContent);
 const ROOT = DATA.kind === 'index' ? '' : '../';
@@ -20,7 +20,7 @@ const seconds = (value) => (isNumber(value) ? `${Number(value.toPrecision(2))} s
 const megabytes = (bytes) => `${(bytes / 1e6).toLocaleString('en-US', { maximumFractionDigits: 1 })} MB`;
 const datasetsOf = (board) => board.datasets.join(', ');
 const scenesText = (board) => `${plural(board.scenes.length, 'scene')} of ${datasetsOf(board)}`;
-// Without the numbers by which processors of one name are told apart; a method's page has them.
+// Without the CPU family and model numbers, which are on the method's page.
 const shortHardware = (row) => row.hardware.replace(/ \(cpu family[^)]*\)/, '');
 const ranksText = (row) => (!row.ranks ? '–'
   : row.ranks[0] === row.ranks[1] ? String(row.ranks[0]) : `${row.ranks[0]} to ${row.ranks[1]}`);
@@ -36,7 +36,7 @@ function valueCell(metric, value, interval) {
     isCount(metric) ? null : whisker(value, interval)];
 }
 
-// The highest of what competes, where not all are equal.
+// The best value among the ranked rows, or null if all are equal.
 function bestOf(rows, value) {
   const numbers = rows.filter((row) => !row.is_ceiling).map(value).filter(isNumber), most = Math.max(...numbers);
   return numbers.some((one) => one < most) ? most : null;
@@ -53,7 +53,7 @@ function headlineColumns(board, valueOf, withIntervals) {
   });
 }
 
-// As dataTable, whose columns of words may be wide and break.
+// A dataTable whose text columns may wrap.
 function table(caption, columns, rows) {
   const made = dataTable({ caption, columns, rows });
   const mark = () => made.querySelectorAll('tbody tr').forEach((line) => columns.forEach((column, k) => {
@@ -66,17 +66,17 @@ function table(caption, columns, rows) {
 
 function boardTable(board, rows) {
   const metrics = headlineColumns(board, (row, k) => row.values[k], true);
-  return table(`${scenesText(board)}; per cent with the 95 % interval over scenes, the best bold`, [
+  return table(`${scenesText(board)}; per cent with the 95 % confidence interval over scenes, best in bold`, [
     { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
     { label: 'Rank', title: 'Simultaneous 95 % rank interval', num: true,
       value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null), show: ranksText },
     ...metrics,
-    { label: 'Frame', title: 'Median seconds a frame that was looked at; in brackets without perception', num: true,
+    { label: 'Time per frame', title: 'Median time per processed frame; in brackets without perception', num: true,
       value: (row) => row.update_s,
       show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
     words('Hardware', (row) => shortHardware(row)),
     words('Weights trained on', (row) => row.trained_on),
-    { label: 'Profile', value: (row) => row.profile },
+    { label: 'Perception profile', value: (row) => row.profile },
     words('Command and bundle', (row) => row.bundle.file, { show: (row) => h('details', null,
       h('summary', { 'aria-label': `${row.bundle.file}: command and SHA-256 of ${row.method}` }, row.bundle.file),
       h('code', null, row.command), bundleText(row)) }),
@@ -85,7 +85,7 @@ function boardTable(board, rows) {
 
 function boardIntro(board) {
   const pages = new Map((DATA.scenes || []).map((one) => [one.name, one.page]));
-  return [intro(`Version ${board.version}: ${board.summary}. Rules `, hash(board.digest.slice(0, 16)), '.'),
+  return [intro(`Version ${board.version}: ${board.summary}. Protocol digest `, hash(board.digest.slice(0, 16)), '.'),
     pages.size ? h('details', null, h('summary', null, plural(board.scenes.length, 'scene')),
       links(board.scenes.map((scene) => link(pages.get(scene), scene)))) : null];
 }
@@ -98,7 +98,7 @@ const facts = (pairs) => h('dl', null, pairs.filter(([, value]) => value).flatMa
 
 const FILTERS = [
   ['Protocol', (row, board) => board.protocol], ['Dataset', (row, board) => datasetsOf(board)],
-  ['Profile', (row) => row.profile], ['Hardware', shortHardware],
+  ['Perception profile', (row) => row.profile], ['Hardware', shortHardware],
 ];
 
 function indexPage() {
@@ -107,7 +107,7 @@ function indexPage() {
   main.append(h('ul', { class: 'facts' }, fact(all.length, 'row'), fact(DATA.methods.length, 'method'),
     fact(new Set(DATA.boards.map((board) => board.protocol)).size, 'protocol'), fact(DATA.scenes.length, 'scene'),
     fact(DATA.n_bundles, 'bundle')));
-  if (!all.length) { main.append(h('p', { class: 'note' }, 'No row stands in this registry.')); leftOut(); return; }
+  if (!all.length) { main.append(h('p', { class: 'note' }, 'This registry has no entries.')); leftOut(); return; }
   const state = FILTERS.map(() => '');
   let text = '';
   const fields = FILTERS.map(([name, of], k) => {
@@ -151,9 +151,9 @@ function indexPage() {
 
 function leftOut() {
   if (!DATA.left_out.length) return;
-  section('left-out', 'Left out', intro('What lies in the registry and stands in no ranking.'),
+  section('left-out', 'Excluded', intro('Results in the registry that are in no ranking.'),
     notes(DATA.left_out.map((one) => `${one.run}, ${one.what}: ${one.reason}`)));
-  toSection('left-out', 'Left out');
+  toSection('left-out', 'Excluded');
 }
 
 // --- one method
@@ -169,17 +169,17 @@ function methodPage() {
       intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
       h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),
       facts([
-        ['Seconds a frame', isNumber(row.update_s)
-          ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception: the median of ${plural(row.n_updates, 'frame')}`
-            + ' but the first of each scene' : 'not measured'],
-        ['Hardware', row.hardware], ['Profile', row.profile], ['Encoder', row.encoder],
+        ['Time per frame', isNumber(row.update_s)
+          ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception (median of ${plural(row.n_updates, 'frame')}, `
+            + 'excluding the first of each scene)' : 'not measured'],
+        ['Hardware', row.hardware], ['Perception profile', row.profile], ['Encoder', row.encoder],
         ['Weights trained on', row.trained_on], ['Settings', row.changed.join(', ')],
         ['Command', h('code', null, row.command)], ['Bundle', bundleText(row)],
-        ['Made by', `${row.bundle.program}, code ${row.code}${row.commit ? `, commit ${row.commit}` : ''}`
+        ['Created by', `${row.bundle.program}, code ${row.code}${row.commit ? `, commit ${row.commit}` : ''}`
           + `${row.bundle.recipe ? `, recipe ${row.bundle.recipe}` : ''}, run ${row.run}`],
-        ['Rules', hash(board.digest)],
+        ['Protocol digest', hash(board.digest)],
       ]),
-      row.weights.some((one) => Object.keys(one.files).length) ? h('details', null, h('summary', null, 'Files of weights'),
+      row.weights.some((one) => Object.keys(one.files).length) ? h('details', null, h('summary', null, 'Weight files'),
         facts(row.weights.flatMap((one) => Object.entries(one.files).map(([file, sha]) => [`${one.model} ${file}`, hash(sha)]))))
         : null,
       scenesTable(board, row));
@@ -199,17 +199,17 @@ function scenesTable(board, row) {
 // --- one scene
 
 function scenePage() {
-  main.append(intro('Each method on this scene only. Rankings use all scenes. Data ',
+  main.append(intro('Results on this scene only; rankings use all scenes. Data digest ',
     hash(DATA.digest), '.'));
   DATA.boards.forEach((board, k) => {
     const id = `board-${k}`, valueOf = (row, j) => row.of_scenes[DATA.name][j];
     section(id, board.protocol, intro(`Version ${board.version}: ${board.summary}. Ranked over ${scenesText(board)}.`),
-      table('This scene, in per cent; the best is bold', [
+      table('This scene, in per cent; best in bold', [
         { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
         ...headlineColumns(board, valueOf, false),
         { label: 'Rank over all scenes', num: true, value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null),
           show: ranksText },
-        { label: 'Profile', value: (row) => row.profile },
+        { label: 'Perception profile', value: (row) => row.profile },
         words('Bundle', (row) => row.bundle.file),
       ], board.rows));
     toSection(id, board.protocol);

@@ -170,7 +170,7 @@
       enlarge(false);
       byId("picture").scrollTo(0, 0);
     }
-    image.alt = `picture of ${item.id}`;
+    image.alt = `Picture of ${item.id}`;
     byId("text").textContent = item.text;
     byId("asks").replaceChildren(...item.asks.map((name) => fieldOf(item, name, currentAsk(item))));
     byId("back").disabled = at === 0;
@@ -195,7 +195,7 @@
     if (event.key === "Enter" || event.key === " ") enlarge(!isLarge());
     else if (event.key === "Escape" && isLarge()) enlarge(false);
     else if (!(event.key.startsWith("Arrow") && isLarge())) return;
-    event.stopPropagation(); // the arrows scroll a large picture
+    event.stopPropagation(); // the arrow keys scroll an enlarged picture
     if (!event.key.startsWith("Arrow")) event.preventDefault();
   });
   document.addEventListener("keydown", (event) => {

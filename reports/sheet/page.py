@@ -1,7 +1,7 @@
 """Pages for human evaluation: self-contained annotation sheets and lists of items to review.
 
-What scenes, queries and maps say reaches a sheet as data and is written with ``textContent``; a policy in each page
-lets nothing run or load that is not in it, or in lists beside it.
+Texts of scenes, queries and maps reach a sheet as data and are shown with ``textContent``; the content security policy
+of each page forbids external scripts and resources (except, for lists, the pictures next to them).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from su3d_bench.core.system.files import file_text
 from su3d_bench.reports.page.page import embedded_json, rendered
 
 HERE = Path(__file__).parent
-MAX_CHARACTERS = 2000  # of a text in a list
+MAX_CHARACTERS = 2000  # per text in a list
 
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
@@ -29,7 +29,7 @@ def page_html(title: str, data: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Entry:
-    """Something to look at: ``head`` says which it is, ``lines`` what is said of it; ``pictures`` are file names."""
+    """An item to review: ``head`` identifies it, ``lines`` are the details, ``pictures`` the file names."""
 
     head: str
     text: str
@@ -38,7 +38,7 @@ class Entry:
 
 
 def list_page(title: str, note: str, entries: Sequence[Entry], pictures: str) -> str:
-    """A page without scripts, every text escaped; ``pictures`` is the folder of the pictures, as the page sees it."""
+    """Return a page without scripts, all text escaped; ``pictures``: the picture folder relative to the page."""
     from jinja2 import Environment
 
     environment = Environment(autoescape=True)
@@ -50,7 +50,7 @@ def list_page(title: str, note: str, entries: Sequence[Entry], pictures: str) ->
 
 
 def is_file_name(name: str) -> bool:
-    """Whether ``name`` is of a file in the folder itself.
+    """Whether ``name`` is a plain file name without a path.
 
     >>> is_file_name("item-1.png"), is_file_name("../item-1.png"), is_file_name("..")
     (True, False, False)

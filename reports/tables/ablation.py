@@ -1,4 +1,4 @@
-"""Table I of OpenSU3D's paper: a sweep over single parameters, each value held against the method's own."""
+"""Table I of OpenSU3D's paper: a sweep over single parameters, each value compared with the default."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ METRICS = tuple(name for side in SIDES for name in side.metrics)
 
 @dataclass(frozen=True)
 class SweepRow:
-    """A value of a parameter as it was asked for, and the method of the run that has it.
+    """A requested value of a parameter, and the method of the run with that value.
 
-    ``is_default`` where the method has it anyway.
+    ``is_default``: whether it is the method's default.
     """
 
     parameter: str
@@ -34,9 +34,9 @@ class SweepRow:
 def ablation_table(
     measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: paper.Shown, *, with_published: bool
 ) -> Table:
-    """A row for each of ``sweep``, with its difference from the method's own row beside each number.
+    """Return a row for each of ``sweep``; each number is followed by its difference from the default row.
 
-    Raises ``ConfigError`` where ``measured`` lacks one of its methods, or a protocol of either kind.
+    Raises ``ConfigError`` if ``measured`` lacks one of its methods, or a protocol of either kind.
     """
     parameters = dict.fromkeys(row.parameter for row in sweep)
     sweep = [row for parameter in parameters for row in sweep if row.parameter == parameter]
@@ -44,8 +44,7 @@ def ablation_table(
     for side, members in zip(SIDES, sides, strict=True):
         if missing := [entry.method for entry in sweep if entry.method not in members]:
             raise ConfigError(
-                f"Table I: no scores of {missing[0]} for {', '.join(side.metrics)}; run the sweep again, it goes on "
-                "where it stopped"
+                f"Table I: no scores of {missing[0]} for {', '.join(side.metrics)}; run the sweep again to resume it"
             )
     looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
     halves = [_half(sweep, members, look) for members, look in zip(sides, looks, strict=True)]
@@ -71,22 +70,22 @@ def ablation_table(
 
 
 def _of_protocol(measured: Sequence[Measured], side: paper.Layout) -> dict[str, Measured]:
-    """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
+    """Method -> its numbers under the protocol of that side, otherwise under the first protocol with the metrics."""
     fitting = [row for row in measured if all(name in row.metrics for name in side.metrics)]
     if not fitting:
-        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the sweep under {side.protocol} too")
+        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; also score the sweep under {side.protocol}")
     names = [row.protocol for row in fitting]
     chosen = side.protocol if side.protocol in names else names[0]
     members: dict[str, Measured] = {}
     for row in fitting:
         if row.protocol == chosen and members.setdefault(row.method, row) is not row:
-            raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; name one of them")
+            raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; give only one")
     return members
 
 
 @dataclass(frozen=True)
 class _Half:
-    """The cells of one side of Table I, a row for each of the sweep, and what must be said of them."""
+    """The cells of one side of Table I, one row per value of the sweep, and the notes on them."""
 
     cells: list[list[Cell]]
     notes: tuple[str, ...]
@@ -95,12 +94,12 @@ class _Half:
 def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: paper.Shown) -> _Half:
     own_name = next((row.method for row in sweep if row.is_default), None)
     if own_name is None:
-        note = "No row has the method's own values, so that none is compared or marked."
+        note = "No row has the method's default values, so that no row is compared or marked."
         return _Half([paper.cells_of(members[row.method], shown, set()) for row in sweep], (note,))
     own = members[own_name]
     others = [members[name] for name in dict.fromkeys(row.method for row in sweep) if name != own_name]
     if any((row.scenes, row.limit) != (own.scenes, own.limit) for row in others):
-        note = "The rows are of different scenes or frames, so that none is compared or marked."
+        note = "The rows have different scenes or frames, so that no row is compared or marked."
         return _Half([paper.cells_of(members[row.method], shown, set()) for row in sweep], (note,))
     compared = {name: _compared(own, others, name) for name in shown.metrics}
     cells = []
@@ -112,19 +111,19 @@ def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: pap
         cells.append([_beside(cell, compared, name, row) for cell, name in own_cells])
     smallest = min((one.smallest_p for of_metric in compared.values() for one in of_metric.values()), default=1.0)
     difference = (
-        f"In parentheses: the mean difference to {own_name} over scenes, in points, and its p (two-sided sign-flip "
-        f"test, Holm's correction over the {counted(len(others), 'other row')} of the sweep, each metric by itself)"
+        f"In parentheses: mean difference to {own_name} over scenes, in percentage points, and p (two-sided sign-flip "
+        f"test, Holm's correction over the {counted(len(others), 'other row')} of the sweep, per metric)"
     )
     if smallest >= paper.LEVEL:
         return _Half(cells, (f"{difference}.", paper.nothing_can_be_marked("scenes", smallest)))
-    bold = f"Bold: the highest of its parameter where p < {paper.LEVEL}"
-    bold += f"; of {own_name} where all others of the parameter differ"
+    bold = f"Bold: the highest value of its parameter if p < {paper.LEVEL}"
+    bold += f"; for {own_name} if all others of the parameter differ"
     return _Half(cells, (f"{difference}. {bold}.",))
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """From the method's own row: the mean over scenes, and ``p`` and the least possible one after Holm's correction."""
+    """Difference from the default row: mean over scenes; ``p`` and the smallest possible p after Holm's correction."""
 
     mean: float
     p: float
@@ -132,7 +131,7 @@ class _Difference:
 
 
 def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[str, _Difference]:
-    """Method -> its difference from ``own``, of the others that have a scene in common with it."""
+    """Method -> its difference from ``own``, for the methods that share a scene with it."""
     changes = {row.method: paper.of_scenes(row, metric) - paper.of_scenes(own, metric) for row in others}
     tests = {method: test for method, change in changes.items() if (test := sign_flip_test(change)) is not None}
     adjusted = [p for p in holm([test.p for test in tests.values()]) if p is not None]
@@ -145,7 +144,7 @@ def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[st
 def _is_best(
     row: Measured, own: Measured, group: Sequence[Measured], metric: str, compared: Mapping[str, _Difference]
 ) -> bool:
-    """Whether a row has the highest value of its parameter and stands out, in the mean over scenes too."""
+    """Whether a row is significantly the highest of its parameter, also in the mean over scenes."""
     values = [member.metrics.get(metric) for member in group]
     known = [value for value in values if value is not None]
     if len(known) < 2 or row.metrics.get(metric) != max(known):
@@ -159,7 +158,7 @@ def _is_best(
 
 
 def _beside(cell: Cell, compared: Mapping[str, Mapping[str, _Difference]], metric: str, row: Measured) -> Cell:
-    """``cell`` with its difference from the method's own row."""
+    """Return ``cell`` with its difference from the default row."""
     difference = compared[metric].get(row.method)
     if difference is None:
         return cell

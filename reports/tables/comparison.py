@@ -1,4 +1,4 @@
-"""Tables of comparisons of runs, of plans for more scenes, and of comparisons of protocols, from their JSON forms."""
+"""Tables of run comparisons, power analyses and protocol comparisons, from their JSON forms."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, brackete
 from su3d_bench.metrics.protocols.mixtures import CONSTANT_RULES
 from su3d_bench.reports.tables.model import few_scenes
 
-HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
-SEEDS = "SD of seeds, A / B"
+HEADER = ["p", "adjusted p", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
+SEEDS = "SD over seeds, A / B"
 
 
 def comparison_tables(comparison: Mapping[str, Any]) -> list[Table | Prose]:
-    """One table a protocol and pair of methods, and one of its classes; numbers are percentages."""
+    """Return one table per protocol and pair of methods, and one of its classes; numbers are percentages."""
     parts: list[Table | Prose] = [Prose((f"A: {comparison['left']}", f"B: {comparison['right']}"))]
     for compared in comparison["protocols"]:
         parts += _protocol_parts(compared, comparison["seeds"])
@@ -46,9 +46,9 @@ def _protocol_parts(compared: Mapping[str, Any], seeds: Sequence[Sequence[int]])
 def _of_seeds(seeds: Sequence[Sequence[int]]) -> str:
     told = [f"{side} over {counted(len(of_side), 'seed')}" for side, of_side in zip("AB", seeds, strict=True)]
     return (
-        f"each scene's value is the mean of {' and of '.join(told)}; {SEEDS}: the standard deviation of one run's "
-        "value, in points, from the seed alone. Test and interval are over scenes, and do not allow for what a seed "
-        "moves in all scenes alike; su3d-bench report power does"
+        f"each scene's value is the mean of {' and of '.join(told)}; {SEEDS}: standard deviation of a run's value due "
+        "to the seed, in percentage points. Test and interval are over scenes and ignore seed effects common to "
+        "all scenes; su3d-bench report power includes them"
     )
 
 
@@ -77,45 +77,44 @@ def _notes(compared: Mapping[str, Any]) -> Sequence[str]:
     tests = [value for value in compared["metrics"].values() if value["p"] is not None]
     notes = []
     if len(compared["scenes"]) < 2:
-        notes.append("a single scene says nothing of other scenes: no interval, and p is 1 whatever the difference")
+        notes.append("a single scene says nothing about other scenes: no interval, and p is always 1")
     elif tests:
-        how = "all patterns of signs" if all(value["is_exact"] for value in tests) else "100000 drawn patterns of signs"
+        how = "all sign patterns" if all(value["is_exact"] for value in tests) else "100000 random sign patterns"
         notes.append(
-            f"p: two-sided sign-flip test of the mean over scenes, {how}; p of all: corrected by Holm for all metrics "
-            "that are compared here, or all classes; [..]: 95 % t interval from the differences without each scene"
+            f"p: two-sided sign-flip test of the mean over scenes, {how}; adjusted p: Holm's correction over all "
+            "metrics compared here, or all classes; [..]: 95 % confidence interval (jackknife t over scenes)"
         )
         notes += [line for line in (few_scenes(len(compared["scenes"])),) if line]
         notes += [f"{name}: {d['disagreement']}" for name, d in compared["metrics"].items() if d["disagreement"]]
     if compared["classes"]:
         values = [(name, v) for name, columns in compared["classes"].items() for v in columns.values()]
         n_equal = sum(not any(v["per_scene"].values()) for _, v in values)
-        notes.append(f"{n_equal} values of classes that no scene changes are left out")
+        notes.append(f"{n_equal} values of classes without a difference in any scene are omitted")
         odd = dict.fromkeys(name for name, v in values if v["disagreement"])
         if odd:
-            notes.append(f"interval and test disagree, and the test decides, for {', '.join(odd)}")
+            notes.append(f"interval and test disagree (the test decides) for {', '.join(odd)}")
     return notes
 
 
 def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
-    """One table a protocol, a row a metric and number of seeds; numbers are percentage points, or scenes."""
+    """Return one table per protocol, one row per metric and number of seeds; in percentage points, or scenes."""
     n_seeds = len(plan["seeds"])
     seeds = "seed " + ", ".join(map(str, plan["seeds"]))
     title = f"{plan['left']} (A), {plan['right']} (B): {counted(len(plan['scenes']), 'scene')}, {seeds}"
     tables = [_protocol_table(name, metrics, title) for name, metrics in plan["protocols"].items()]
     notes = [
-        f"scenes that find a true difference of so many points with a power of {100 * plan['power']:g} %, by a "
-        "two-sided paired test at 5 %; at least 6, of which a sign-flip test can have a p below 0.05",
-        f"[..] behind it: at the ends of the 95 % interval of the variance, which {len(plan['scenes'])} scenes leave "
-        f"wide; {NOT_MEASURED}: no number of scenes up to 100,000, under so many seeds",
-        "SD: standard deviation of the difference B - A over scenes, over seeds, and of what is left; in percentage "
-        "points",
+        f"columns of points: scenes needed to detect a true difference of that size with a power of "
+        f"{100 * plan['power']:g} %, two-sided paired test at 5 %; at least 6, for a sign-flip p below 0.05",
+        f"[..] after it: at the bounds of the 95 % confidence interval of the variance, which is wide for "
+        f"{len(plan['scenes'])} scenes; {NOT_MEASURED}: more than 100,000 scenes with that number of seeds",
+        "SD: standard deviation of B - A over scenes, over seeds, and the residual; in percentage points",
     ]
     if any(one["variance"] is None for metrics in plan["protocols"].values() for one in metrics.values()):
-        notes.append("no SD: the difference is the same in every scene and run, or rests on a single scene")
+        notes.append("no SD: the difference is the same in every scene and run, or there is only one scene")
     if n_seeds < 2:
-        notes.append("one seed: how much seeds move the difference is not known; name runs of other seeds too")
+        notes.append("one seed: the effect of seeds on the difference is unknown; add runs with other seeds")
     if n_seeds == 2:
-        notes.append("two seeds: no interval, for of so few it would hold the truth too seldom; name a run of a third")
+        notes.append("two seeds: no interval, because its coverage would be too low; add a run with a third seed")
     notes += plan["remarks"]
     notes += [line for line in (few_scenes(len(plan["scenes"])),) if line]
     return [*tables, Prose(tuple(notes), is_list=True)]
@@ -123,7 +122,7 @@ def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
 
 def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Table:
     asked = list(dict.fromkeys(need["points"] for plan in metrics.values() for need in plan["needs"]))
-    header = ["metric", "B - A", "SD of scenes", "of seeds", "of what is left", "seeds"]
+    header = ["metric", "B - A", "SD over scenes", "SD over seeds", "residual SD", "seeds"]
     rows = [[*header, *(f"{points:g} {'point' if points == 1 else 'points'}" for points in asked)]]
     for name, plan in metrics.items():
         variance = plan["variance"]
@@ -148,15 +147,15 @@ def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Ta
 
 
 MAX_RULE_CHARACTERS = 60  # characters
-SUM = "points that a rule adds, the mean over all orders in which rules can be changed; they sum to the difference"
-DRAWN = "points that a rule adds, the mean over {n} orders that were drawn, ± its standard error; the sum is exact"
+SUM = "contribution of a rule in percentage points (Shapley value: mean over all orders); the sum is the difference"
+DRAWN = "contribution of a rule in percentage points (Shapley value: {n} random orders, ± standard error); exact sum"
 
 
 def rules_tables(apart: Mapping[str, Any]) -> list[Table | Prose]:
-    """The rules that differ, and beneath them the way from one number to the other where a prediction was given."""
+    """Return the rules that differ and, if a prediction was given, the contribution of each rule to the difference."""
     first, second = apart["first"], apart["second"]
     if not apart["differing"]:
-        return [Prose((f"{first} and {second}: no rule differs that moves a number",))]
+        return [Prose((f"{first} and {second}: no rule that affects the numbers differs",))]
     rows = [["rule", first, second]]
     rows += [[one["rule"], *_sides(one["rule"], one["first"], one["second"])] for one in apart["differing"]]
     parts: list[Table | Prose] = [text_table("rules", rows, heading=f"{first} and {second}")]
@@ -166,7 +165,7 @@ def rules_tables(apart: Mapping[str, Any]) -> list[Table | Prose]:
 def _walk_table(apart: Mapping[str, Any]) -> Table:
     walk = apart["walk"]
     names = list(walk["start"])
-    rows = [["", *(cell for name in names for cell in (name, "least to most"))]]
+    rows = [["", *(cell for name in names for cell in (name, "range"))]]
     rows.append([apart["first"], *(cell for name in names for cell in (percent(walk["start"][name]), ""))])
     rows += [
         [", ".join(step["rules"]), *(cell for name in names for cell in _share_cells(step["adds"][name]))]
@@ -175,11 +174,11 @@ def _walk_table(apart: Mapping[str, Any]) -> Table:
     rows.append([apart["second"], *(cell for name in names for cell in (percent(walk["end"][name]), ""))])
     n = walk["n_orders"]
     notes = [
-        f"{SUM if n is None else DRAWN.format(n=n)}; beside it the least and the most that it adds anywhere",
-        "rules in one line depend on one another and are changed together",
+        f"{SUM if n is None else DRAWN.format(n=n)}; range: its smallest and largest contribution in any order",
+        "rules in one row depend on each other and are changed together",
     ]
     if any(one["rule"] in CONSTANT_RULES for one in apart["differing"]):
-        notes.append("the encoder is the run's own under both")
+        notes.append("both use the encoder of the run")
     title = f"{walk['run']}: {walk['method']}, {counted(len(walk['scenes']), 'scene')}"
     return text_table("walk", rows, heading=title, notes=notes)
 
@@ -191,12 +190,12 @@ def _share_cells(share: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _sides(rule: str, first: Any, second: Any) -> list[str]:
-    """Either value; of long lists how many there are and what the other lacks."""
+    """Return both values; for long lists their length and what the other side lacks."""
     if rule == "classes":
         names = [[entry["name"] for entry in side] for side in (first, second)]
         return [f"{len(mine)} classes{_alone(mine, other)}" for mine, other in (names, names[::-1])]
     if isinstance(first, list) and isinstance(second, list) and max(len(first), len(second)) > 4:
-        return [f"{len(mine)} of them{_alone(mine, other)}" for mine, other in ((first, second), (second, first))]
+        return [f"{len(mine)} entries{_alone(mine, other)}" for mine, other in ((first, second), (second, first))]
     return [_shown(value) for value in (first, second)]
 
 
@@ -205,7 +204,7 @@ def _alone(mine: Sequence[Any], other: Sequence[Any]) -> str:
     if not own:
         return ""
     rest = f" and {len(own) - 3} more" if len(own) > 3 else ""
-    return f", it alone: {printable(', '.join(own[:3]), MAX_RULE_CHARACTERS)}{rest}"
+    return f", only here: {printable(', '.join(own[:3]), MAX_RULE_CHARACTERS)}{rest}"
 
 
 def _shown(value: Any) -> str:

@@ -1,6 +1,6 @@
-"""Tables, and what stands between them, as text, Markdown, CSV and HTML; ``FORMATS`` has LaTeX too.
+"""Tables and prose as text, Markdown, CSV and HTML; ``FORMATS`` also has LaTeX.
 
-Each form has one function through which every text goes: ``markup_free``, ``harmless``, ``safe``, and ``escape`` of
+Each format has one function that escapes every text: ``markup_free``, ``harmless``, ``safe``, and ``escape`` for
 LaTeX.
 """
 
@@ -24,8 +24,8 @@ CSV_COLUMNS = (
     *("table", "kind", "row", "column", "text", "is_best", "value", "low", "high"),
     *("what", "run", "method", "protocol", "version", "metric", "unit", "mark"),
 )
-# What CommonMark takes for markup wherever it stands; links need two of the brackets beside each other, and of names
-# with underscores only the outer ones are emphasis.
+# Characters that CommonMark reads as markup anywhere; links need two adjacent brackets, and in names with underscores
+# only the outer ones are emphasis.
 _MARKUP = re.compile(
     r"""\\(?=[!-/:-@\[-`{-~]) | [`*|] | (?<![^\W_])_ | _(?![^\W_]) | ~(?=~) | (?<=\])[(:\[]""", re.VERBOSE
 )
@@ -33,18 +33,18 @@ _ENTITY = re.compile(r"&(?=#?\w+;)")
 _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
 TITLE = "su3d-bench tables"
 MAX_CELL_LINE = 28  # characters of a cell
-MAX_NOTE_CHARACTERS = 7_000  # characters: it may name every scene of a data set
+MAX_NOTE_CHARACTERS = 7_000  # characters: a note may name every scene of a dataset
 
 
 def markdown(parts: Sequence[Table | Prose]) -> str:
-    """All ``parts``, each table with its caption above and its notes beneath; the best is in two asterisks a side."""
+    """Return all ``parts``, each table with its caption above and its notes below; the best value is bold."""
     return _laid_out(parts, markup_free)
 
 
 def plain(parts: Sequence[Table | Prose], width: int | None = None) -> str:
-    """As ``markdown``, for a terminal: texts stand there as they are.
+    """As ``markdown``, for a terminal: texts are not escaped.
 
-    ``width``: characters that a line may have. What is longer is folded between words; a wider table is a list.
+    ``width``: maximum line length. Longer texts are wrapped; wider tables become lists.
     """
     return _laid_out(parts, printable, width)
 
@@ -70,7 +70,7 @@ def _block(part: Table | Prose, shown: Callable[[str, int], str], width: int | N
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a Markdown table, the first row its header, with columns of one width."""
+    """Return the lines of a Markdown table with aligned columns; the first row is the header."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
@@ -80,7 +80,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _folded(text: str, width: int | None, begin: str = "") -> str:
-    """``text`` behind ``begin``, folded between words where it is longer than ``width``."""
+    """Return ``begin`` and ``text``, wrapped between words to ``width``."""
     return f"{begin}{text}" if width is None else "\n".join(_wrapped(text, width, begin))
 
 
@@ -96,7 +96,7 @@ def _wrapped(text: str, width: int, begin: str = "") -> list[str]:
 
 
 def _on_its_side(rows: Sequence[Sequence[str]], width: int) -> list[str]:
-    """The lines of a list a row: its first cell, below it the others behind the names of their columns."""
+    """Return one list per row: its first cell, and below it the other cells after their column names."""
     (head, *names), *body = rows
     size = min(max(map(len, names), default=0), max(width // 2 - 4, 1))
     lines = []
@@ -115,7 +115,7 @@ def _marked(cell: Cell, shown: Callable[[str, int], str]) -> str:
 
 
 def markup_free(text: str, most: int = MAX_CELL_CHARACTERS) -> str:
-    r"""``text`` on one line as Markdown shows it letter for letter: no tag, link, emphasis, heading or end of a cell.
+    r"""Escape ``text``, on one line, so that Markdown shows it literally: no tag, link, emphasis, heading or cell end.
 
     >>> markup_free("<b> [a](http://x) | *top_m=5* [1.0, 2.0]"), markup_free("# 1"), markup_free("_a_b")
     ('&lt;b> [a]\\(http://x) \\| \\*top_m=5\\* [1.0, 2.0]', '\\# 1', '\\_a_b')
@@ -125,7 +125,7 @@ def markup_free(text: str, most: int = MAX_CELL_CHARACTERS) -> str:
 
 
 def csv_text(parts: Sequence[Table | Prose]) -> str:
-    """One line a cell, then one a note; measured values also in full precision, as fractions."""
+    """Return one line per cell, then one per note; measured values also in full precision, as fractions."""
     rows = [row for part in parts for row in (_note_rows("", part.lines) if isinstance(part, Prose) else _rows(part))]
     return csv_lines([CSV_COLUMNS, *([row.get(name, "") for name in CSV_COLUMNS] for row in rows)])
 
@@ -154,7 +154,7 @@ def _note_rows(table: str, lines: Sequence[str]) -> Iterator[Mapping[str, Any]]:
 
 
 def html_page(parts: Sequence[Table | Prose]) -> str:
-    """A page of its own without scripts, for light and dark."""
+    """Return a complete page without scripts, for light and dark mode."""
     style = file_text(Path(__file__).parent / "tables.css").replace("\n", "")
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
@@ -165,7 +165,7 @@ def html_page(parts: Sequence[Table | Prose]) -> str:
 
 
 def html_tables(parts: Sequence[Table | Prose]) -> str:
-    """The parts alone, to stand in a page or notebook of somebody else's."""
+    """Return only the parts, for use in another page or a notebook."""
     return "\n".join(_html(part) for part in parts)
 
 
@@ -190,7 +190,7 @@ def _html(table: Table | Prose) -> str:
 
 
 def _short(text: str) -> str:
-    """What keeps a number with its interval, or a name, on one line: the box scrolls where the screen is narrow."""
+    """Return the class that keeps a short cell on one line; on narrow screens the table scrolls."""
     return ' class="short"' if len(text) <= MAX_CELL_LINE else ""
 
 
@@ -204,7 +204,7 @@ def _strong(cell: Cell) -> str:
 
 
 def safe(text: str) -> str:
-    """``text`` on one line, without what HTML would take for its own."""
+    """Escape ``text`` for HTML, on one line."""
     return html.escape(printable(text, MAX_CELL_CHARACTERS))
 
 

@@ -1,4 +1,4 @@
-"""Tables IV and V of OpenSU3D's paper and its reasoning scores, as people or the ground truth judge."""
+"""Tables IV and V of OpenSU3D's paper and its reasoning scores, judged by annotators or by ground truth."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from su3d_bench.reports.tables import paper
 from su3d_bench.reports.tables.model import ANNOTATED_SUFFIX, Measured
 
 REFINED = "refined label (n')"
-PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning
-ROLE_LABELS = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
+PAPER_MODEL = "gpt-4-1106-preview"  # used for labels n' and for reasoning
+ROLE_LABELS = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # prefixes of notes in a sheet's key
 
 
 @dataclass(frozen=True)
 class JudgedLayout:
-    """``parts``: what each method has a row of -> metric by the column that it stands in; '' where it has one row."""
+    """``parts``: label of each row of a method -> column -> metric; '' if a method has a single row."""
 
     kind: str
     subject: str
@@ -49,14 +49,14 @@ JUDGED: Mapping[paper.PaperTable, JudgedLayout] = {
 def judged_table(
     number: paper.PaperTable, results: Sequence[Measured], shown: paper.Shown, *, with_published: bool
 ) -> Table:
-    """Such a table with the columns of each dataset: what people judged, what the truth judged, what papers report."""
+    """Return Table IV, V or reasoning with the columns of each dataset: annotators, ground truth, published numbers."""
     layout = JUDGED[number]
     rows = [row for row in results if row.kind == layout.kind]
     if not any(row.per_scene for row in rows):
         have = ", ".join(dict.fromkeys(row.protocol for row in results))
         wanted = " or ".join(f"{dataset}-{layout.kind}" for dataset in ("rooms", "replica", "scannet"))
         raise ConfigError(
-            f"Table {number}: needs protocol {wanted}, or scores of sheets of kind {layout.kind}; there are {have}"
+            f"Table {number}: needs protocol {wanted}, or scores of sheets of kind {layout.kind}; found {have}"
         )
     shown = replace(
         shown, metrics=shown.metrics or layout.columns, only_significant=True, n_judged=True, unit="fraction"
@@ -68,7 +68,7 @@ def judged_table(
     }
     columns = [column if len(names) == 1 else f"{name} {column}" for name in names for column in parts[name].columns]
     reported, sources = _reported(paper.figures_of(is_wanted=with_published, table=number), names, shown, parts)
-    # people judge the retrieval and labels of the paper, and its reasoning
+    # the paper's retrieval, labels and reasoning were judged by humans
     judges = [] if all(row.is_by_people for row in rows) else ["judges"]
     made_by = [who for row in rows for start in ROLE_LABELS.values() for who in remarks_starting(row.warnings, start)]
     models = [] if all(PAPER_MODEL in who for who in made_by) else ["language model"]
@@ -79,7 +79,7 @@ def judged_table(
 
 
 def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
-    """The notes of all parts, each once, with the judges and data that it is about before it."""
+    """Return the notes of all parts, each once, prefixed with their judges and datasets."""
     places: dict[str, list[str]] = {}
     for name, part in parts.items():
         for judged in part.notes:
@@ -89,7 +89,7 @@ def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
 
 
 def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: paper.Shown) -> Table:
-    """The part of a table that is of one dataset."""
+    """Return the part of a table for one dataset."""
     body: list[TableRow] = []
     notes: list[str] = []
     columns: tuple[str, ...] = ()
@@ -99,7 +99,7 @@ def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: paper
             continue
         parts = [_part(row, name, layout) for row in rows for name in layout.parts]
         table = paper.protocol_table(parts, shown, [])
-        judge = "people" if rows[0].is_by_people else "ground truth"
+        judge = "annotators" if rows[0].is_by_people else "ground truth"
         scored = [part for part in parts if part.per_scene or part.failed]
         body += [_named(*both, judge, layout) for both in zip(table.rows, scored, strict=True)]
         notes += [f"{judge}: {note}" for note in table.notes]
@@ -108,10 +108,10 @@ def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: paper
 
 
 def _joined(parts: Sequence[Table]) -> list[TableRow]:
-    """The rows of several parts side by side, by label; what a part lacks is a dash there. People's rows come first."""
+    """Join the rows of several parts by label, with dashes for missing cells; annotators' rows come first."""
     first = {row.label: row for part in parts for row in part.rows}
     wide = []
-    for label, row in sorted(first.items(), key=lambda item: item[1].group != "people"):
+    for label, row in sorted(first.items(), key=lambda item: item[1].group != "annotators"):
         own = [next((one.cells for one in part.rows if one.label == label), ()) for part in parts]
         wide.append(replace(row, cells=_side_by_side(own, parts)))
     return wide
@@ -127,9 +127,9 @@ def _side_by_side(cells: Sequence[Sequence[Cell]], parts: Sequence[Table]) -> tu
 def _reported(
     figures: Sequence[paper.Figure], names: Sequence[str], shown: paper.Shown, parts: Mapping[str, Table]
 ) -> tuple[list[TableRow], list[str]]:
-    """The paper's rows beneath, with the digits that it prints: each dataset's under its own columns.
+    """Return the paper's rows with the digits as printed, each dataset under its own columns.
 
-    All of them stand under those of other data alone.
+    If none of the datasets is measured, all rows are shown under the measured columns.
     """
     if not any(figure.dataset in names for figure in figures):
         return paper.reported_rows(figures, shown.metrics, len(parts[names[0]].columns), as_fractions=True)
@@ -147,7 +147,7 @@ def _reported(
 
 
 def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
-    """``row`` with the metrics of one part under the names of their columns."""
+    """Return ``row`` with the metrics of one part under the names of their columns."""
     names = layout.parts[part]
     known = {column: name for column, name in names.items() if name in row.metrics}
     of_labels = row.tests.get(("label", row.method))  # n' against n, over the same instances
@@ -170,8 +170,8 @@ def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
 
 
 def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> TableRow:
-    """``row`` with who made the labels or answers and its judge, and each cell with the number's own name, by which a
-    paper is checked."""
+    """Return ``row`` labelled with the source of labels or answers and its judge; the origin of each cell names the
+    original metric, for ``report verify``."""
     label = row.label.replace(REFINED, f"{REFINED[:-1]} {_refined_by(part)})" if _refined_by(part) else REFINED)
     solvers = remarks_starting(part.warnings, ANSWERED_BY)
     label += f", answers by {' and '.join(solvers)}" if solvers else ""
@@ -179,7 +179,7 @@ def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> T
 
 
 def _refined_by(part: Measured) -> str:
-    """What label n' is: a vote, or a model's name."""
+    """Return the source of label n': a vote, or a model's name."""
     who = [source.partition(" of ")[0] for source in remarks_starting(part.warnings, REFINED_BY)]
     said = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
     return " and ".join(dict.fromkeys(printable(one, 100) for one in said))
@@ -198,19 +198,19 @@ def _own(cell: Cell, layout: JudgedLayout) -> Cell:
 
 
 SUBJECTS = {
-    "retrieval": ("Retrieval by text", "is the instance ranked first right?"),
-    "annotation": ("Labels and merging of instances", "is the label right, how was the mask merged?"),
-    "reasoning": ("Spatial reasoning", "is the answer right, and are the objects that it names?"),
-    "questions": ("Generated questions", "do they make sense, and are their wording and their answer right?"),
+    "retrieval": ("Retrieval by text", "is the top-ranked instance correct?"),
+    "annotation": ("Labels and merging of instances", "is the label correct, how is the mask merged?"),
+    "reasoning": ("Spatial reasoning", "are the answer and its objects correct?"),
+    "questions": ("Generated questions", "do they make sense, are wording and answer correct?"),
 }
-JUDGES = {"people": "people", "automatic": "ground truth"}
-GROUND_TRUTH_NOTE = "The ground truth judges the same items, as far as it knows them"
-QUESTION_NOTE = "A question is as right as the worst of what is said of it; arguable: those that are no worse"
-SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
+JUDGES = {"people": "annotators", "automatic": "ground truth"}
+GROUND_TRUTH_NOTE = "Ground-truth rows: the same items, judged automatically if the ground truth covers them"
+QUESTION_NOTE = "A question counts by its worst rating; arguable: questions rated arguable or better"
+SHOWN_TESTS = 60  # pairs of methods per metric; scores.json has all
 
 
 def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
-    """Accuracies of each dataset, tests between methods, agreement, and people against the ground truth."""
+    """Return accuracies per dataset, tests between methods, agreement, and annotators compared with ground truth."""
     datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
     tables = [_accuracies(scores, dataset) for dataset in datasets]
     tables += [_tests(scores["tests"])] if scores["tests"] else []
@@ -231,12 +231,12 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             row = tuple(_accuracy(cells.get((judge, method, metric))) for metric in metrics)
             rows.append(TableRow(f"{method} ({what})", row, group=judge))
     n_scenes = len({scene for cell in cells.values() for scene in cell["per_scene"]})
-    # methods share items, so that their sum would count a judgement several times
+    # methods share items, so that a sum would count judgements several times
     unclear = max((c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people"), default=0)
     subject, question = SUBJECTS[scores["kind"]]
     people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
     judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
-    judged = judged if people else f"no person judged; {scores['n_items']} items"
+    judged = judged if people else f"not judged by annotators; {scores['n_items']} items"
     origin = f" of run {scores['run']}" if scores["run"] else ""
     return Table(
         name=f"{scores['kind']}-{dataset}",
@@ -245,8 +245,8 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
         columns=tuple(metrics),
         rows=tuple(rows),
         notes=(
-            "Per cent; in brackets Wilson's 95 % interval over items, then the number of items. An item that "
-            "several people judged counts once, with the share of them that said so. "
+            "Per cent; in brackets Wilson's 95 % confidence interval over items, then the number of items. An item "
+            "judged by several annotators counts once, with the share of them who chose it. "
             + (QUESTION_NOTE if scores["kind"] == "questions" else GROUND_TRUTH_NOTE),
             f"set {scores['sheet_id']}{origin}; {judged}",
             *(printable(remark, 300) for remark in scores["remarks"]),
@@ -255,7 +255,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
                 if scores["answered_by"]
                 else []
             ),
-            *([f"'cannot tell' is left out: at most {counted(unclear, 'judgement')} of a number"] if unclear else []),
+            *([f"'cannot tell' is excluded: at most {counted(unclear, 'judgement')} per number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),
     )
@@ -286,22 +286,22 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     odd = [f"{row.label}, {t['metric']}" for row, t in zip(rows, differing, strict=False) if _disagree(t)]
     return Table(
         name="differences",
-        caption="Differences between methods, as people judged them.",
+        caption="Differences between methods, judged by annotators.",
         head="difference",
-        columns=("metric", "n", "differ", "points", "p", "p of all", "smallest p"),
+        columns=("metric", "n", "differ", "points", "p", "adjusted p", "smallest p"),
         rows=tuple(rows),
         notes=(
-            "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); p of all: "
-            "corrected by Holm for all comparisons in which anything differs; smallest p: the least that so many give",
-            *([f"interval and test disagree, and the test decides, for {'; '.join(odd)}"] if odd else []),
-            *([f"{n_same} of {len(tests)} comparisons are left out: nothing differs"] if n_same else []),
+            "p: two-sided sign-flip test over differing items (McNemar's exact test if each is judged once); adjusted "
+            "p: Holm's correction over all comparisons with a difference; smallest p: the smallest possible",
+            *([f"interval and test disagree (the test decides) for {'; '.join(odd)}"] if odd else []),
+            *([f"{n_same} of {len(tests)} comparisons without a difference are omitted"] if n_same else []),
             *([f"{n_more} more differences are in scores.json"] if n_more else []),
         ),
     )
 
 
 def _disagree(test: Mapping[str, Any]) -> bool:
-    """Whether the interval of a change leaves 0 out where the test finds nothing, or the other way round."""
+    """Whether the interval excludes 0 but the test is not significant, or vice versa."""
     if test["interval"] is None:
         return False
     low, high = test["interval"]
@@ -324,8 +324,8 @@ def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:
         columns=("annotators", "all equal", "Krippendorff's alpha", "Fleiss' kappa"),
         rows=tuple(rows),
         notes=(
-            "1: they agree on all, 0: as chance would have it; over items with two answers or more; 'cannot tell' is "
-            "an answer; in brackets the 95 % interval over items",
+            "1: full agreement, 0: chance level; over items with at least two answers; 'cannot tell' is an answer; in "
+            "brackets the 95 % confidence interval over items",
         ),
     )
 
@@ -339,7 +339,7 @@ def _pairs(pairs: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
         "pairs",
         [("annotators", "question", "equal", "Cohen's kappa"), *rows],
         caption="Agreement of each pair of annotators.",
-        notes=("over the items that both judged; -: undefined, for want of items or of a second answer",),
+        notes=("over the items that both judged; -: undefined (no items, or only one answer used)",),
     )
 
 
@@ -349,16 +349,16 @@ def _coefficient(value: float | None) -> str:
 
 def _confusion(confusion: Mapping[str, Any], rule: str) -> Table:
     columns = [k for k, _ in enumerate(confusion["choices"]) if any(row[k] for row in confusion["counts"])]
-    header = ["judgements", *(f"truth: {confusion['choices'][k]}" for k in columns)]
+    header = ["judgements", *(f"ground truth: {confusion['choices'][k]}" for k in columns)]
     rows = [
-        [f"people: {choice}", *(str(counts[k]) for k in columns)]
+        [f"annotators: {choice}", *(str(counts[k]) for k in columns)]
         for choice, counts in zip(confusion["choices"], confusion["counts"], strict=True)
     ]
     n = confusion["n"]
-    share = f"{confusion['n_equal']} of {n} judgements are those of the ground truth" if n else "none is clear"
+    share = f"{confusion['n_equal']} of {n} judgements agree with the ground truth" if n else "no judgement is clear"
     return text_table(
         f"confusion-{confusion['ask']}",
         [header, *rows],
-        caption=f"People against the ground truth: {confusion['ask']}.",
-        notes=(f"{share}; Cohen's kappa {_coefficient(confusion['kappa'])}; truth: {rule}",),
+        caption=f"Annotators compared with ground truth: {confusion['ask']}.",
+        notes=(f"{share}; Cohen's kappa {_coefficient(confusion['kappa'])}; ground truth: {rule}",),
     )

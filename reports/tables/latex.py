@@ -1,4 +1,4 @@
-"""Tables as LaTeX with booktabs; nothing that comes from a file can be a command, and each cell names its run."""
+"""Tables as LaTeX with booktabs; no text from a file can become a command, and each cell records its run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from urllib.parse import quote, unquote
 from su3d_bench.core.errors import printable
 from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, blocks_of
 
-HEADER = "% made by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"
+HEADER = "% created by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"
 _ESCAPES = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -29,7 +29,7 @@ _ESCAPES = {
     "|": r"\textbar{}",
     '"': "''",
     "`": r"\textasciigrave{}",
-    # After the end of a row these three would belong to it: \\[2pt], \\*
+    # At the start of a row, these three would be read as options of the row end before it: \\[2pt], \\*
     "[": "{[}",
     "]": "{]}",
     "*": "{*}",
@@ -39,10 +39,10 @@ _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
 REPORTED = "as reported, not measured here"
 GAP_PT, SMALLEST_GAP_PT = 4, 2
-MAX_LABEL_PT = 150  # of a label in a table that is too wide for a page; a longer one is broken
-# Widths of one column and of the page in a paper of two columns (IEEEtran: 252 pt and 516 pt), a little narrower.
+MAX_LABEL_PT = 150  # of labels in a table wider than the page; longer labels are wrapped
+# Column and page width of a two-column paper (IEEEtran: 252 pt and 516 pt), slightly reduced.
 FLOATS = (("table", 238), ("table*", 480))
-# Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
+# Font sizes and width of a letter: bold Computer Modern digits at a normal size of 10 pt.
 SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
     r"% run=(?P<run>\S+) method=(?P<method>\S+) protocol=(?P<protocol>\S+) version=(?P<version>\d{1,6}) "
@@ -54,7 +54,7 @@ _MARK = re.compile(r"% run=")
 
 
 def escape(text: str) -> str:
-    r"""``text`` as LaTeX shows it letter for letter, in plain OT1 fonts without packages.
+    r"""Escape ``text`` so that LaTeX prints it literally, in plain OT1 fonts without packages.
 
     >>> escape("50_% & é")
     "50\\_\\% \\& \\'{e}"
@@ -79,7 +79,7 @@ def _letter(character: str) -> str:
 
 
 def latex(parts: Sequence[Table | Prose]) -> str:
-    """All tables as floats of their own, notes beneath in small type."""
+    """Return each table as a float, with notes below in small type."""
     blocks = [HEADER]
     for part in parts:
         if isinstance(part, Prose):
@@ -91,10 +91,10 @@ def latex(parts: Sequence[Table | Prose]) -> str:
 
 @dataclass(frozen=True)
 class _Place:
-    """How a table fits a page of two columns: its float, type size and half the gap between columns.
+    """The layout of a table on a two-column page: float, font size and half the gap between columns.
 
-    ``label_pt``: the width at which labels are broken, None where they need not be; ``parts``: the columns of each
-    tabular, one beneath the other.
+    ``label_pt``: the width at which labels are wrapped, None if they need not be; ``parts``: the columns of each
+    tabular; the tabulars are stacked.
     """
 
     kind: str
@@ -108,7 +108,7 @@ def _float(table: Table) -> str:
     place = _place(table)
     lines = [
         f"\\begin{{{place.kind}}}[t]",
-        r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
+        r"  \centering\hbadness=10000",  # no warning about short captions in a narrow column
         f"  \\caption{{{escape(table.heading + table.caption)}}}",
         f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}",
         f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
@@ -138,7 +138,7 @@ def _tabular(table: Table, columns: Sequence[int], label_pt: float | None) -> li
 
 
 def _place(table: Table) -> _Place:
-    """Letters are counted, not measured."""
+    """Choose the layout from character counts; widths are not measured."""
     label = max(len(text) for text in (table.head, *(f"{row.label} {row.mark}" for row in table.rows)))
     columns = [
         max(len(text) for text in (name, *(row.cells[k].whole for row in table.rows if k < len(row.cells))))
@@ -165,7 +165,7 @@ def _place(table: Table) -> _Place:
 
 
 def _label(text: str, width_pt: float | None, mark: str = "") -> str:
-    """A label, which may be broken after a sign between its words where it has a width."""
+    """Return a label; with a width, it may wrap after separators."""
     raised = f"\\textsuperscript{{{escape(mark)}}}" if mark else ""
     if width_pt is None:
         return escape(text) + raised
@@ -188,7 +188,7 @@ def _cell(cell: Cell) -> str:
 
 
 def origin_comment(origin: Origin) -> str:
-    """The comment that tells a cell's run, in one line without a blank inside a value."""
+    """Return the one-line comment that records a cell's origin, without spaces inside values."""
     parts = [("run", origin.run), ("method", origin.method), ("protocol", origin.protocol)]
     comment = " ".join(f"{name}={quote(value, safe=_SAFE)}" for name, value in parts)
     comment += f" version={origin.version} metric={quote(origin.metric, safe=_SAFE)} what={origin.what}"
@@ -201,9 +201,9 @@ def origin_comment(origin: Origin) -> str:
 
 @dataclass(frozen=True)
 class PrintedCell:
-    """A cell of a paper's source that names its run: its ``line`` from 1, the numbers in it, and its origin.
+    """A cell of a LaTeX source that records its run: its ``line`` (1-based), its text, and its origin.
 
-    ``origin`` is None where the comment is damaged.
+    ``origin`` is None if the comment is malformed.
     """
 
     line: int
@@ -212,12 +212,12 @@ class PrintedCell:
 
     @property
     def numbers(self) -> list[str]:
-        """The numbers of the cell as printed: the value, then the ends of its interval."""
+        """The numbers of the cell as printed: the value, then the bounds of its interval."""
         return re.findall(r"\d+(?:\.\d+)?", self.shown)
 
 
 def printed_cells(text: str) -> list[PrintedCell]:
-    """Every cell of a LaTeX source that carries the comment of ``origin_comment``."""
+    """Return every cell of a LaTeX source that has a comment of ``origin_comment``."""
     cells = []
     for number, line in enumerate(text.splitlines(), start=1):
         mark = _MARK.search(line)

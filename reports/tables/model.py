@@ -1,4 +1,4 @@
-"""The measured numbers that tables show, and the notes beneath them."""
+"""The measured numbers shown in tables, and the notes below them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from su3d_bench.numerics.statistics import FEW_SCENES, SignFlipTest
 
 
 def few_scenes(n_scenes: int) -> str | None:
-    """What must stand beneath intervals over so few scenes; None where they are enough, or where none has any.
+    """Return the warning for intervals over few scenes; None for a single scene (no interval) or enough scenes.
 
     >>> few_scenes(4)
     'intervals from fewer than 10 scenes are unreliable (here: 4): docs/numbers/statistics.md'
@@ -27,23 +27,23 @@ REFINED_LABELS = "label n: the name given while mapping; n': the name chosen aft
 
 
 def label_notes(names: Iterable[str]) -> list[str]:
-    """What the paper's marks in the names of metrics mean, where one has them."""
+    """Explain the paper's marks n and n' if the name of a metric has one."""
     return [REFINED_LABELS] if any(name.endswith((" n", " n'")) for name in names) else []
 
 
-ANNOTATED_SUFFIX = "-people"  # ends the name of what stands in a protocol's place where people judged
+ANNOTATED_SUFFIX = "-people"  # suffix of the protocol name of results judged by annotators
 
 
 def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
-    """Where the confidences behind average precision come from, for each row that has one; a mix is marked.
+    """Return the origin of the confidences behind average precision for the rows that have one; a mix is marked.
 
     >>> confidence_notes({"a": "computed", "b": "1 for all", "c": "1 for all"})
-    ['MIXED CONFIDENCES: computed (a); 1 for all (b, c): these average precisions do not compare']
+    ['MIXED CONFIDENCES: computed (a); 1 for all (b, c): average precisions are not comparable']
     """
     whose = _rows_by(confidences)
     if len(whose) < 2:
         return [f"confidences: {what}" for what in whose]
-    return [f"MIXED CONFIDENCES: {_listing(whose)}: these average precisions do not compare"]
+    return [f"MIXED CONFIDENCES: {_listing(whose)}: average precisions are not comparable"]
 
 
 def _rows_by(said: Mapping[str, str | None]) -> dict[str, list[str]]:
@@ -59,28 +59,28 @@ def _listing(whose: Mapping[str, Iterable[str]]) -> str:
 
 
 def is_ceiling(method: str, caveat: str | None) -> bool:
-    """Whether a row was told the truth, and competes with none."""
+    """Whether a row uses ground truth, so that it is not ranked."""
     return method == CEILING_METHOD or "a ceiling, not a result" in (caveat or "")
 
 
 def label_count_notes(labels: Mapping[str, str | None]) -> list[str]:
-    """That rows are of other numbers of labels a mask or point, which do not compare; nothing where all are of one.
+    """Return a warning if rows use different numbers of labels per mask or point; empty if all are the same.
 
     >>> label_count_notes({"a": "one label", "b": "the top 5 labels", "c": None})
-    ['MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare']
+    ['MIXED LABELS: one label (a); the top 5 labels (b): numbers are not comparable']
     """
     whose = _rows_by(labels)
-    return [f"MIXED LABELS: {_listing(whose)}: these numbers do not compare"] if len(whose) > 1 else []
+    return [f"MIXED LABELS: {_listing(whose)}: numbers are not comparable"] if len(whose) > 1 else []
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
 
-    What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named;
-    ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty where there is none. ``per_scene`` is
-    scene -> metric -> value; ``changed``: settings other than the method's own; ``warnings`` are what was said of the
-    numbers when they were made, ``tests`` what people's judgements of the same items say, by metric and other method.
+    Annotators' judgements, from ``scores.json``, have this form too. ``run``: the folder as given by the user;
+    ``limit``: frames per scene, 0 for all; ``ceilings``: empty if unknown; ``per_scene``: scene -> metric -> value;
+    ``changed``: settings that differ from the method's defaults; ``warnings``: those recorded with the numbers;
+    ``tests``: paired tests on annotators' judgements of the same items, by metric and other method.
     """
 
     run: str
@@ -115,12 +115,12 @@ class Measured:
 
     @property
     def datasets(self) -> str:
-        """The datasets of the scenes, which are named ``dataset/scene``."""
+        """The datasets of the scenes, whose names are ``dataset/scene``."""
         return ", ".join(dict.fromkeys(scene.partition("/")[0] for scene in self.per_scene)) or "no scene"
 
     @property
     def scenes_text(self) -> str:
-        """``8``, ``7/8`` where some are missing, ``8 partial`` where only the first frames were used."""
+        """``8``, ``7/8`` if some are missing, ``8 partial`` if only the first frames were used."""
         n = len(self.per_scene)
         text = str(n) if n == self.n_planned else f"{n}/{self.n_planned}"
         return f"{text} partial" if self.limit else text
@@ -131,5 +131,5 @@ class Measured:
 
     @property
     def is_ceiling(self) -> bool:
-        """Whether the method was told the truth, or where to look for it, so that it competes with none."""
+        """Whether the method uses ground truth, if only to choose where to look, so that it is not ranked."""
         return is_ceiling(self.method, self.caveat)

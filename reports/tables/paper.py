@@ -1,4 +1,4 @@
-"""Tables II and III of OpenSU3D's paper and any other selection, from measured results and what papers report."""
+"""Tables II and III of OpenSU3D's paper and other selections, from measured and published numbers."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import Measured, confidence_notes, few_scenes, label_notes
 
 FILE = Path(__file__).resolve().parent / "published.toml"
-Number = Annotated[str, Field(pattern=r"^\d*\.?\d+$")]  # as printed: the number of decimals says something
-PaperTable = Literal["I", "II", "III", "IV", "V", "reasoning"]  # the last is of the text alone
+Number = Annotated[str, Field(pattern=r"^\d*\.?\d+$")]  # as printed, with all decimals
+PaperTable = Literal["I", "II", "III", "IV", "V", "reasoning"]  # reasoning: in the text, not a table
 
 
-OPEN = "open"  # no source that was read says it
+OPEN = "open"  # not stated in any source that was read
 Fact = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class System(BaseModel):
-    """What made a printed number, as far as a source says.
+    """The system behind a published number, as far as a source states it.
 
-    ``labels`` a mask or point; ``time`` of a scene or frame, with hardware; ``frames`` that were used; ``proposals``:
-    what finds masks, and on what it was trained.
+    ``labels`` per mask or point; ``time`` per scene or frame, with hardware; ``frames`` used; ``proposals``: model that
+    proposes masks, and its training data.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -57,22 +57,22 @@ class System(BaseModel):
 
     @property
     def words(self) -> str:
-        """What is known, and then what is open.
+        """The known facts, then the ones not stated.
 
         >>> System(labels="one").words
-        'labels a mask: one; time, frames, proposals: open'
+        'labels per mask: one; time, frames, proposals: not stated'
         """
-        facts = {"labels a mask": self.labels, "time": self.time, "frames": self.frames, "proposals": self.proposals}
+        facts = {"labels per mask": self.labels, "time": self.time, "frames": self.frames, "proposals": self.proposals}
         known = [f"{what}: {fact}" for what, fact in facts.items() if fact != OPEN]
         unknown = ", ".join(what for what, fact in facts.items() if fact == OPEN)
-        return "; ".join([*known, *([f"{unknown}: {OPEN}"] if unknown else [])])
+        return "; ".join([*known, *([f"{unknown}: not stated"] if unknown else [])])
 
 
 class Figure(BaseModel):
-    """One printed row: ``values`` is metric -> number as printed, in ``unit``; ``system`` is what made it.
+    """One published row: ``values`` is metric -> number as printed, in ``unit``; ``system``: the system behind it.
 
-    ``table`` and ``row``: the table of OpenSU3D's paper in which it stands, and its label there. ``protocol``: ours
-    that comes nearest to the set-up. ``read_from``: the paper itself, or somebody who quotes it.
+    ``table`` and ``row``: its table in OpenSU3D's paper, and its label there. ``protocol``: the protocol here closest
+    to the set-up. ``read_from``: the paper itself, or another paper that quotes it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -91,7 +91,7 @@ class Figure(BaseModel):
     note: str | None = None
 
     def percent(self, metric: str) -> str | None:
-        """The number in per cent with the decimals that it was printed with; None where it was not printed.
+        """Return the number in per cent with the decimals as printed; None if it was not printed.
 
         >>> Figure(method="a", dataset="b", setup="c", source="d", unit="fraction", values={"AP": ".204"}).percent("AP")
         '20.4'
@@ -104,7 +104,7 @@ class Figure(BaseModel):
 
 @cache
 def published() -> tuple[Figure, ...]:
-    """What papers report, as ``published.toml`` has it, each figure with its system in place of that one's name."""
+    """Return the numbers of ``published.toml``, each figure with its system instead of the system's name."""
     table = tomllib.loads(file_text(FILE))
     systems = {entry["name"]: entry for entry in table["system"]}
     figures = [one | ({"system": systems[one["system"]]} if "system" in one else {}) for one in table["figure"]]
@@ -112,7 +112,7 @@ def published() -> tuple[Figure, ...]:
 
 
 def figures_of(*, is_wanted: bool = True, **fields: str) -> list[Figure]:
-    """What is reported where each of ``fields`` is as given, such as ``method="sam3d"``; none where not wanted."""
+    """Return the figures whose ``fields`` match, such as ``method="sam3d"``; an empty list if not wanted."""
     figures = published() if is_wanted else ()
     return [figure for figure in figures if all(getattr(figure, name) == value for name, value in fields.items())]
 
@@ -127,7 +127,7 @@ PAPER_SCENES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Layout:
-    """A table of the paper, or half of one: its metrics, the protocol of its set-up, and its subject."""
+    """A table of the paper, or half of one: its metrics, the protocol closest to its set-up, and its subject."""
 
     metrics: tuple[str, ...]
     protocol: str
@@ -142,9 +142,9 @@ LAYOUTS: Mapping[PaperTable, Layout] = {
 
 @dataclass(frozen=True)
 class Shown:
-    """What stands in the cells, and which best values are marked; ``unit``: in which shares stand there.
+    """Options for the content of cells and the marking of best values; ``unit``: unit of shares.
 
-    ``n_judged``: beside a share, of how many questions or instances it is.
+    ``n_judged``: show the number of questions or instances behind each share.
     """
 
     metrics: tuple[str, ...] = ()
@@ -157,9 +157,9 @@ class Shown:
 
 
 def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """Table II or III of the paper: under the protocol of its set-up, or one each for the others that have its metrics.
+    """Return Table II or III of the paper under the protocol of its set-up.
 
-    What was scored under several protocols of which one is the paper's gives that one alone.
+    Without scores under that protocol: one table for each other protocol with its metrics.
     """
     layout = LAYOUTS[number]
     metrics = shown.metrics or layout.metrics
@@ -168,7 +168,7 @@ def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, 
         have = ", ".join(dict.fromkeys(row.protocol for row in measured))
         raise ConfigError(
             f"Table {number}: needs {', '.join(metrics)}, which none of the runs' protocols has ({have}); score them "
-            f"with --protocols {layout.protocol} too"
+            f"also with --protocols {layout.protocol}"
         )
     scored = [row for row in fitting if row.per_scene] or fitting
     names = list(dict.fromkeys(row.protocol for row in scored))
@@ -192,9 +192,9 @@ def other_setup(
     datasets: Sequence[str] = ("replica",),
     more: Sequence[str] = (),
 ) -> str:
-    """What a caption adds where ``rows`` were not made as the paper's were, and in what they differ; else nothing.
+    """Return the addition to a caption if the set-up of ``rows`` differs from the paper's; otherwise "".
 
-    ``datasets``: those of the paper's table; ``more``: what else is known to differ.
+    ``datasets``: those of the paper's table; ``more``: other known differences.
     """
     scored = [row for row in rows if row.per_scene]
     profiles = {row.profile for row in scored} - {None}
@@ -211,30 +211,30 @@ def other_setup(
 
 
 def _of_stride(row: Measured) -> set[str]:
-    """What of the changed settings says which frames are taken."""
+    """Return the changed settings that select frames."""
     return {setting for setting in row.changed if setting.startswith("stride = ")}
 
 
 def _papers_scenes(row: Measured, datasets: Sequence[str]) -> set[str]:
-    """The paper's scenes of the data of ``row``, none where its table has no such data."""
+    """Return the paper's scenes of the dataset of ``row``; empty if its table does not have that dataset."""
     names = PAPER_SCENES.get(row.datasets, ()) if row.datasets in datasets else ()
     return {f"{row.datasets}/{name}" for name in names}
 
 
 def _has_its_encoder(row: Measured) -> bool:
-    """Whether the features are of the encoder that the protocol names, as far as both name one."""
+    """Whether the encoder is the one that the protocol requires; True if either is unknown."""
     is_known = row.encoder is not None and row.protocol in protocol_names()
     return not is_known or load_protocol(row.protocol).encoder in (None, row.encoder)
 
 
 def selection_tables(measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """One table a protocol, in the order of the runs; of chosen metrics those that it has, none where it has none."""
+    """Return one table per protocol, in run order, with the selected metrics that it has; none without any."""
     tables = []
     known = {name for row in measured for name in row.metrics}
     for name in dict.fromkeys(row.protocol for row in measured):
         rows = [row for row in measured if row.protocol == name]
         metrics = shown.metrics
-        if known.issuperset(metrics):  # else the table says which is known nowhere
+        if known.issuperset(metrics):  # otherwise the table reports the unknown metric
             metrics = tuple(metric for metric in metrics if metric in rows[0].metrics)
         if metrics or not shown.metrics:
             figures = figures_of(is_wanted=with_published, protocol=name)
@@ -243,13 +243,13 @@ def selection_tables(measured: Sequence[Measured], shown: Shown, *, with_publish
 
 
 def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
-    """The table of what was ``measured`` under one protocol, reported ``figures`` beneath.
+    """Return the table of ``measured`` results under one protocol, with the published ``figures`` below.
 
-    A method that failed has a row without values; one that the protocol cannot score is named in a note.
+    A failed method has a row without values; methods that the protocol cannot score are listed in a note.
     """
     rows = [row for row in measured if row.per_scene or row.failed]
     if not rows:
-        raise ConfigError(f"{measured[0].protocol}: scored none of {', '.join(row.method for row in measured)}")
+        raise ConfigError(f"{measured[0].protocol}: has no scores of {', '.join(row.method for row in measured)}")
     first = next((row for row in rows if row.per_scene), rows[0])
     left_out = [row.method for row in measured if row not in rows]
     metrics = shown.metrics or rows[0].headline
@@ -284,15 +284,15 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
 
 
 def units(row: Measured, shown: Shown) -> str:
-    """What the numbers of a table are."""
+    """Return the note on protocol, data, units and intervals of a table."""
     interval = ""
     if shown.intervals:
-        interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
+        interval = f"; in brackets the 95 % confidence interval over {'items' if row.is_by_people else 'scenes'}"
         rough = None if row.is_by_people else few_scenes(len(row.scenes))
         interval += f" ({rough})" if rough else ""
-    ceiling = "; (truth): what the truth itself scores" if shown.ceilings else ""
-    unit = "per cent" if shown.unit == "percent" else "shares of 1"
-    n = "; n: how many were judged" if shown.n_judged else ""
+    ceiling = "; (GT ceiling): score of the ground truth" if shown.ceilings else ""
+    unit = "per cent" if shown.unit == "percent" else "fractions"
+    n = "; n: number of judged items" if shown.n_judged else ""
     scenes = counted(len(row.per_scene), "scene")
     return (
         f"Protocol {row.protocol}, version {row.version}, on {row.datasets} ({scenes}); {unit}{interval}{ceiling}{n}."
@@ -300,7 +300,7 @@ def units(row: Measured, shown: Shown) -> str:
 
 
 def labels_of(rows: Sequence[Measured]) -> list[str]:
-    """The method, with the run's name where two rows are of one method."""
+    """Return the method names, with the run's name if several rows have the same method."""
     names = [row.method for row in rows]
     short = [row.run.rstrip("/").rpartition("/")[2] for row in rows]
     pairs = list(zip(names, short, strict=True))
@@ -309,7 +309,7 @@ def labels_of(rows: Sequence[Measured]) -> list[str]:
 
 
 def _columns(shown: Shown) -> list[str]:
-    ceilings = [f"{name} (truth)" for name in shown.metrics] if shown.ceilings else []
+    ceilings = [f"{name} (GT ceiling)" for name in shown.metrics] if shown.ceilings else []
     return [*shown.metrics, *ceilings, *(["scenes"] if shown.scenes_count else [])]
 
 
@@ -338,7 +338,7 @@ def _origin(row: Measured, metric: str, value: float, interval: tuple[float, flo
 
 
 def shown_as(metric: str, value: float | None, unit: Unit = "percent") -> str:
-    """``value`` as a table shows it: a share in its unit, a count as it is.
+    """Format ``value`` for a table: shares in their unit, counts as numbers.
 
     >>> shown_as("AP", 0.1234), shown_as("AP", 0.1234, "fraction"), shown_as("n_classes", 12.0)
     ('12.3', '0.123', '12')
@@ -349,16 +349,16 @@ def shown_as(metric: str, value: float | None, unit: Unit = "percent") -> str:
 
 
 def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
-    """Metric -> the rows to mark, and what must be said of the marks; rows of other scenes are not compared.
+    """Return metric -> rows to mark as best, and the note on the marks; rows of different scenes are not compared.
 
-    Rows that print the same best value are all marked; where only a significant best is marked, none of them.
+    Rows with the same printed best value are all marked, or none if only significant best values are marked.
     """
     scored = [k for k, row in enumerate(rows) if row.per_scene]
     competing = [k for k in scored if not rows[k].is_ceiling] or scored
     if len(competing) < 2:
         return {}, None
     if len({(rows[k].scenes, rows[k].limit) for k in competing}) > 1:
-        return {}, "The rows are of different scenes or frames, so that none is marked as the best."
+        return {}, "The rows have different scenes or frames, so that no best value is marked."
     marked: dict[str, set[int]] = {}
     tests: dict[str, SignFlipTest | None] = {}
     is_contradicted: dict[str, bool] = {}
@@ -384,21 +384,20 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     if smallest >= LEVEL:
         return marked, nothing_can_be_marked(over, smallest)
     return marked, (
-        f"Bold: the highest measured value where it differs from the second (two-sided sign-flip test over {over}, "
+        f"Bold: the highest measured value if it differs from the second (two-sided sign-flip test over {over}, "
         f"p < {LEVEL}{corrected}; with these {over} p cannot be below {smallest:.2g})."
     )
 
 
 def nothing_can_be_marked(over: str, smallest: float) -> str:
-    """What is said, once, where no difference over so few could be told from chance."""
-    return f"No best is marked: with so few {over} no difference can have p < {LEVEL} (the least is {smallest:.2g})."
+    """Return the note for samples too small for any significant difference."""
+    return f"No best value is marked: with so few {over}, p < {LEVEL} is impossible (at least {smallest:.2g})."
 
 
 def _paired_test(row: Measured, other: Measured, metric: str) -> tuple[SignFlipTest | None, bool]:
-    """People's over the same items where they judged, else over the scenes that both have a value for.
+    """Return the paired test over items for annotators' judgements, otherwise over the scenes with values of both.
 
-    And whether ``row``, the higher over all scenes together, is the lower of the two in the mean over scenes, which is
-    what a test over scenes is of.
+    Also whether the mean over scenes, which the test uses, contradicts the order of the two over all scenes together.
     """
     if row.is_by_people and (row.tests or other.tests):
         return row.tests.get((metric, other.method)), False
@@ -407,20 +406,20 @@ def _paired_test(row: Measured, other: Measured, metric: str) -> tuple[SignFlipT
 
 
 def of_scenes(row: Measured, metric: str) -> np.ndarray:
-    """The value of each scene, by the scene's name; NaN where there is none."""
+    """Return the value of each scene, sorted by scene name; NaN without a value."""
     values = [row.per_scene[scene].get(metric) for scene in sorted(row.per_scene)]
     return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
 def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
-    """What must be known of measured rows: missing scenes, partial runs, where masks come from, who names."""
+    """Return the notes on measured rows: missing scenes, partial runs, changed settings, perception, confidences."""
     notes: dict[str, list[str]] = {}
     for row, label in zip(rows, labels, strict=True):
         said = [
             f"PARTIAL: only the first {counted(row.limit, 'frame')} of each scene" if row.limit else "",
             f"with {some(row.changed, 8)}" if row.changed else "",
             f"INCOMPLETE: failed on {some(row.failed, 4)}" if row.failed else "",
-            f"unscored on {some(row.unscored, 4)}" if row.unscored else "",
+            f"not scored on {some(row.unscored, 4)}" if row.unscored else "",
             row.caveat or "",
             f"perception {row.profile}{f', encoder {row.encoder}' if row.encoder else ''}" if row.profile else "",
             *(f"{RELATIVE}{one}" for one in remarks_starting(row.warnings, RELATIVE)),
@@ -440,7 +439,7 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
 def reported_rows(
     figures: Sequence[Figure], metrics: Sequence[str], n_columns: int, *, as_fractions: bool = False
 ) -> tuple[list[TableRow], list[str]]:
-    """A row for each figure that has one of ``metrics``, marked, and the notes that say where the marks lead."""
+    """Return a marked row for each figure with one of ``metrics``, and the notes that give their sources."""
     rows: list[TableRow] = []
     marks: dict[str, str] = {}
     for figure in figures:

@@ -1,4 +1,4 @@
-"""Tables of a run, from what ``metrics.json`` holds, and of an evaluation of predictions made elsewhere."""
+"""Tables of a run, from ``metrics.json``, and of an evaluation of external predictions."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
 from su3d_bench.store.records import UnscoredRecord
 
-# A number of things in a scene, and what is said of them before the first of them is named. Scenes share classes.
+# A count, and the text up to the first named item. Counts of classes are not summed, because scenes share classes.
 _COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>(?!class)[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
 _PLURAL = {"mask": "masks", "pair": "pairs", "has": "have", "counts": "count", "is": "are"}
 
 
 def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, list[str]]]:
-    """What is said, and of which ``scenes``: of several that say the same the numbers are added up.
+    """Group equal warnings of several ``scenes`` and add up their counts.
 
-    A warning begins with its scene and a colon, or is of none.
+    A warning begins with its scene and a colon, or belongs to no scene.
 
     >>> summed(["a: 1 empty mask, the first is mask 3", "b: 2 empty masks, the first is mask 0", "c"], ["a", "b"])
     [('3 empty masks', ['a', 'b']), ('c', [])]
@@ -57,17 +57,17 @@ def _in_plural(words: str) -> str:
     return " ".join([_PLURAL.get(first, first), *plural])
 
 
-MAX_NAMES = 8  # of a scene that are shown; the rest is counted
-UNNAMED = "without a name"
+MAX_NAMES = 8  # names shown per scene; the rest is counted
+UNNAMED = "unnamed"
 
 
 @dataclass(frozen=True)
 class Found:
-    """The map of a method in a scene; ``n_instances`` is None where it holds features alone, ``update_ms`` where the
-    method looks at no frame.
+    """The map of a method in a scene; ``n_instances`` is None for maps with features only, ``update_ms`` is None if the
+    method uses no frames.
 
-    ``names``: how many instances have a name, the most frequent first; ``extents_m``: the longest edges of the boxes of
-    the smallest, the median and the largest instance.
+    ``names``: names and their number of instances, most frequent first; ``extents_m``: the longest box edges of the
+    smallest, the median and the largest instance.
     """
 
     scene: str
@@ -81,8 +81,8 @@ class Found:
 
 
 def found_table(rows: Sequence[Found], run: str = "") -> Table:
-    """A row a scene and method; ``run`` is named where there are several."""
-    head = ["scene", "method", "instances", "points", "smallest / median / largest (m)", "updates", "ms an update"]
+    """Return one row per scene and method; ``run``: shown in the caption if there are several."""
+    head = ["scene", "method", "instances", "points", "smallest / median / largest (m)", "updates", "ms per update"]
     body = [
         [
             row.scene,
@@ -96,16 +96,16 @@ def found_table(rows: Sequence[Found], run: str = "") -> Table:
         ]
         for row in rows
     ]
-    note = "sizes: longest edges of the instances' boxes; ms an update: the median, perception included"
+    note = "sizes: longest edges of the instances' boxes; ms per update: median, including perception"
     of = run and f": {run}"
-    return text_table("found", [[*head, "names"], *body], heading="Found, not scored", caption=of, notes=(note,))
+    return text_table("found", [[*head, "names"], *body], heading="Maps without scores", caption=of, notes=(note,))
 
 
 def names_text(names: Sequence[tuple[str, int]], most: int = MAX_NAMES) -> str:
-    """The most frequent names with their numbers.
+    """Return the most frequent names with their counts.
 
     >>> names_text((("chair", 3), ("sofa", 1), ("", 2))), names_text((("lamp", 1), ("bed", 1)), most=1)
-    ('3 chairs, sofa, 2 without a name', 'lamp and 1 name more')
+    ('3 chairs, sofa, 2 unnamed', 'lamp and 1 name more')
     """
     if not names:
         return NOT_MEASURED
@@ -121,7 +121,7 @@ def _of_name(name: str, n: int) -> str:
 
 
 def not_scored_lines(reasons: Iterable[UnscoredRecord]) -> list[str]:
-    """One line a protocol, protocols of one reason together, scenes that lack the same as the first of them alone."""
+    """Return one line per reason; protocols are listed together, similar scenes are counted."""
     of_kind: dict[tuple[str, tuple[str, ...]], list[UnscoredRecord]] = {}
     for reason in reasons:
         of_kind.setdefault((reason.protocol, _kind(reason)), []).append(reason)
@@ -134,32 +134,31 @@ def not_scored_lines(reasons: Iterable[UnscoredRecord]) -> list[str]:
         n_scenes = len({reason.scene for reason in alike})
         protocols.setdefault((methods, why, n_scenes), []).append(protocol)
     return [
-        f"{methods}: not scored under {', '.join(names)}: {why}{f' (and alike in {n - 1} more)' if n > 1 else ''}"
+        f"{methods}: not scored under {', '.join(names)}: {why}{f' (and similarly in {n - 1} more)' if n > 1 else ''}"
         for (methods, why, n), names in protocols.items()
     ]
 
 
 def _kind(reason: UnscoredRecord) -> tuple[str, ...]:
-    """The words of a reason that are not of its scene: no path, and nothing that holds the scene's name."""
+    """Return the words of a reason that do not depend on its scene: no paths, no words with the scene's name."""
     own = reason.scene.rpartition("/")[2]
     return tuple(word for word in reason.reason.split() if "/" not in word and own not in word)
 
 
-# What stands below the methods: the prefix of a metric's name, and what the row is called.
-MAX_SCENES = 20  # that a line names
-CHEAP = {"chance": "by chance", "names-alone": "by names alone"}
+MAX_SCENES = 20  # named per line
+CHEAP = {"chance": "by chance", "names-alone": "by names alone"}  # prefix of metric names -> row label
 
 
 def markdown_table(metrics: Mapping[str, Any]) -> str:
-    """The tables of a run as Markdown that reads well as plain text too."""
+    """Return the tables of a run as Markdown that is also readable as plain text."""
     return markdown(run_tables(metrics))
 
 
 def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[Table | Prose]:
-    """One table a protocol that scored a scene or should have, a row a method, what must be known beneath.
+    """Return one table per protocol with scores or failures: one row per method, notes below.
 
-    ``metrics`` is the value of ``metrics.json``, ``found`` are the maps that nothing scored. Numbers are percentages
-    with their 95 % interval over scenes.
+    ``metrics``: content of ``metrics.json``; ``found``: maps without scores. Numbers are percentages with their 95 %
+    confidence interval over scenes.
     """
     rows_of: dict[str, list[Mapping[str, Any]]] = {}
     for result in metrics["results"]:
@@ -167,12 +166,12 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
     told = [rows for rows in rows_of.values() if any(row["result"] is not None or row["failed"] for row in rows)]
     parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in told]
     if not parts:
-        parts = [Prose(("no protocol scores these scenes",))]
+        parts = [Prose(("no protocol applies to these scenes",))]
     return [*parts, *([found_table(found)] if found else [])]
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One line per method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, GT ceiling 97.1)``, by commas."""
+    """Return the headline metrics in one line: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, GT ceiling 97.1), ...``."""
     parts = []
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]
@@ -202,7 +201,7 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:
-    """What a guess scores, and who knows names alone, and the number of questions; nothing where nobody guesses."""
+    """Return the rows of chance level, names-only baseline and number of questions; empty without a chance level."""
     results = [row["result"] for row in rows if row["result"] is not None]
     metrics: Mapping[str, Any] = results[0]["metrics"] if results else {}
     if not any(f"chance_{name}" in metrics for name in names):
@@ -233,12 +232,12 @@ def _value_text(row: Mapping[str, Any], name: str) -> str:
 
 
 def _notes(row: Mapping[str, Any]) -> Iterable[str]:
-    """What stands beneath a table: incomplete scenes, the caveat of the profile, warnings with their scenes."""
+    """Yield the notes below a table: incomplete scenes, the caveat of the profile, warnings with their scenes."""
     method = row["method"]
     if row["failed"]:
         yield f"INCOMPLETE: {method} failed on {', '.join(row['failed'])}"
     if row["unscored"]:
-        yield f"{method} is unscored on {some(row['unscored'], MAX_SCENES)}"
+        yield f"{method} is not scored on {some(row['unscored'], MAX_SCENES)}"
     if row["caveat"]:
         yield f"{method}: {row['caveat']}"
     warnings = [] if row["result"] is None else [str(line) for line in row["result"]["warnings"]]
@@ -248,11 +247,11 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
 NAMES |= {f"top_{k}_{key}": f"top-{k} {name}" for k in range(1, 10) for key, name in NAMES.items()}
-MAX_NOTES = 12  # warnings that are printed; the file has all
+MAX_NOTES = 12  # printed warnings; the file has all
 
 
 def evaluation_tables(document: Mapping[str, Any], *, per_class: bool = False) -> list[Table | Prose]:
-    """A table a protocol: its numbers in per cent, what stands beside them, warnings; classes where asked for."""
+    """Return one table per protocol: numbers in per cent, context rows, warnings; on request one per class."""
     parts: list[Table | Prose] = []
     for name, scored in document["protocols"].items():
         caption = f" (version {scored['version']}), {_scenes(scored)}"
@@ -264,7 +263,7 @@ def evaluation_tables(document: Mapping[str, Any], *, per_class: bool = False) -
 def side_by_side_tables(
     metrics: Mapping[str, Any], documents: Mapping[str, Mapping[str, Any]], *, per_class: bool = False
 ) -> list[Table | Prose]:
-    """The tables of a run of several methods; classes of each where asked for."""
+    """Return the tables of a run of several methods; on request with the classes of each."""
     parts = run_tables(metrics)
     for method, document in documents.items() if per_class else ():
         for name, scored in document["protocols"].items():
@@ -276,8 +275,8 @@ def side_by_side_tables(
 def _scenes(scored: Mapping[str, Any]) -> str:
     text = counted(int(scored["n_scenes"]), "scene")
     n_missed, n_skipped = len(scored["missed_scenes"]), len(scored["skipped_scenes"])
-    text += f", {n_missed} of them without a prediction" if n_missed else ""
-    return text + (f"; {n_skipped} LEFT OUT" if n_skipped else "")
+    text += f", {n_missed} without a prediction" if n_missed else ""
+    return text + (f"; {n_skipped} EXCLUDED" if n_skipped else "")
 
 
 def _numbers(scored: Mapping[str, Any]) -> list[list[str]]:
@@ -286,10 +285,10 @@ def _numbers(scored: Mapping[str, Any]) -> list[list[str]]:
     is_pooled = metrics == {name: scored["pooled"].get(name) for name in names}
     rows = [["", *(NAMES.get(name, name) for name in names)]]
     rows.append(["result", *(with_interval(metrics[name], intervals.get(name)) for name in names)])
-    other = ("mean of scenes", scored["scene_mean"]) if is_pooled else ("scenes pooled", scored["pooled"])
+    other = ("mean over scenes", scored["scene_mean"]) if is_pooled else ("scenes pooled", scored["pooled"])
     others = [other, ("GT ceiling", scored["ceiling"])]
-    others.append(("every mask under every class", scored["every_mask_every_class"]))
-    others.insert(1, ("with every confidence 1", scored["every_confidence_1"]))
+    others.append(("each mask under each class", scored["every_mask_every_class"]))
+    others.insert(1, ("all confidences 1", scored["every_confidence_1"]))
     others += list(scored["groups"].items())
     for title, values in others:
         if values is not None:
@@ -304,18 +303,18 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
         twice, of = scored["duplicates"], scored["confidences"]
         said = f"all {of['min']:g}" if of["constant"] else f"{of['min']:g} to {of['max']:g}"
         yield (
-            f"predictions a scene: {sum(counts) / len(counts):.1f}{spread}; near-duplicate pairs {twice['near']}, "
-            f"identical ones {twice['identical']}; confidences {said}"
+            f"predictions per scene: {sum(counts) / len(counts):.1f}{spread}; near-duplicate pairs {twice['near']}, "
+            f"identical pairs {twice['identical']}; confidences {said}"
         )
     if scored["labels"] is not None:
-        yield f"of each mask or point counts: {scored['labels']}"
+        yield f"counted per mask or point: {scored['labels']}"
     if scored["contested_points"] is not None:
-        yield f"points that several masks claim: {percent(scored['contested_points'])} % of those in masks"
+        yield f"points in several masks: {percent(scored['contested_points'])} % of the points in masks"
     if scored["coverage"] is None:
-        yield "coverage: unknown, the ground truth has no coordinates"
+        yield "coverage: unknown because the ground truth has no coordinates"
     else:
         shares = " / ".join(percent(share) for share in scored["coverage"].values())
-        yield f"scored points with a predicted one within 2.5 / 5 / 10 cm: {shares} %"
+        yield f"coverage @ 2.5 / 5 / 10 cm: {shares} %"
     if any(scored["intervals"].values()) and (line := few_scenes(int(scored["n_scenes"]))):
         yield line
     warnings = [
@@ -328,7 +327,7 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _classes(protocol: str, scored: Mapping[str, Any]) -> list[Table | Prose]:
-    """A row a class; those without a value in any column are named beneath."""
+    """Return one row per class; classes without any value are named below."""
     classes = {
         name: values for name, values in scored["per_class"].items() if any(v is not None for v in values.values())
     }

@@ -1,4 +1,4 @@
-"""Instances one per row, as CSV and Parquet, and tables of what each kind of error costs."""
+"""Instances, one per row, as CSV and Parquet, and tables of the cost of each kind of error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _KINDS: Mapping[str, Kind] = {
 
 @dataclass(frozen=True)
 class Sample:
-    """An instance of a map or of the truth under one protocol: the columns of ``samples.toml``, in their order."""
+    """A predicted or ground-truth instance under one protocol: the columns of ``samples.toml``, in order."""
 
     run: str
     scene: str
@@ -57,7 +57,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the samples; ``may_lack``: where cells may be empty."""
+    """A column of the samples; ``may_lack``: whether cells may be empty."""
 
     name: str
     kind: Kind
@@ -73,13 +73,13 @@ COLUMNS = tuple(
 
 
 def columns_table() -> Table:
-    """What each column holds, a row a column."""
+    """Return the table that describes the columns, one per row."""
     rows = [(one.name, one.kind + (", may be empty" if one.may_lack else ""), one.meaning) for one in COLUMNS]
-    return text_table("samples", [("column", "holds", "meaning"), *rows])
+    return text_table("samples", [("column", "type", "description"), *rows])
 
 
 def csv_of(samples: Sequence[Sample]) -> str:
-    """A line of names and a line a sample; numbers in full precision, 1 and 0 for yes and no, nothing for none.
+    """Return a header and one line per sample: full precision, 1 and 0 for yes and no, empty for None.
 
     >>> csv_of([])[:17]
     'run,scene,method,'
@@ -93,13 +93,13 @@ def _cell(value: object) -> object:
 
 
 def parquet_of(samples: Sequence[Sample]) -> bytes:
-    """The samples as a Parquet file, a column's meaning in its metadata; ``ModelMissing`` without pyarrow."""
+    """Return the samples as a Parquet file with described columns; ``ModelMissing`` without pyarrow."""
     try:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
         raise ModelMissing(
-            "--format parquet needs the parquet extra: pip install 'su3d-bench[parquet]'; csv needs nothing"
+            "--format parquet needs the parquet extra: pip install 'su3d-bench[parquet]'; or use --format csv"
         ) from error
     types = {
         "text": pyarrow.string(),
@@ -119,16 +119,16 @@ def parquet_of(samples: Sequence[Sample]) -> bytes:
     return stream.getvalue()
 
 
-LEFT = {"overlap": "several together", "rest": "none of these"}  # what the two remainders are called
+LEFT = {"overlap": "interaction", "rest": "remaining"}  # row labels of the two remainders
 SUM = (
-    "a gain is in percentage points, with this kind of error alone corrected; the value, all gains, 'several together' "
-    "and 'none of these' add up to 100"
+    "gains are in percentage points, with only this kind of error corrected; the score, all gains, 'interaction' "
+    "and 'remaining' add up to 100"
 )
-OVERLAP = "correcting all of them, beyond the sum of the gains"
+OVERLAP = "all corrected together, minus the sum of the gains"
 
 
 def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
-    """One table a protocol; gains are in percentage points, each for one kind of error corrected alone."""
+    """Return one table per protocol; gains are in percentage points, with only one kind of error corrected."""
     return [
         Prose((f"{attribution['run']}: {attribution['method']}",)),
         *map(_protocol_table, attribution["protocols"]),
@@ -140,20 +140,20 @@ def _protocol_table(protocol: Mapping[str, Any]) -> Table:
     names, n_scored = list(protocol["values"]), protocol["n_scored"]
     meanings = TEXTS["errors"][protocol["kind"]]
     title = f"{protocol['protocol']} (version {protocol['version']}): {counted(len(protocol['scenes']), 'scene')}"
-    header = ["", "errors" if n_scored is None else "points", *names, "what it is"]
-    rows = [["as it is", "", *(percent(protocol["values"][name]) for name in names), ""]]
+    header = ["", "errors" if n_scored is None else "points", *names, "description"]
+    rows = [["score", "", *(percent(protocol["values"][name]) for name in names), ""]]
     for kind, cause in protocol["causes"].items():
         gains = [signed(cause["gains"][name]) for name in names]
         rows.append([kind, n_text(cause["n"], n_scored), *gains, meanings[kind]])
     rows.append([LEFT["overlap"], "", *(signed(protocol["overlap"][name]) for name in names), OVERLAP])
     rows.append([LEFT["rest"], "", *(signed(protocol["rest"][name]) for name in names), meanings["rest"]])
     for stage, values in protocol["stages"].items():
-        rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), TEXTS["stages"][stage]])
+        rows.append([f"with GT {stage}", "", *(percent(values[name]) for name in names), TEXTS["stages"][stage]])
     return text_table(protocol["protocol"], [header, *rows], heading=title)
 
 
 def n_text(n: int, n_scored: int | None) -> str:
-    """A number of errors, or a share of the scored points.
+    """Return a number of errors, or a percentage of the scored points.
 
     >>> n_text(3, None), n_text(25, 1000)
     ('3', '2.5 %')

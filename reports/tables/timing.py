@@ -1,4 +1,4 @@
-"""What updates cost, as tables: one a run for all methods, one a method for its stages, one for maps midway."""
+"""Timing tables: all methods, the stages of each method, and intermediate maps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CACHE = "cache"
 
 @dataclass(frozen=True)
 class AnytimePoint:
-    """How good the map was after a share of the updates, and the seconds until it was there, of all scenes together."""
+    """The scores of the map after a share of the updates, and the seconds until then, over all scenes together."""
 
     run: str
     method: str
@@ -30,12 +30,12 @@ class AnytimePoint:
 def timing_tables(
     summaries: Sequence[MethodSummary], anytime: Sequence[AnytimePoint], hardware: Mapping[str, str], camera_rate: float
 ) -> list[Table | Prose]:
-    """All tables; ``hardware`` names the machine of each run, ``camera_rate`` is in frames a second."""
+    """Return all tables. ``hardware``: run -> machine; ``camera_rate``: frames per second."""
     runs = dict.fromkeys(summary.run for summary in summaries)
     parts: list[Table | Prose] = [Prose((f"{run}: {hardware[run]}",)) for run in runs]
     parts.append(text_table("timing", list(_methods_table(summaries, camera_rate))))
     if any(stage.name == CACHE and stage.share > 0 for summary in summaries for stage in summary.stages):
-        line = f"Stage {CACHE}: what perception found was read from disk there; the speeds are those of the rest."
+        line = f"Stage {CACHE}: perception results were read from disk; the speeds do not include perception."
         parts.append(Prose((line,)))
     for summary in summaries:
         updates = f"{counted(summary.n_updates, 'update')} of {counted(len(summary.scenes), 'scene')}"
@@ -43,12 +43,12 @@ def timing_tables(
         name = f"timing-{summary.run}-{summary.method}"
         parts.append(text_table(name, list(_stages_table(summary)), heading=summary.method, caption=caption))
     if anytime:
-        parts.append(text_table("timing-midway", list(_anytime_table(anytime)), heading="Maps midway"))
+        parts.append(text_table("timing-midway", list(_anytime_table(anytime)), heading="Intermediate maps"))
     return parts
 
 
 def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) -> str:
-    """One row a run, method and stage, in full precision."""
+    """Return one row per run, method and stage, in full precision."""
     growth = [f"{name}_{part}" for name in ("points", "frames") for part in ("exponent", "low", "high", "words")]
     head = ["run", "hardware", "method", "n_scenes", "stage", "n", "first_ms", "p50_ms", "p95_ms", "max_ms", "share"]
     rows: list[list[Any]] = [[*head, *growth]]
@@ -64,7 +64,7 @@ def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) ->
 
 
 def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str], camera_rate: float) -> str:
-    """One row a run and method, in full precision: speed, the map, memory."""
+    """Return one row per run and method, in full precision: speed, map size, memory."""
     speeds = ("updates_per_s", "frames_per_s", "camera_rate", "real_time_factor")
     sizes = ("finish_ms", "n_points", "map_bytes", "peak_rss_bytes", "device_bytes")
     rows: list[list[Any]] = [["run", "hardware", "method", "n_scenes", "n_updates", *speeds, *sizes]]
@@ -78,7 +78,7 @@ def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str],
 def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> Iterator[list[str]]:
     yield [
         *("run", "method", "updates", "update p50", "p95", "max", "first", "map update p50", "updates/s", "frames/s"),
-        *(f"real time at {camera_rate:g}/s", "finish", "points", "map MiB", "peak MiB", "GPU MiB"),
+        *(f"real-time factor at {camera_rate:g} fps", "finish", "points", "map MiB", "peak MiB", "GPU MiB"),
     ]
     for cost in summaries:
         total, of_map = (next(stage for stage in cost.stages if stage.name == name) for name in ("total", "map"))
@@ -97,14 +97,14 @@ def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> It
 def _stages_table(summary: MethodSummary) -> Iterator[list[str]]:
     yield [
         *("stage", "p50", "p95", "max", "first", "share", "exponent by map points", "exponent by updates"),
-        "with a larger map",
+        "growth with map size",
     ]
     for stage in summary.stages:
         growth = stage.against_points or stage.against_frames
         yield [
             *(stage.name, _ms(stage.p50), _ms(stage.p95), _ms(stage.worst), _ms(stage.first), percent(stage.share)),
             *(_growth(stage.against_points), _growth(stage.against_frames)),
-            "too few updates to tell" if growth is None else growth.words,
+            "too few updates" if growth is None else growth.words,
         ]
 
 
@@ -121,7 +121,7 @@ def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
 
 
 def _ms(value: float) -> str:
-    """Three digits: 1234, 12.3, 0.123."""
+    """Return three significant digits, or all digits before the point: 1234, 12.3, 0.123."""
     if value != value:
         return NOT_MEASURED
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

@@ -228,7 +228,7 @@ def test_attribution_command_prints_a_table_and_draws_the_plot(capsys: pytest.Ca
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| missed "))
     assert [cell.strip() for cell in row.strip("|").split("|")][:2] == ["missed", "2"]
-    assert "| with true 2D masks |" in text
+    assert "| with GT 2D masks |" in text
     picture = Path("plots/errors.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
     assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0

@@ -172,7 +172,7 @@ def test_only_common_scenes_are_compared_with_a_remark() -> None:
     assert "only common scenes are compared; only a:collector has painted/a, painted/c" in found.remarks
     text = markdown(comparison_tables(compare("a", "few").to_json()))
     assert "only few:collector has painted/d" in text
-    assert "a single scene says nothing of other scenes" in text
+    assert "a single scene says nothing about other scenes" in text
 
 
 REFUSED = [
@@ -207,6 +207,6 @@ def test_compare_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str
     assert cells[1:5] == ["0.25", "0.75", "0.25", "0 / 0 / 3"]
     assert cells[5] == "100.0"
     assert "| chair | AP " in text
-    assert "values of classes that no scene changes are left out" in text
+    assert "values of classes without a difference in any scene are omitted" in text
     assert main(["compare", "a", "b", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == compare("a", "b").to_json()

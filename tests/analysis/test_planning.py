@@ -101,7 +101,7 @@ def test_power_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
     assert main(["report", "power", "seed-0"]) == 0
-    assert "how much seeds move the difference is not known" in capsys.readouterr().out
+    assert "the effect of seeds on the difference is unknown" in capsys.readouterr().out
 
 
 # comparisons of several seeds

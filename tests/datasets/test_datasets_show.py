@@ -78,7 +78,7 @@ def test_the_command_writes_the_picture_and_tells_counts(capsys: pytest.CaptureF
     assert main(["datasets", "show", "replica/room0"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("replica/room0: 12 frames of 48x36 · depth 1.")
-    assert lines[0].endswith("6 objects of 3 classes · 23,600 points of ground truth (mesh-vertices)")
+    assert lines[0].endswith("6 objects of 3 classes · 23,600 ground-truth points (mesh-vertices)")
     assert lines[1] == "picture: replica-room0.png"
     assert pixels(Path("replica-room0.png")).shape[1] == WIDTH
 

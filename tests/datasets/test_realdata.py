@@ -119,7 +119,7 @@ def test_recordings_run_unscored_with_the_embedded_segmenter(
     if data is not None:
         monkeypatch.setenv("SU3D_DATA", str(data.resolve()))
     found = run(scene)
-    assert "no protocol scores these scenes" in capsys.readouterr().out
+    assert "no protocol applies to these scenes" in capsys.readouterr().out
     assert len(found) > 5 and len(found.points) > 10_000
     # A few frames of a room's corner: what the colour images show is one to three metres wide.
     np.testing.assert_allclose(np.ptp(found.points, axis=0), extent_m, atol=0.3)

@@ -32,11 +32,12 @@ def test_table_has_values_with_interval_ceiling_and_warnings(capsys: pytest.Capt
     rows = {line.split("|")[1].strip(): line for line in answer.out.splitlines() if line.startswith("|")}
     assert [cell.strip() for cell in rows["result"].split("|")[2:-1]] == ["75.0 [0.0, 100.0]"] * 3  # of two scenes
     assert "| 100.0 " in rows["GT ceiling"]
-    assert "every mask under every class" in rows
+    assert "each mask under each class" in rows
     assert (
-        "- predictions a scene: 1.5 (1 to 2); near-duplicate pairs 0, identical ones 0; confidences 0.8" in answer.out
+        "- predictions per scene: 1.5 (1 to 2); near-duplicate pairs 0, identical pairs 0; confidences 0.8"
+        in answer.out
     )
-    assert "- coverage: unknown, the ground truth has no coordinates" in answer.out
+    assert "- coverage: unknown because the ground truth has no coordinates" in answer.out
     assert "format: scannet-text; ground truth: gt\n" in answer.err
     assert "written: out/numbers.json\n" in answer.err
 

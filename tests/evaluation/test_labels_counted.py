@@ -72,7 +72,7 @@ def test_masks_with_several_labels_are_detected_and_reported(
         write_scannet_text(tmp_path / "pred", written)
         assert numbers(tmp_path)["labels"] == expected
         assert main(["evaluate", str(tmp_path / "pred"), "--ground-truth", str(tmp_path / "gt"), "--quiet"]) == 0
-        assert f"of each mask or point counts: {expected}" in capsys.readouterr().out
+        assert f"counted per mask or point: {expected}" in capsys.readouterr().out
     assert numbers(tmp_path, "class-agnostic-open3dis")["labels"] is None
 
 

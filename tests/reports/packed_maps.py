@@ -1,4 +1,4 @@
-"""What a browser reads of a map that a page holds."""
+"""Reads the packed maps of an HTML report, as the browser does."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def unpacked(content: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a browser reads of a packed map: the JSON and the planes, among them the places in metres."""
+    """Unpack a map: its JSON header and its planes, including positions in metres."""
     data = zlib.decompress(base64.b64decode(content))
     length = int.from_bytes(data[:4], "little")
     about, at, planes = json.loads(data[4 : 4 + length]), 4 + length, {}

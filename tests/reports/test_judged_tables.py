@@ -1,4 +1,4 @@
-"""Tables IV and V of the paper: from what people judged, from what the ground truth judged, side by side."""
+"""Tables IV and V of the paper, judged by annotators and by ground truth, side by side."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ LABELS = [
     ("right", "right", "well-merged"),
     ("wrong", "right", "well-merged"),
     ("wrong", "wrong", "under-merged"),
-    ("wrong", "", "over-merged"),  # labels n' leave it out
+    ("wrong", "", "over-merged"),  # excluded from labels n'
 ]
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Scores of a retrieval set and of an annotation set."""
+    """Scores of a retrieval sheet and of an annotation sheet."""
     found = []
     for name, (sheet, key) in (("retrieval", retrieval_set(40)), ("annotation", annotation_set(LABELS))):
         folder = tmp_path_factory.mktemp(name)
@@ -65,19 +65,19 @@ def texts(table: Any) -> dict[str, list[str]]:
     return {row["label"]: [cell["text"] for cell in row["cells"]] for row in table["rows"] if not row["is_reported"]}
 
 
-def test_table_iv_is_made_of_what_people_judged(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_iv_shows_annotators_judgements(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     (table,) = told(capsys, str(folders[0]), "--table", "IV")
     assert table["columns"] == ["instance", "affordance", "property", "relative"]
-    assert texts(table) == {f"{one}, people": [f"{RATES[one]:.3f}"] * 4 for one in SCHEMES}
+    assert texts(table) == {f"{one}, annotators": [f"{RATES[one]:.3f}"] * 4 for one in SCHEMES}
     assert {cell["beside"] for row in table["rows"][:4] for cell in row["cells"]} == {"n=10"}
     assert not any(cell["is_best"] for row in table["rows"] for cell in row["cells"])  # 9 of 10 against 7 of 10
-    assert sum("with so few items no difference" in note for note in table["notes"]) == 1
+    assert sum("with so few items, p < 0.05 is impossible" in note for note in table["notes"]) == 1
     assert any("judged by 1 annotator, 40 items" in note for note in table["notes"])
     assert sum(row["is_reported"] for row in table["rows"]) == 8
     assert table["caption"] == "Retrieval by text on rooms; not the paper's set-up: other scenes."
 
 
-def test_the_best_that_people_see_is_marked_by_the_test_over_the_items_that_they_judged(tmp_path: Path) -> None:
+def test_best_of_annotators_is_marked_by_the_test_over_items(tmp_path: Path) -> None:
     sheet, key = retrieval_set(160)
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
@@ -86,12 +86,12 @@ def test_the_best_that_people_see_is_marked_by_the_test_over_the_items_that_they
     assert any("sign-flip test over items" in note for note in table.notes)
 
 
-def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_v_has_one_row_per_label(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     (table,) = told(capsys, str(folders[1]), "--table", "V", "--no-published")
     assert table["columns"] == ["label-accuracy", "merge-accuracy"]
     assert texts(table) == {
-        "opensu3d: direct label (n), people": ["0.250", "0.500"],
-        "opensu3d: refined label (n'), people": ["0.667", "0.667"],
+        "opensu3d: direct label (n), annotators": ["0.250", "0.500"],
+        "opensu3d: refined label (n'), annotators": ["0.667", "0.667"],
     }
     origins = [cell["origin"] for row in table["rows"] for cell in row["cells"][:2]]
     assert [(one["method"], one["metric"]) for one in origins] == [
@@ -102,7 +102,7 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
     ]
 
 
-def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digits() -> None:
+def test_two_datasets_share_one_table_with_the_papers_digits() -> None:
     values = {"instance": 0.8, "affordance": 0.7, "property": 0.6, "relative": 0.5}
     n = {f"n_{kind}": 40.0 + k for k, kind in enumerate(values)}
     rows = [by_truth("opensu3d", "retrieval", dataset, **values, **n) for dataset in ("replica", "scannet")]
@@ -117,7 +117,9 @@ def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digit
     assert table.caption.endswith("; not the paper's set-up: other scenes, perception, judges.")
 
 
-def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_reasoning_table_shows_measured_and_published_scores(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     sheet, key = reasoning_set([("right", "right"), ("right", "wrong"), ("wrong", "wrong"), ("right", "right")])
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
@@ -141,9 +143,7 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     assert len(checks) == 2 and [check.fault for check in checks if check.fault] == []
 
 
-def test_a_paper_with_peoples_numbers_is_checked_against_their_scores(
-    folders: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_verify_checks_annotators_numbers_against_their_scores(folders: tuple[Path, Path], tmp_path: Path) -> None:
     rows = measured_results(folders)
     shown = Shown(intervals=True)
     tables = [

@@ -1,4 +1,4 @@
-"""What of a page was made before: taken where nothing moved it, made anew where anything did, and never in the way."""
+"""The cache of the HTML report: used if nothing changed, rebuilt if anything did, and ignored if corrupted."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(made_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the run, in the folder from which the command is given."""
+    """A copy of the run in the working directory."""
     shutil.copytree(made_run, tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     see_painted(monkeypatch)
@@ -53,11 +53,11 @@ def pieces(run: Path) -> list[Path]:
 
 
 def refuse(*_: Any, **__: Any) -> Any:
-    raise AssertionError("nothing is made again")
+    raise AssertionError("built again")
 
 
 def noting(made: list[str]) -> Callable[..., PageScene]:
-    """What makes a scene of a page, and notes which."""
+    """A ``page_scene`` that records the scenes it builds."""
 
     def make(scene: str, *rest: Any) -> PageScene:
         made.append(scene)
@@ -71,18 +71,18 @@ def nothing_is_made(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Explained, "matched", refuse)
 
 
-def test_a_second_page_makes_nothing_and_has_the_same_bytes(
+def test_second_page_uses_the_cache_and_has_the_same_bytes(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = page()
-    assert len(pieces(run)) == 2  # a scene each
+    assert len(pieces(run)) == 2  # one per scene
     assert "painted/b done" in capsys.readouterr().err
     nothing_is_made(monkeypatch)
     assert page() == first
     assert capsys.readouterr().err == ""
 
 
-def test_a_damaged_piece_counts_as_absent(run: Path) -> None:
+def test_corrupted_cache_entry_is_ignored(run: Path) -> None:
     first = page()
     for piece, place in zip(pieces(run), (0, 70), strict=True):
         content = bytearray(piece.read_bytes())
@@ -94,7 +94,7 @@ def test_a_damaged_piece_counts_as_absent(run: Path) -> None:
     assert page() == first
 
 
-def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_scene_with_a_changed_map_is_rebuilt(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page("--no-errors", *WORDS)
     place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"
     prediction = read_prediction(place)
@@ -106,7 +106,7 @@ def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypa
     assert made == ["painted/a"]
 
 
-def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_encoder_is_not_cached(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = page()
     shutil.rmtree(run / FOLDER)
 
@@ -120,7 +120,7 @@ def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest
 
 
 @pytest.mark.proof
-def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
+def test_parallel_processes_give_the_same_bytes(run: Path) -> None:
     first = page()
     shutil.rmtree(run / FOLDER)
     command = [sys.executable, str(SCENES / "painted_cli.py"), "report", "html", "run", "--out", "two.html"]
@@ -129,7 +129,7 @@ def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
     assert len(pieces(run)) == 2
 
 
-def test_counts_come_back_as_they_went(run: Path) -> None:
+def test_packed_counts_unpack_unchanged(run: Path) -> None:
     finished = read_run(run)
     explained = explained_of(finished, "collector")
     data = SceneData("painted/a")

@@ -1,4 +1,4 @@
-"""The points of a map on a page: thinned, packed, read back, coloured by what is near."""
+"""The points of a map in the HTML report: downsampling, packing, unpacking, nearest ground truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def surface(n: int, seed: int) -> Any:
     return points.astype(np.float32)
 
 
-def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None:
+def test_twenty_scenes_of_eight_methods_stay_below_thirty_megabytes() -> None:
     most = points_of_each(160, 30_000_000)
     cloud = thinned(surface(150_000, 0), most)
     assert 0.6 * most < len(cloud.points) <= most
@@ -46,7 +46,7 @@ def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None
     assert 160 * len(pack_map(cloud, planes, {})) < 30_000_000
 
 
-def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None:
+def test_thinned_points_are_one_per_cell_in_curve_order() -> None:
     points = np.array([[0, 0, 0], [0.001, 0, 0], [1, 0, 0], [1, 1, 1], [0.02, 0, 0]], np.float32)
     cloud = thinned(points, 10)
     assert sorted(cloud.rows.tolist()) == [0, 2, 3, 4]
@@ -56,22 +56,22 @@ def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
-def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None:
+def test_positions_unpack_within_half_a_step_at_every_scale(scale: float) -> None:
     points = surface(5000, 3) * np.float32(scale) - np.float32(2 * scale)
     cloud = thinned(points, 2000)
     about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.arange(len(cloud.rows)))}, {}))
     assert planes["owner"].tolist() == list(range(about["n"]))
     assert np.abs(planes["position"] - cloud.points).max() <= 0.5 * about["step"] * (1 + 1e-4)
-    assert about["depth"] <= 16  # a page counts cells in sixteen bits
+    assert about["depth"] <= 16  # positions in a page are 16-bit integers
 
 
-def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
+def test_smaller_of_overlapping_masks_owns_the_points() -> None:
     masks = [np.array([0, 1, 2]), np.array([1])]
     prediction = Instances.of(np.zeros((4, 3), np.float32), masks, names=["large", "small"])
     assert point_owners(prediction, np.arange(4)).tolist() == [0, 1, 0, -1]
 
 
-def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
+def test_nearest_ground_truth_is_within_five_centimetres() -> None:
     truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
     points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
     assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [

@@ -1,4 +1,4 @@
-"""What papers report, as data: digit for digit, with source and set-up, in a strict form."""
+"""Published numbers: digit for digit as in the papers, and their conversion to per cent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def rows(table: str) -> dict[tuple[str, str, str | None], tuple[str, ...]]:
     return {(one.method, one.dataset, one.row): tuple(one.values.values()) for one in published() if one.table == table}
 
 
-def test_tables_ii_and_iii_of_the_paper_are_as_printed() -> None:
+def test_tables_ii_and_iii_match_the_paper() -> None:
     assert rows("II") == {
         ("conceptfusion", "replica", None): ("24.2", "31.3"),
         ("conceptfusion-sam", "replica", None): ("31.5", "38.7"),
@@ -27,7 +27,7 @@ def test_tables_ii_and_iii_of_the_paper_are_as_printed() -> None:
     }
 
 
-def test_tables_iv_and_v_and_reasoning_are_as_printed() -> None:
+def test_tables_iv_and_v_and_reasoning_match_the_paper() -> None:
     assert rows("IV")["opensu3d", "scannet", "scheme4"] == ("0.9", "0.7", "0.7", "0.7")
     assert len(rows("IV")) == 8
     assert rows("V")["opensu3d", "replica", "llm"] == ("0.87", "0.88")
@@ -35,13 +35,13 @@ def test_tables_iv_and_v_and_reasoning_are_as_printed() -> None:
     assert reasoning == ["0.83", "0.68"]
 
 
-def test_every_protocol_that_a_figure_names_exists() -> None:
+def test_protocols_of_published_numbers_exist() -> None:
     for name in {one.protocol for one in published() if one.protocol is not None}:
         assert load_protocol(name).name == name
 
 
 @pytest.mark.parametrize(("text", "shown"), [(".231", "23.1"), ("0.9", "90"), (".30", "30"), ("1.0", "100")])
-def test_a_fraction_is_shown_in_per_cent_with_the_decimals_it_was_printed_with(text: str, shown: str) -> None:
+def test_fraction_is_shown_in_per_cent_with_its_printed_decimals(text: str, shown: str) -> None:
     one = Figure(method="a", dataset="b", setup="c", source="d", unit="fraction", values={"AP": text})
     assert one.percent("AP") == shown
     assert one.percent("AP50") is None

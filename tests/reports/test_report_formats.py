@@ -1,4 +1,4 @@
-"""Tables for papers: every format, and what hostile texts may do to it."""
+"""Tables for papers: every format, and hostile texts in it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def hostile_table() -> Table:
     return replace(table, caption=" ".join(HOSTILE), head=HOSTILE[2], columns=(HOSTILE[4], HOSTILE[5]))
 
 
-def test_no_text_can_be_a_latex_command() -> None:
+def test_hostile_text_is_never_a_latex_command() -> None:
     text = latex([hostile_table()])
     body = "\n".join(line.split("% run=")[0] if "value=" in line else line for line in text.splitlines()[1:])
     assert "\\input" not in body
@@ -76,7 +76,7 @@ class _Page(HTMLParser):
         self.attributes |= {name for name, _ in attrs}
 
 
-def test_no_text_can_be_html() -> None:
+def test_hostile_text_is_never_html() -> None:
     page = _Page()
     page.feed(html_page([hostile_table()]))
     assert page.tags <= {
@@ -96,7 +96,7 @@ MARKUP = (
 
 
 @pytest.mark.parametrize("text", [*MARKUP, *HOSTILE])
-def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
+def test_markdown_shows_text_literally(text: str) -> None:
     page = _Page()
     parts: list[Table | Prose] = [
         Prose((text,)),
@@ -108,7 +108,7 @@ def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
     assert [word for line in page.words if (word := line.strip())] == [printable(text)] * 8
 
 
-def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
+def test_text_is_never_a_spreadsheet_formula() -> None:
     table = Table("=1+1", "c", "h", ("+x",), (TableRow("@SUM(A1)", (Cell("-"), )), TableRow("\t=x", (Cell("=2"),))), ("-n",))  # fmt: skip  # noqa: E501
     for line in csv.reader(io.StringIO(csv_text([table]))):
         for value in line:
@@ -116,7 +116,7 @@ def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
     assert "'@SUM(A1)" in csv_text([table])
 
 
-def test_csv_has_full_precision_and_every_note_once() -> None:
+def test_csv_has_full_precision_and_each_note_once() -> None:
     table = protocol_table([measured(accuracy=1 / 3)], Shown(intervals=True), [])
     lines = list(csv.DictReader(io.StringIO(csv_text([table]))))
     assert float(lines[0]["value"]) == 1 / 3
@@ -124,7 +124,7 @@ def test_csv_has_full_precision_and_every_note_once() -> None:
     assert [line["text"] for line in lines if line["kind"] == "note"] == list(table.notes)
 
 
-def test_a_comment_reads_back_as_its_cell_whatever_the_names() -> None:
+def test_latex_comment_round_trips_with_hostile_names() -> None:
     for name in HOSTILE:
         origin = Origin(f"runs/{name}", name, "rooms-semantic", 3, "F-mIoU", "value", 1 / 3, (0.1, 0.2))
         line = f"      & \\textbf{{33.3}} {{[}}10.0, 20.0{{]}} {origin_comment(origin)}"
@@ -135,7 +135,7 @@ def test_a_comment_reads_back_as_its_cell_whatever_the_names() -> None:
 
 
 def wide_and_high(n_rows: int) -> Table:
-    """More columns than a page is wide, more rows than it is high, and labels that must be broken."""
+    """A table wider and higher than a page, with labels that must wrap."""
     columns = tuple(f"column {k}" for k in range(9))
     label = "opensu3d@crop_ratios=[0.8,1.0,1.2,1.4,1.6]: refined label (n'), ground truth"
     cells = tuple(Cell(f"{k}2.3", "[41.2, 61.8]") for k in range(9))
@@ -143,14 +143,14 @@ def wide_and_high(n_rows: int) -> Table:
     return Table("wide", "A wide table.", "method, judge", columns, rows, ("a note of the table " * 12,))
 
 
-def test_a_table_too_wide_for_a_page_is_divided_and_loses_nothing() -> None:
+def test_table_wider_than_a_page_is_split_without_loss() -> None:
     text = latex([wide_and_high(40)])
     assert text.count(r"\begin{table*}") == 1 and text.count(r"\begin{tabular}") > 1
     assert text.count("{[}41.2, 61.8{]}") == 40 * 9
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed (texlive-latex-base, booktabs)")
-def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
+def test_latex_tables_compile_without_warnings(tmp_path: Path) -> None:
     shown = Shown(intervals=True, ceilings=True, scenes_count=True)
     rows = [measured("opensu3d", 0.41), measured("conceptgraphs-detector", 0.387), measured("sam3d@a=[1.0,2.0]", 0.2)]
     instances = [measured_instances("opensu3d", 0.41), measured_instances("openmask3d-segment3d", 0.387)]

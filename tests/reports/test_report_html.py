@@ -1,4 +1,4 @@
-"""The page of runs: what it holds, that nothing of a run is markup, what it says of gaps."""
+"""The HTML report: its numbers and maps, and that no text of a run is markup."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 class Elements(HTMLParser):
-    """The elements of a page and the content of its scripts by id."""
+    """Collects the elements of a page and the content of its scripts by id."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ def data_of(text: str) -> dict[str, Any]:
     return found
 
 
-def test_the_page_holds_the_numbers_of_the_record(run: Path, page: str) -> None:
+def test_page_has_the_numbers_of_metrics_json(run: Path, page: str) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     found = data_of(page)
     assert [(one["method"], one["protocol"]) for one in found["results"]] == [
@@ -88,7 +88,7 @@ def test_the_page_holds_the_numbers_of_the_record(run: Path, page: str) -> None:
         assert [one["metrics"] for one in shown["anytime"]] == [one["metrics"] for one in stored["anytime"]]
 
 
-def test_confusions_errors_times_and_comparisons_are_there_for_every_method(page: str) -> None:
+def test_page_has_confusion_errors_timing_and_comparison_of_every_method(page: str) -> None:
     found = data_of(page)
     methods = found["runs"][0]["methods"]
     assert len(methods) == 2
@@ -102,7 +102,7 @@ def test_confusions_errors_times_and_comparisons_are_there_for_every_method(page
     assert set(found["timing"][0]["series"]) == {"painted/a", "painted/b"}
 
 
-def test_nothing_may_run_or_be_loaded_but_what_stands_in_the_page(page: str) -> None:
+def test_page_policy_allows_only_embedded_scripts_and_styles(page: str) -> None:
     found = elements(page)
     policy = next(value for name, value in found.attributes if name == "content" and value and "default-src" in value)
     for kind, content in (("script", found.content["script"]), ("style", found.content["style"])):
@@ -116,7 +116,7 @@ def test_nothing_may_run_or_be_loaded_but_what_stands_in_the_page(page: str) -> 
     assert not re.search(r"https?:|//[a-z]+\.|fetch\(|XMLHttpRequest|import\(|innerHTML|outerHTML|eval\(|url\(", used)
 
 
-def test_no_text_of_a_run_is_markup() -> None:
+def test_hostile_text_of_a_run_is_never_markup() -> None:
     plain = elements(page_html("title", {"name": ""}, [{"name": ""}], ["AAAA"]))
     found = elements(page_html(HOSTILE, {"name": HOSTILE, HOSTILE: 1}, [{"name": HOSTILE}], ["AAAA"]))
     assert found.tags == plain.tags
@@ -125,7 +125,7 @@ def test_no_text_of_a_run_is_markup() -> None:
     assert found.content["title"] == HOSTILE
 
 
-def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: str) -> None:
+def test_packed_map_has_instances_colours_and_ground_truth(run: Path, page: str) -> None:
     found = elements(page)
     listed = data_of(page)["maps"]
     assert [(one["scene"], one["reason"]) for one in listed] == [("painted/a", None)] * 2 + [("painted/b", None)] * 2
@@ -146,12 +146,12 @@ def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: 
     }
     called = np.array([one["class"] for one in about["instances"]])[planes["owner"]]
     is_scored = planes["truth"] < NOT_SCORED
-    assert 0.2 < is_scored.mean() < 1  # walls are not
+    assert 0.2 < is_scored.mean() < 1  # walls are not scored
     assert (called == planes["truth"])[is_scored].mean() > 0.9
     assert len(planes["colour"]) == about["n"]
 
 
-def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(run: Path, tmp_path: Path) -> None:
+def test_ground_truth_of_a_map_lists_its_objects_and_the_missed_ones(run: Path, tmp_path: Path) -> None:
     changed = tmp_path / "run"
     shutil.copytree(run, changed)
     place = changed / "scenes" / "painted.a" / "collector" / "prediction.npz"
@@ -174,7 +174,7 @@ def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(
     assert distance.min(axis=1).max() < truth["step"]
     nearest_instance = of_dataset.instance[distance.argmin(axis=1)]
     assert (planes["owner"] == nearest_instance - 1).mean() > 0.99
-    assert np.array_equal(planes["owner"], planes["class"])  # one object a class, in the order of the classes
+    assert np.array_equal(planes["owner"], planes["class"])  # one object per class, in class order
     about, _ = unpacked(found.content["map-0"])
     assert about["beside"] == {
         "truth": 0, "objects": 4, "protocol": "rooms-instance", "counted": [0, 1, 2], "missed": [0],
@@ -185,7 +185,7 @@ def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(
     assert untouched["beside"]["missed"] == []
 
 
-def test_a_mask_is_an_object_of_the_truth_where_they_share_more_than_half() -> None:
+def test_mask_matches_an_object_if_they_share_more_than_half() -> None:
     labels = LabelSet("painted", (5, 9), ("chair", "lamp"))
     instance = np.repeat([0, 40, 7], 10).astype(np.int32)
     semantic = np.repeat([0, 9, 5], 10).astype(np.int32)
@@ -196,7 +196,7 @@ def test_a_mask_is_an_object_of_the_truth_where_they_share_more_than_half() -> N
     assert found == {2: lamp, 3: chair, 4: chair}  # half is not more than half
 
 
-def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: str) -> None:
+def test_instance_appears_at_the_update_of_its_first_view(run: Path, page: str) -> None:
     about, _ = unpacked(elements(page).content["map-0"])
     stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
     assert isinstance(stored, Instances)
@@ -207,7 +207,7 @@ def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: st
     assert [one["born"] for one in about["instances"]] == first
 
 
-def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path: Path) -> None:
+def test_dense_features_have_one_class_per_point_and_no_instances(run: Path, tmp_path: Path) -> None:
     changed = tmp_path / "run"
     shutil.copytree(run, changed)
     points = np.array([[0, 0, 1], [0, 0, 2], [5, 0, 2], [5, 5, 2]], np.float32)

@@ -1,4 +1,4 @@
-"""Tables for papers: which numbers stand in them, what is marked, what is said beside, in every format."""
+"""Tables for papers: numbers, marks of best values, and notes, in every format."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def best(table: Table) -> list[list[bool]]:
     return [[cell.is_best for cell in row.cells] for row in table.rows if not row.is_reported]
 
 
-def test_measured_and_reported_rows_never_stand_without_a_mark() -> None:
+def test_published_rows_are_marked_in_every_format() -> None:
     (table,) = paper_table("II", [measured()], Shown(), with_published=True)
     assert texts(table)[0] == ["opensu3d", "40.0", "20.0"]
     assert texts(table)[-1] == ["opensu3d (as reported [e])", "42.6", "40.9"]
@@ -50,14 +50,14 @@ def test_rows_of_different_scenes_are_not_compared() -> None:
     assert any("different scenes" in note for note in table.notes)
 
 
-def test_the_best_is_marked_in_each_column_and_equal_ones_together() -> None:
+def test_best_value_per_column_is_marked_including_ties() -> None:
     rows = [measured(), measured("sam3d", 0.4002), measured("conceptgraphs", 0.3)]
     assert best(protocol_table(rows, Shown(), [])) == [[True, True], [True, True], [False, False]]
     assert best(protocol_table([measured(), measured("sam3d", 0.5)], Shown(), [])) == [[False, False], [True, True]]
     assert best(protocol_table([measured()], Shown(), [])) == [[False, False]]
 
 
-def test_only_a_significant_best_is_marked_on_request() -> None:
+def test_only_significant_best_values_are_marked_on_request() -> None:
     clear = [measured(), measured("sam3d", 0.5)]
     table = protocol_table(clear, Shown(only_significant=True), [])
     assert best(table) == [[False, False], [True, True]]
@@ -66,13 +66,13 @@ def test_only_a_significant_best_is_marked_on_request() -> None:
     )
     mixed = {
         scene: {"mAcc": 0.4 + (0.3 if k % 2 else -0.2), "F-mIoU": 0.3} for k, scene in enumerate(SCENES)
-    }  # higher on the whole, but not in every scene
+    }  # higher overall, but not in every scene
     unclear = [measured(), measured("sam3d", 0.45, per_scene=mixed)]
     assert best(protocol_table(unclear, Shown(only_significant=True), [])) == [[False, False], [False, True]]
     assert best(protocol_table(unclear, Shown(), [])) == [[False, False], [True, True]]
 
 
-def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they_are_not_it() -> None:
+def test_papers_protocol_is_preferred_and_other_setups_are_stated() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
     told = "Semantic segmentation on replica, replica-conceptgraphs-ex6"
@@ -90,7 +90,7 @@ def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they
         assert paper_table("II", [row], Shown(), with_published=False)[0].caption.endswith(f": other {other_thing}.")
     lacking = measured(
         per_scene={}, metrics=dict.fromkeys(whole.metrics)
-    )  # its protocol wants files that are not there
+    )  # the files required by its protocol are missing
     (other,) = paper_table("II", [lacking, own], Shown(), with_published=False)
     assert [row.cells[0].text for row in other.rows] == ["40.0"]
     assert other.caption.endswith("rooms-semantic; not the paper's set-up: other protocol, perception.")
@@ -107,7 +107,7 @@ SWEEP = [
 
 
 def swept(scenes: tuple[str, ...], **accuracy: float) -> list[Measured]:
-    """The rows of ``SWEEP`` on some scenes: each a little apart from the method's own, in every scene alike."""
+    """The rows of ``SWEEP`` on some scenes, with the same difference from the default in every scene."""
     names = {"own": "opensu3d", "m1": "opensu3d@top_m=1", "k1": "opensu3d@crop_ratios=[1.0]"}
     rows = []
     for short, name in names.items():
@@ -118,16 +118,16 @@ def swept(scenes: tuple[str, ...], **accuracy: float) -> list[Measured]:
     return [replace(row, protocol=SEMANTIC) if row.kind == "semantic" else row for row in rows]
 
 
-def test_table_i_holds_each_row_against_the_methods_own_with_holms_correction() -> None:
+def test_table_i_compares_each_row_with_the_default_with_holms_correction() -> None:
     table = ablation_table(swept(SCENES, own=0.4, m1=0.3, k1=0.45), SWEEP, Shown(), with_published=True)
     own = [row for row in table.rows if not row.is_reported]
     assert [row.label for row in own] == ["m = 1", "m = 5", "k = 3", "k = 1"]
     assert [cell.text for cell in own[1].cells] == ["40.0", "20.0", "40.0", "40.0", "40.0"]
-    # two other rows: each p of 2 / 2**8 counts twice, then at least as much
+    # two other rows: Holm's correction doubles the smaller p of 2 / 2**8
     assert [row.cells[0].beside for row in own] == ["(-10.0, p 0.016)", "", "", "(+5.0, p 0.016)"]
     assert [row.cells[0].is_best for row in own] == [False, True, False, True]
     assert {row.label for row in table.rows if row.is_reported} >= {"m = 10", "ratios = 0.1,1,1.1"}
-    assert latex([table]).count(r"\midrule") == 2 * (2 + 3)  # in two halves, for the width
+    assert latex([table]).count(r"\midrule") == 2 * (2 + 3)  # split in two halves because of the width
     assert any("Holm's correction over the 2 other rows" in note for note in table.notes)
     assert table.caption == (
         "Ablation of single parameters on replica, replica-openmask3d-semantic and replica-openmask3d; not the "

@@ -1,4 +1,4 @@
-"""Tables for papers: from runs, on the command line, and checked again from LaTeX."""
+"""Tables for papers: built from runs on the command line and verified in LaTeX sources."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from su3d_bench.reports.tables.paper import Shown, selection_tables
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run over four painted scenes with a method and two variants of it."""
+    """A run on four painted scenes with a method and two variants of it."""
     out = tmp_path_factory.mktemp("sweep") / "runs" / "a run"
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
@@ -40,7 +40,7 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-def test_tables_of_a_run_hold_what_its_record_holds(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_of_a_run_have_the_numbers_of_metrics_json(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tables = json.loads(told(capsys, "tables", str(sweep), "--table", "II", "III", "--json"))
     record = json.loads((sweep / "metrics.json").read_text())
     expected = {
@@ -56,7 +56,7 @@ def test_tables_of_a_run_hold_what_its_record_holds(sweep: Path, capsys: pytest.
     assert found == expected
 
 
-def test_verify_finds_every_cell_that_was_changed_by_hand(
+def test_verify_finds_each_modified_cell(
     sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(sweep.parent.parent)
@@ -90,7 +90,7 @@ def test_verify_finds_every_cell_that_was_changed_by_hand(
     assert main(["report", "verify", str(paper), "--root", str(sweep.parent.parent)]) == 0
 
 
-def test_what_a_paper_reads_from_its_own_folder_is_checked_too(
+def test_verify_checks_files_included_from_the_papers_folder(
     sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paper, outside = tmp_path / "paper", tmp_path / "outside.tex"
@@ -104,7 +104,7 @@ def test_what_a_paper_reads_from_its_own_folder_is_checked_too(
     assert capsys.readouterr().out == f"{n_cells} cells checked, 0 differ\n"
 
 
-def test_numbers_come_from_the_counts_not_from_the_record(sweep: Path, tmp_path: Path) -> None:
+def test_numbers_are_computed_from_counts_not_metrics_json(sweep: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(sweep, copy)
     record = json.loads((copy / "metrics.json").read_text())
@@ -117,7 +117,7 @@ def test_numbers_come_from_the_counts_not_from_the_record(sweep: Path, tmp_path:
     assert sum(check.fault is not None for check in check_paper(paper)) == len(found) / 2 * 5
 
 
-def test_runs_on_other_data_do_not_stand_in_one_table(sweep: Path, tmp_path: Path) -> None:
+def test_runs_on_different_data_are_not_combined(sweep: Path, tmp_path: Path) -> None:
     copy = tmp_path / "other"
     shutil.copytree(sweep, copy)
     record = json.loads((copy / "run.json").read_text())

@@ -1,4 +1,4 @@
-"""What updates cost: reading the tables of a run, summing them up, the report as people see it."""
+"""Timing report: reading the update times of a run, summaries, and the printed report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def stages_of(summary: Any) -> dict[str, Any]:
     return {one.name: one for one in summary.stages}
 
 
-def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
+def test_growth_distinguishes_noisy_constant_and_noisy_root() -> None:
     sizes = np.linspace(1e4, 1e6, 200)
     noise = np.exp(np.random.default_rng(0).normal(0, 0.1, 200))
     flat, root = growth_exponent(sizes, 20.0 * noise), growth_exponent(sizes, np.sqrt(sizes) * noise)
@@ -41,7 +41,7 @@ def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
     assert root is not None and root.low < 0.5 < root.high and root.words == "grows"
 
 
-def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> None:
+def test_percentiles_exclude_warm_up_and_shares_include_it() -> None:
     total = np.array([100.0, 50.0, 10.0, 10.0, 20.0, 30.0])
     summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
     stage = stages_of(summary)["total"]
@@ -52,7 +52,7 @@ def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> 
     assert summary.frames_per_s == pytest.approx(60 / 0.22)
 
 
-def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:
+def test_sizes_are_maxima_over_scenes_and_finish_is_of_the_final_maps() -> None:
     first = times(np.ones(2), n_points=np.array([7.0, 5.0]), map_bytes=np.array([10.0, 90.0]))
     second = times(np.ones(3))
     maps = tuple(MapCost(n_updates=n, finish_ms=ms) for n, ms in ((1, 50.0), (2, 4.0)))
@@ -66,12 +66,12 @@ def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps(
     assert (none.n_points, none.map_bytes, none.peak_rss_bytes, none.device_bytes, none.finish_ms) == (None,) * 5
 
 
-def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:
+def test_map_time_excludes_reading_and_perception() -> None:
     one = times(np.full(4, 10.0), decode_ms=np.full(4, 3.0), encode_ms=np.full(4, 4.0), match_ms=np.full(4, 2.0))
     np.testing.assert_array_equal(one.ms("map"), 2.0)
 
 
-def test_a_run_records_sizes_memory_and_the_cost_of_every_map(run: Path) -> None:
+def test_run_records_sizes_memory_and_cost_of_every_map(run: Path) -> None:
     (first, second) = read_update_times(read_run(run), "collector")
     assert [first.scene, second.scene] == ["painted/a", "painted/b"]
     assert len(first) == 6
@@ -81,7 +81,7 @@ def test_a_run_records_sizes_memory_and_the_cost_of_every_map(run: Path) -> None
     assert all(isinstance(one, MapCost) and one.finish_ms >= 0 for one in first.maps)
 
 
-def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: Path) -> None:
+def test_intermediate_maps_are_scored_in_metrics_json(run: Path) -> None:
     results = json.loads((run / "metrics.json").read_text())["results"]
     for one in results:
         assert [midway["share"] for midway in one["anytime"]] == [0.1, 0.5]
@@ -90,7 +90,7 @@ def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: 
     assert coverage[0] <= coverage[1] <= results[0]["result"]["metrics"]["mAcc"]
 
 
-def test_the_report_prints_tables_and_writes_them_with_plots(
+def test_timing_report_prints_tables_and_writes_plots(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["report", "timing", str(run), "--out", str(tmp_path), "--warm-up", "1"]) == 0

@@ -141,7 +141,7 @@ def test_unscored_maps_are_summarised_instead_of_dashes(capsys: pytest.CaptureFi
     noisy = [*words(scenes="b")[3:], "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.3"]
     assert main(["run", "--scenes", f"{PAINTED}/b", *noisy, "--set", "painted.fault=no-truth"]) == 0
     said = capsys.readouterr()
-    assert said.out.startswith("no protocol scores these scenes\n\n**Found, not scored**\n")
+    assert said.out.startswith("no protocol applies to these scenes\n\n**Maps without scores**\n")
     rows = [line for line in said.out.splitlines() if line.startswith("| painted/b")]
     assert [row.split("|")[2].strip() for row in rows] == ["collector", "collector@noise_m=0.3"]
     assert all(" / " in row.split("|")[5] and row.split("|")[8].strip() != "-" for row in rows)

@@ -1,4 +1,4 @@
-"""Pages that are made from the code, and the place of every page in the navigation."""
+"""Generated documentation pages, navigation and links of the documentation site."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def words(page: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]+>", "", page)).split())
 
 
-def test_every_protocol_has_a_page_with_every_rule_source_and_class(pages: dict[str, str]) -> None:
+def test_each_protocol_page_has_every_rule_source_and_class(pages: dict[str, str]) -> None:
     for name in loading.protocol_names():
         rules, text = loading.load_protocol(name), pages[f"{PROTOCOLS}/{name}.md"]
         shown = words(text)
@@ -58,7 +58,7 @@ def test_every_protocol_has_a_page_with_every_rule_source_and_class(pages: dict[
         assert rules.digest in shown
 
 
-def test_every_method_has_a_page_with_every_setting_preset_and_published_row(pages: dict[str, str]) -> None:
+def test_each_method_page_has_every_setting_preset_and_published_row(pages: dict[str, str]) -> None:
     for name in registry.BUILT_IN["method"]:
         text, told = pages[f"{METHODS}/{name}.md"], summary_of(name)
         assert all(f"<td><code>{'.'.join(path)}</code></td>" in text for path, _ in flatten(told["settings"]))
@@ -69,11 +69,11 @@ def test_every_method_has_a_page_with_every_setting_preset_and_published_row(pag
             assert f"<td>{', '.join(f'{metric} {value}' for metric, value in figure.values.items())}</td>" in text
 
 
-def test_every_public_name_has_its_place_in_the_reference(pages: dict[str, str]) -> None:
+def test_reference_lists_every_public_name(pages: dict[str, str]) -> None:
     assert sorted(re.findall(r"^::: su3d_bench\.(\w+)$", pages[API], re.MULTILINE)) == sorted(su3d_bench.__all__)
 
 
-def test_nothing_in_a_protocol_file_acts_on_its_page(tmp_path: Path) -> None:
+def test_hostile_text_of_a_protocol_file_is_never_markup(tmp_path: Path) -> None:
     text = (ROOT / "su3d_bench/metrics/rules/rooms/rooms-instance.toml").read_text()
     hostile = "</td></table><script>alert(1)</script><img src=x onerror=y> `<b>` **"
     text = text.replace('name = "rooms-instance"', f"name = '{hostile} name'")
@@ -101,7 +101,7 @@ class _Tags(HTMLParser):
         self.attributes.append((tag, attributes))
 
 
-def test_every_page_has_one_place_in_the_navigation(pages: dict[str, str]) -> None:
+def test_every_page_is_in_the_navigation_once(pages: dict[str, str]) -> None:
     docs = ROOT / "docs"
     there = {str(path.relative_to(docs)) for path in docs.rglob("*.md")} | set(pages)
     there |= set(ROOT_PAGES.values())
@@ -110,7 +110,7 @@ def test_every_page_has_one_place_in_the_navigation(pages: dict[str, str]) -> No
 
 
 def _settings() -> dict[str, Any]:
-    """mkdocs.yml, whose one value for mkdocs alone is left out."""
+    """The settings of mkdocs.yml, without its Python object."""
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
         pass
@@ -120,14 +120,14 @@ def _settings() -> dict[str, Any]:
     return settings
 
 
-def test_the_site_asks_for_nothing_that_is_elsewhere() -> None:
+def test_site_loads_nothing_from_the_network() -> None:
     settings = _settings()
     assert settings["theme"]["font"] is False
     assert "offline" in settings["plugins"]
     assert all((ROOT / "docs" / name).is_file() for name in [*settings["extra"]["polyfills"], *settings["extra_css"]])
 
 
-def test_the_check_of_a_site_finds_dead_links_and_what_is_loaded_from_elsewhere(tmp_path: Path) -> None:
+def test_site_check_finds_dead_links_and_external_resources(tmp_path: Path) -> None:
     (tmp_path / "a.css").write_text("b { background: url( 'https://example.org/x.png') }")
     (tmp_path / "b.html").write_text('<h1 id="there">b</h1>')
     (tmp_path / "index.html").write_text(
@@ -152,7 +152,7 @@ def test_the_check_of_a_site_finds_dead_links_and_what_is_loaded_from_elsewhere(
     ]
 
 
-# texts on their way into the site
+# conversion of texts for the site
 
 HERE = {"su3d_bench/core/types.py", "action.yml", "benchmarks/README.md"}
 
@@ -161,7 +161,7 @@ def as_site(text: str, page: str = "docs/running/gpu.md", repository: str | None
     return for_site(text, page, HERE.__contains__, repository)
 
 
-def test_the_examples_of_hooks_and_texts_hold() -> None:
+def test_docstring_examples_of_site_tools_pass() -> None:
     assert doctest.testmod(site_hooks).failed == doctest.testmod(site_text).failed == 0
 
 
@@ -180,26 +180,26 @@ def test_the_examples_of_hooks_and_texts_hold() -> None:
         ("README.md", "[a](#licence)", "[a](#licence)"),
     ],
 )
-def test_links_lead_to_pages_of_the_site(page: str, link: str, there: str) -> None:
+def test_links_are_converted_to_pages_of_the_site(page: str, link: str, there: str) -> None:
     assert as_site(f"See {link}.", page) == f"See {there}."
 
 
-def test_a_link_out_of_the_docs_is_a_path_where_no_code_host_is_known() -> None:
+def test_link_to_code_is_a_path_without_a_repository_url() -> None:
     text = "[core/types.py](../../su3d_bench/core/types.py), [`action.yml`](../../action.yml)"
-    text += ", [the gate](../../action.yml)"
-    assert as_site(text) == "`su3d_bench/core/types.py`, `action.yml`, the gate (`action.yml`)"
-    assert as_site("[the gate](../../action.yml#L3)", repository="https://example.org/a/b") == (
-        "[the gate](https://example.org/a/b/blob/main/action.yml#L3)"
+    text += ", [the check](../../action.yml)"
+    assert as_site(text) == "`su3d_bench/core/types.py`, `action.yml`, the check (`action.yml`)"
+    assert as_site("[the check](../../action.yml#L3)", repository="https://example.org/a/b") == (
+        "[the check](https://example.org/a/b/blob/main/action.yml#L3)"
     )
 
 
 @pytest.mark.parametrize("link", ["[a](../../gone.py)", "[a](../../../outside.md)"])
-def test_a_link_to_what_is_not_there_stays_for_the_build_to_refuse(link: str) -> None:
+def test_dead_link_is_kept_for_the_build_to_reject(link: str) -> None:
     assert as_site(link) == link
     assert as_site(link, repository="https://example.org/a/b") == link
 
 
-def test_no_text_acts_on_the_page() -> None:
+def test_hostile_text_is_never_markup_on_the_site() -> None:
     hostile = '</p><script>alert(1)</script>\n\n# x `<b>` ![y](z) https://a.b/"><script> \x1b[31m\u202e'
     for shown in (plain(hostile), prose(hostile), heading(hostile)):
         assert "<script" not in shown and "<b>" not in shown and "\n" not in shown
@@ -207,7 +207,7 @@ def test_no_text_acts_on_the_page() -> None:
     assert "![y]" not in heading(hostile)
 
 
-def test_an_example_is_a_block_of_code_and_the_rest_of_the_text_as_it_was() -> None:
+def test_docstring_example_becomes_a_code_block() -> None:
     text = "One.\n\n    Two:\n    >>> f(\n    ...     1)\n    2\n    >>> 3\n    3\n\n    ``a`` > b.\n    "
     assert with_examples(text) == "One.\n\nTwo:\n\n```pycon\n>>> f(\n...     1)\n2\n>>> 3\n3\n```\n\n``a`` > b."
     assert with_examples("No example, a > b.") == "No example, a > b."

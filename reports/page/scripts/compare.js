@@ -1,10 +1,10 @@
-// The sections of what is compared with what, and of what the numbers depend on.
+// The sections Compare and Provenance.
 
 function compareSection() {
   if (!DATA.comparisons.length) return;
-  part('compare', 'Compare', 'B − A over the common scenes, in percentage points: p of the exact sign-flip '
-    + 'test over scenes, with the smallest p possible for this number of scenes; p adjusted by Holm over all metrics of '
-    + 'the comparison; and the 95 % jackknife t interval. Bold: adjusted p below 0.05.', (section) => {
+  part('compare', 'Compare', 'Difference B − A over the common scenes, in percentage points, with the 95 % confidence '
+    + 'interval (jackknife t); p of the exact sign-flip test over scenes, with the smallest possible p for this number '
+    + 'of scenes; p adjusted by Holm over all metrics of the comparison. Bold: adjusted p below 0.05.', (section) => {
     const sides = [...new Set(DATA.comparisons.flatMap((one) => [one.left, one.right].map(String)))].map((text) => {
       const at = text.indexOf(',');
       return [text, sideName(Number(text.slice(0, at)), text.slice(at + 1))];
@@ -28,7 +28,7 @@ function compareSection() {
   });
 }
 
-// The table of one comparison; `isTurned` where its right side is A.
+// The table of one comparison; `isTurned` if its right side is A.
 function compared(one, isTurned) {
   const times = (value) => (isNumber(value) ? (isTurned ? -value : value) : null);
   const intervalOf = (d) => d.interval && (isTurned ? [-d.interval[1], -d.interval[0]] : d.interval);
@@ -39,18 +39,18 @@ function compared(one, isTurned) {
     ofAll: d.p_of_all, disagreement: d.disagreement,
     scenes: Object.entries(d.per_scene).map(([scene, value]) => [scene, times(value)]) })));
   const spread = (row) => (row.interval ? h('small', null, ` [${row.interval.map(signed).join(', ')}]`) : null);
-  const least = (row) => h('small', null, ` (${plural(row.pairs, 'scene')}, at least ${row.least.toPrecision(2)})`);
+  const least = (row) => h('small', null, ` (${plural(row.pairs, 'scene')}, min. ${row.least.toPrecision(2)})`);
   const table = dataTable({ caption: 'Differences, B − A', rows, columns: [
     { label: 'Protocol', value: (row) => row.protocol }, { label: 'Metric', value: (row) => row.metric },
     { label: 'p', num: true, value: (row) => row.p,
       show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), least(row)] : '–') },
-    { label: 'p of all', num: true, value: (row) => row.ofAll,
+    { label: 'Adjusted p', num: true, value: (row) => row.ofAll,
       show: (row) => (isNumber(row.ofAll) ? row.ofAll.toPrecision(2) : '–') },
     { label: 'A', num: true, value: (row) => row.left, show: (row) => percent(row.left) },
     { label: 'B', num: true, value: (row) => row.right, show: (row) => percent(row.right) },
     { label: 'B − A', num: true, value: (row) => row.difference, show: (row) => [signed(row.difference), spread(row)],
       best: (row) => isNumber(row.ofAll) && row.ofAll < 0.05 },
-    { label: 'Scene by scene', value: (row) => row.n, show: differenceStrip }] });
+    { label: 'Per scene', value: (row) => row.n, show: differenceStrip }] });
   const odd = rows.filter((row) => row.disagreement).map((row) => `${row.protocol}, ${row.metric}: ${row.disagreement}`);
   const notes = [...odd, ...one.remarks, ...one.protocols.flatMap((p) => p.remarks)];
   return [table, h('div', null, noteList([...new Set(notes)]))];
@@ -72,7 +72,7 @@ function provenanceSection() {
     RUNS.forEach((run, index) => {
       const lines = factsOfRun(run).flatMap(([name, text]) => [h('dt', null, name), h('dd', null, text)]);
       fill(section, null, [h('h3', null, runNames[index]), h('dl', null, lines), noteList(run.warnings)]);
-      section.append(h('details', null, h('summary', null, 'Rules and data'), protocolsOf(run), dataOf(run)),
+      section.append(h('details', null, h('summary', null, 'Protocols and data'), protocolsOf(run), dataOf(run)),
         h('details', null, h('summary', null, `Settings (${run.settings.length})`), settingsOf(run)));
     });
   });
@@ -83,10 +83,10 @@ function factsOfRun(run) {
   const packages = Object.entries(run.packages).map(([name, version]) => `${name} ${version}`);
   return [
     ['Folder', run.name], ['Status', run.is_partial ? `${status}, partial: ${run.limit} frames per scene` : status],
-    ['Methods', run.methods.join(', ')], ['Scenes', String(run.scenes.length)], ['Profile', run.profile || '–'],
+    ['Methods', run.methods.join(', ')], ['Scenes', String(run.scenes.length)], ['Perception profile', run.profile || '–'],
     ['Encoder', run.encoder ? `${run.encoder}, ${run.encoder_digest || 'no digest'}` : '–'],
     ['Seed', String(run.seed ?? '–')], ['Code', run.code],
-    ['Commit', run.git ? `${run.git.commit}${run.git.is_dirty ? ', with changes' : ''}` : 'not recorded'],
+    ['Commit', run.git ? `${run.git.commit}${run.git.is_dirty ? ', modified' : ''}` : 'not recorded'],
     ['Hardware', run.hardware], ['Packages', packages.join(', ')],
   ];
 }
@@ -98,7 +98,7 @@ function protocolsOf(run) {
     { label: 'Digest', value: (row) => row.digest, show: (row) => hash(row.digest) }] });
 }
 function dataOf(run) {
-  return dataTable({ caption: 'Data of the scenes', rows: Object.entries(run.data_digests), columns: [
+  return dataTable({ caption: 'Scene data', rows: Object.entries(run.data_digests), columns: [
     { label: 'Scene', value: (row) => row[0] },
     { label: 'Digest', value: (row) => row[1], show: (row) => hash(row[1]) }] });
 }

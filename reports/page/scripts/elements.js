@@ -56,9 +56,8 @@ function compareValues(a, b) {
 // Stays in place when the table scrolls horizontally.
 const captionOf = (text) => h('caption', null, h('span', null, text));
 
-// A table that sorts by its headers and, with `filter`, shows the rows whose text holds what is typed.
-// Columns: {label, title, value(row), show(row), num, best}; rows of `onRow` can be chosen by mouse and keyboard. Of
-// those that fit what is typed the first `most` stand there.
+// A sortable table; with `filter`, a search field filters its rows. Columns: {label, title, value(row), show(row), num,
+// best}; with `onRow`, rows can be selected by mouse and keyboard. At most `most` of the matching rows are shown.
 function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, onRow, foot, most = Infinity }) {
   const state = { column: sortBy === undefined ? null : sortBy, down: !!descending, text: '' };
   const body = h('tbody');
@@ -96,8 +95,8 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
       const order = (a, b) => (state.down ? -1 : 1) * compareValues(value(a), value(b));
       shown = [...shown].sort((a, b) => (missing(a) - missing(b)) || order(a, b));
     }
-    const cut = shown.length > most ? `, the first ${most} are shown` : '';
-    counter.textContent = `${shown.length === rows.length ? '' : `${shown.length} of `}${rows.length} rows${cut}`;
+    const cut = shown.length > most ? `, first ${most} shown` : '';
+    counter.textContent = `${shown.length === rows.length ? '' : `${shown.length} of `}${plural(rows.length, 'row')}${cut}`;
     body.replaceChildren(...shown.slice(0, most).map(line));
   }
   function line(row) {
@@ -134,7 +133,7 @@ function noteList(lines, most = 6) {
 }
 
 function whisker(value, interval, ceiling) {
-  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the ground-truth ceiling.
+  // 0 to 100 %: a dot at the value, a line for its confidence interval, a tick at the ground-truth ceiling.
   const width = 104, x = (v) => 2 + Math.min(1, Math.max(0, v)) * (width - 4);
   if (!isNumber(value)) return null;
   return svg('svg', { width, height: 10, viewBox: `0 0 ${width} 10`, 'aria-hidden': 'true' },
@@ -161,7 +160,7 @@ function linePlot({ label, lines, xLabel, yLabel }) {
   const width = 760, height = 300, left = 62, right = 12, top = 22, bottom = 42;
   const xs = lines.flatMap((one) => one.x), ys = lines.flatMap((one) => one.y);
   const plot = svg('svg', { viewBox: `0 0 ${width} ${height}`, width, role: 'img', 'aria-label': label });
-  if (!xs.length) return h('p', { class: 'intro' }, 'Nothing was timed here.');
+  if (!xs.length) return h('p', { class: 'intro' }, 'No timings.');
   const xHigh = Math.max(...xs, 1e-9), yHigh = Math.max(...ys, 1e-9) * 1.05;
   const px = (v) => left + (v / xHigh) * (width - left - right);
   const py = (v) => height - bottom - (v / yHigh) * (height - top - bottom);

@@ -1,12 +1,12 @@
-// The sections of what goes wrong: confusion of classes, and what each kind of error costs.
+// The sections Confusion (of classes) and Errors (cost of each kind of error).
 
-const MAX_CONFUSED = 18, MAX_PAIRS = 200; // that are shown until more are asked for
+const MAX_CONFUSED = 18, MAX_PAIRS = 200; // shown by default
 
 function confusionSection() {
   const usable = DATA.confusions;
   if (!usable.length) return;
-  part('confusion', 'Confusion', 'Rows are the true class, columns what the map calls its points, as shares of the '
-    + 'row. The classes with most points come first.', (section) => {
+  part('confusion', 'Confusion', 'Rows are ground-truth classes, columns predicted classes; each cell is the '
+    + 'percentage of the points of its row. The classes with the most points come first.', (section) => {
     const names = [...new Set(usable.map((one) => one.protocol))], place = h('div');
     const protocols = protocolField(names), side = select('Method', [], null, draw);
     const amounts = [[MAX_CONFUSED, `the ${MAX_CONFUSED} largest`], [Infinity, 'all']];
@@ -41,17 +41,17 @@ function confusionTables(one, most) {
   const columns = [...shown, -1];
   function cellOf(truth, called) {
     const n = cells.get(`${truth},${called}`) || 0, share = n / total.get(truth);
-    const title = `${label(truth)} called ${label(called)}: ${percent(share)} %, ${countText(n)} points`;
+    const title = `${label(truth)} predicted as ${label(called)}: ${percent(share)} %, ${countText(n)} points`;
     const text = share >= 0.005 ? (100 * share).toFixed(0) : '';
     const wish = wishOf(one, label(truth), label(called));
-    const content = truth === called || !n ? text : toGallery(text, wish, `${title}; the worst errors of this kind`);
+    const content = truth === called || !n ? text : toGallery(text, wish, `${title}; show the worst errors of this kind`);
     const cell = h('td', { class: truth === called ? 'same' : null, title }, content);
     if (share > 0) cell.style.backgroundColor = `rgba(var(--heat), ${(0.06 + 0.84 * share).toFixed(3)})`;
     return cell;
   }
   const table = h('table', { class: 'confusion' },
     captionOf(`${nameOf(one)}, ${one.protocol}: ${shown.length < total.size ? `the ${shown.length} largest of ` : 'all '}`
-      + `${total.size} true classes`),
+      + `${total.size} ground-truth classes`),
     h('thead', null, h('tr', null, h('td'), columns.map((k) => h('th', { scope: 'col' }, h('span', null, label(k)))))),
     h('tbody', null, shown.map((truth) => h('tr', null, h('th', { scope: 'row' }, label(truth)),
       columns.map((called) => cellOf(truth, called))))));
@@ -62,40 +62,40 @@ function confusionTables(one, most) {
   return [
     h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Confusion matrix' }, table),
     h('h3', null, 'Largest confusions'),
-    dataTable({ caption: 'True class, what it is called instead, and how many points', rows: wrong,
+    dataTable({ caption: 'Ground-truth class, wrong predicted class, number of points', rows: wrong,
       filter: 'classes', tall: wrong.length > 10, most: MAX_PAIRS,
-      columns: [{ label: 'True class', value: (row) => row.truth, show: (row) => toGallery(row.truth, row.wish,
-        `The worst errors: ${row.truth} called ${row.called}`) }, { label: 'Called', value: (row) => row.called },
+      columns: [{ label: 'Ground truth', value: (row) => row.truth, show: (row) => toGallery(row.truth, row.wish,
+        `Worst errors: ${row.truth} predicted as ${row.called}`) },
+        { label: 'Prediction', value: (row) => row.called },
         { label: 'Points', num: true, value: (row) => row.n, show: (row) => countText(row.n) },
-        { label: 'Of the class', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` }] }),
+        { label: 'Share of the class', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` }] }),
   ];
 }
 
 const CAUSES = {
   instance: {
-    merged: 'one mask holds several objects', split: 'one object lies in several masks',
-    duplicate: 'a mask repeats another one’s object', mislabelled: 'the right mask, another class',
-    background: 'a mask that belongs to no object', missed: 'an object that no mask is of',
+    merged: 'one mask covers several objects', split: 'one object is split over several masks',
+    duplicate: 'a further mask of the same object', mislabelled: 'correct mask, wrong class',
+    background: 'a mask without an object', missed: 'an object without a mask',
   },
   semantic: {
-    geometry: 'no point of the map within 5 cm', background: 'the map is there, but no mask',
-    association: 'a mask that belongs to another object', label: 'the object’s own mask, another class',
+    geometry: 'no map point within 5 cm', background: 'map point nearby, but in no mask',
+    association: 'in the mask of another object', label: 'in the object’s own mask, wrong class',
   },
 };
 
 const LEFT = {
-  instance: 'masks that fit badly; mask and class wrong at once', semantic: 'what no class put right brings back',
+  instance: 'inaccurate masks; mask and class both wrong', semantic: 'classes that correcting points does not recover',
 };
-const STAGES = { labels: 'every mask named by the truth', '2D masks': 'masks and names of each image from the truth' };
+const STAGES = { labels: 'each mask labelled from ground truth', '2D masks': '2D masks and labels from ground truth' };
 
 function errorsSection() {
   if (!DATA.errors.length) return;
-  part('errors', 'Errors', 'What each kind of error costs: by how many percentage points the score rises when that '
-    + 'kind alone is put right and everything is scored anew. The score, the rises and the two rows below them add up '
-    + 'to 100.', (section) => {
+  part('errors', 'Errors', 'Cost of each kind of error: the gain in percentage points if only that kind is corrected '
+    + 'and everything is scored again. The score, the gains and the two rows below them add up to 100.', (section) => {
     const names = [...new Set(DATA.errors.flatMap((one) => one.protocols.map((p) => p.protocol)))];
     const reasons = DATA.errors.filter((one) => one.reason)
-      .map((one) => `${nameOf(one)}: not explained: ${one.reason}`);
+      .map((one) => `${nameOf(one)}: no error analysis: ${one.reason}`);
     if (!names.length) { fill(section, null, [noteList(reasons)]); return; }
     const place = h('div'), protocols = protocolField(names), metric = select('Metric', [], null, draw);
     section.append(h('div', { class: 'toolbar' }, protocols, metric), place);
@@ -110,7 +110,7 @@ function errorsSection() {
       draw();
     }
     function draw() {
-      place.replaceChildren(h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'What errors cost' },
+      place.replaceChildren(h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Cost of errors' },
         errorsTable(explained(), protocols.protocol(), metric.input.value)),
       h('div', null, noteList([...new Set(DATA.errors.flatMap((one) => one.remarks))])));
     }
@@ -135,19 +135,19 @@ function errorsTable(all, protocol, name) {
     const { gains, n } = one.causes[cause];
     const wish = { protocol, run: one.run, method: one.method, kind: cause, metric: name };
     const cost = [signed(gains[name]), bar(gains[name])];
-    return [toGallery(cost, wish, `The worst errors: ${cause}, ${nameOf(one)}`), h('br'), h('small', null, amount(one, n))];
+    return [toGallery(cost, wish, `Worst errors: ${cause}, ${nameOf(one)}`), h('br'), h('small', null, amount(one, n))];
   };
   const stages = [...new Set(all.flatMap((one) => Object.keys(one.stages)))];
   return h('table', null,
-    captionOf(`${protocol}: ${name}, the score in per cent and what would be added to it`),
+    captionOf(`${protocol}: ${name} in per cent, and gains in percentage points`),
     h('thead', null, h('tr', null, h('th', { scope: 'col' }, 'Kind of error'),
       all.map((one) => h('th', { scope: 'col', class: 'num' }, nameOf(one))))),
     h('tbody', null,
-      row('As it is', null, (one) => percent(one.values[name])),
+      row('Score', null, (one) => percent(one.values[name])),
       Object.keys(all[0].causes).map((cause) => row(cause, about[cause], (one) => costOf(one, cause))),
-      row('Several at once', 'what only putting several kinds right together adds or takes',
+      row('Interaction', 'all corrected together, minus the sum of the gains',
         (one) => signed(one.overlap[name])),
-      row('Out of reach', LEFT[all[0].kind] || 'what is lost with every kind put right', (one) => signed(one.rest[name])),
-      stages.map((stage) => row(`Score with true ${stage}`, STAGES[stage] || 'one stage replaced by the truth',
+      row('Remaining', LEFT[all[0].kind] || 'lost even if every kind is corrected', (one) => signed(one.rest[name])),
+      stages.map((stage) => row(`Score with ground-truth ${stage}`, STAGES[stage] || 'one stage from ground truth',
         (one) => (one.stages[stage] ? percent(one.stages[stage][name]) : '–')))));
 }

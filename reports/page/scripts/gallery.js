@@ -1,15 +1,15 @@
-// The gallery of single errors: cards sorted by cost, reached from rows of classes and scenes, cells and bars.
+// The gallery of individual errors: cards sorted by cost, linked from rows of classes and scenes, cells and bars.
 
 const CARDS_AT_ONCE = 24;
-const MORE_DIGITS = 2; // single errors cost less than whole kinds
+const MORE_DIGITS = 2; // individual errors cost less than whole kinds
 const gallery = { show: null };
-const EVERY = ''; // the choice that leaves nothing out
+const EVERY = ''; // the option without a filter
 
 const costText = (value) => (isNumber(value)
   ? (value >= 0 ? '+' : '−') + Math.abs(100 * value).toFixed(MORE_DIGITS) : '–');
 const isOf = (one, { run, method }) => method === undefined || (one.run === run && one.method === method);
 
-// Whether the gallery has a card for those wishes: {protocol, run, method, scene, kind, name, called}.
+// Whether the gallery has a card that matches {protocol, run, method, scene, kind, name, called}.
 function isInGallery(wish) {
   const { scene, kind, name, called } = wish;
   return DATA.gallery.some((one) => one.protocol === wish.protocol && isOf(one, wish)
@@ -18,7 +18,7 @@ function isInGallery(wish) {
       : !name || one.classes.includes(name)));
 }
 
-// The text, as a way to the gallery where it has cards for the wishes.
+// The text, as a link to the gallery if it has matching cards.
 function toGallery(text, wish, title) {
   if (!DATA.gallery || !isInGallery(wish)) return text;
   return h('button', { type: 'button', class: 'to-gallery', title, 'aria-label': text ? null : title,
@@ -27,10 +27,9 @@ function toGallery(text, wish, title) {
 
 function gallerySection() {
   if (!DATA.gallery || !DATA.gallery.length) return;
-  part('gallery', 'Worst errors', 'Individual errors, most costly first. The cost is by how many percentage points the '
-    + 'score over all scenes rises when this one error alone is put right and the score is formed anew. Costs do not '
-    + 'add up: two errors that hide each other cost nothing alone, and several put right at once may give more or '
-    + 'less than their sum.', galleryContent);
+  part('gallery', 'Worst errors', 'Individual errors, most costly first. The cost is the gain of the score over all '
+    + 'scenes, in percentage points, if only this error is corrected. Costs do not add up: two errors that mask each '
+    + 'other cost nothing alone, and correcting several together may gain more or less than their sum.', galleryContent);
   const section = byId('gallery');
   gallery.show = (wish, from) => { makeAll(); section.show(wish, from); };
 }
@@ -40,8 +39,8 @@ function galleryContent(section) {
   const protocols = protocolField(names), metric = select('Metric', [], null, () => draw());
   const fields = {
     side: select('Method', [], null, () => draw()), scene: select('Scene', [], null, () => draw()),
-    kind: select('Kind', [], null, () => draw()), name: select('Class, true or called', [], null, () => draw()),
-    called: select('Called', [], null, () => draw()),
+    kind: select('Kind', [], null, () => draw()), name: select('Class (true or predicted)', [], null, () => draw()),
+    called: select('Predicted class', [], null, () => draw()),
   };
   const back = h('button', { type: 'button', class: 'plain', hidden: true }, 'Back');
   const clear = h('button', { type: 'button', class: 'plain', onclick: () => { choose({}); draw(); } }, 'Show all');
@@ -49,8 +48,8 @@ function galleryContent(section) {
   const more = h('button', { type: 'button', class: 'plain', onclick: () => draw(n + CARDS_AT_ONCE) },
     'Show more');
   section.append(h('div', { class: 'toolbar' }, back, protocols, metric, Object.values(fields), clear),
-    h('ul', { class: 'key' }, h('li', null, h('i', { class: 'sign area' }), 'what the method says'),
-      h('li', null, h('i', { class: 'sign line' }), 'what is there')), status, cards, more);
+    h('ul', { class: 'key' }, h('li', null, h('i', { class: 'sign area' }), 'prediction'),
+      h('li', null, h('i', { class: 'sign line' }), 'ground truth')), status, cards, more);
 
   let n = CARDS_AT_ONCE, all = [], photos = new Map();
   const sideKey = (one) => `${one.run} ${one.method}`;
@@ -74,7 +73,7 @@ function galleryContent(section) {
     offer('scene', 'all scenes', [...new Set(mine.map((one) => one.scene))]);
     offer('kind', 'all kinds', [...new Set(mine.map((one) => one.kind))].sort());
     offer('name', 'all classes', classes('true', 'called'));
-    offer('called', 'anything', classes('called'));
+    offer('called', 'all classes', classes('called'));
     draw();
   }
   function fitting() {
@@ -94,7 +93,7 @@ function galleryContent(section) {
       + one[what].reduce((part, value, k) => part + (!scene || one.scenes[k] === scene ? value : 0), 0), 0);
     const told = sum('told'), there = sum('n');
     status.textContent = `${shown.length} of ${plural(found.length, 'error')}, ${withPhoto} with a photo`
-      + (told < there ? `; the ${told} dearest of ${there} stand here one by one` : '');
+      + (told < there ? `; only the ${told} most costly of ${there} are listed` : '');
     cards.replaceChildren(...shown.map((one) => cardOf(one, metric.input.value, photos.get(one.scene))));
     more.hidden = shown.length === found.length;
   }
@@ -138,8 +137,8 @@ function galleryContent(section) {
 
 function cardTitle(one) {
   const names = (list) => list.join(' + '), called = one.called.filter((name) => name !== 'none');
-  if (!one.true.length) return `${names(called) || 'a mask'} where no object is`;
-  return `${names(one.true)}, called ${names(called) || 'nothing'}`;
+  if (!one.true.length) return `${names(called) || 'mask'} without a ground-truth object`;
+  return `${names(one.true)}, predicted as ${names(called) || 'nothing'}`;
 }
 
 function cardOf(one, metric, photos) {
@@ -164,6 +163,6 @@ function cardOf(one, metric, photos) {
     h('p', { class: 'cost' }, h('b', null, costText(one.cost)), ` ${metric}`,
       h('span', { class: 'mark', title: about }, one.kind)),
     h('h3', null, cardTitle(one)), h('dl', null, facts), link
-      ? h('a', { class: 'to-map', href: link, 'aria-label': `See it in the map: ${cardTitle(one)}` }, 'See it in the map')
+      ? h('a', { class: 'to-map', href: link, 'aria-label': `Show in the map: ${cardTitle(one)}` }, 'Show in the map')
       : null);
 }

@@ -1,4 +1,4 @@
-// Puts the page together.
+// Builds the page.
 
 function headFacts() {
   const n = (values) => new Set(values).size;
@@ -11,14 +11,14 @@ function headFacts() {
   byId('main').append(h('ul', { class: 'facts' },
     RUNS.length > 1 ? h('li', null, h('b', null, String(RUNS.length)), ' runs') : null,
     counts.map(([count, what]) => h('li', null, h('b', null, String(count)), ` ${what}${count === 1 ? '' : 's'}`)),
-    fact('profile', only.profile), fact('encoder', only.encoder)));
+    fact('perception profile', only.profile), fact('encoder', only.encoder)));
 }
 
 function followSections() {
   const nav = byId('nav'), links = [...nav.querySelectorAll('a')];
   const sections = [...document.querySelectorAll('section.part')];
   const top = (section) => section.getBoundingClientRect().top;
-  // At the end of the page several short sections may stand on the screen: the one asked for, else the last.
+  // At the end of the page several short sections may be visible: the one in the address, otherwise the last.
   const atEnd = () => sections.find((one) => `#${one.id}` === location.hash && top(one) > 0 && top(one) < innerHeight)
     || sections[sections.length - 1];
   const mark = () => {
@@ -42,7 +42,7 @@ function followSections() {
   mark();
 }
 
-// The summary at once; the rest one section after the other while nothing else is to do, or before anybody jumps there.
+// The summary is built immediately; the other sections when the browser is idle, or before the user jumps to one.
 function makeInTime() {
   const idle = window.requestIdleCallback || ((work) => setTimeout(work, 1));
   const next = () => {

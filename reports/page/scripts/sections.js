@@ -1,5 +1,5 @@
-// The sections of numbers by method, scene and class, and what all sections share. DATA is what
-// su3d_bench/analysis/page gathers.
+// The sections Summary, Scenes and Classes, and functions that all sections share. DATA is collected by
+// su3d_bench/analysis/page.
 
 const DATA = JSON.parse(byId('data').textContent);
 const RUNS = DATA.runs;
@@ -16,7 +16,7 @@ for (const one of DATA.results) {
   }
 }
 for (const [run, { methods }] of RUNS.entries()) {
-  for (const method of methods) {  // what no protocol scored is looked at all the same
+  for (const method of methods) {  // methods without scores are listed too
     if (!SIDES.some((side) => side.run === run && side.method === method)) {
       SIDES.push({ run, method, name: sideName(run, method), style: SIDES.length });
     }
@@ -27,7 +27,7 @@ const resultsOf = (protocol) => DATA.results.filter((one) => one.protocol === pr
 const nameOf = (one) => sideName(one.run, one.method);
 const styleOf = (run, method) => SIDES.findIndex((side) => side.run === run && side.method === method);
 
-// A section stands at once with its heading; its content is made when the page has time, or when it is asked for.
+// A section appears immediately with its heading; its content is built when the browser is idle, or on demand.
 const unmade = new Map();
 function part(id, title, intro, make) {
   const section = h('section', { class: 'part', id, 'aria-labelledby': `${id}-title` },
@@ -49,7 +49,7 @@ function makeAll() {
   for (const section of [...unmade.keys()]) makePart(section);
 }
 
-// One choice of protocol for all sections that show one.
+// The selected protocol is shared by all sections.
 const chosen = { protocol: PROTOCOLS[0], listeners: [] };
 function protocolField(protocols) {
   const field = select('Protocol', protocols.map((name) => [name, name]), chosen.protocol, (name) => {
@@ -84,7 +84,7 @@ function notesOf(rows) {
   if (kinds.length === 1) lines.push(`confidences: ${kinds[0]}`);
   if (kinds.length > 1) {
     const told = kinds.map((kind) => `${kind} (${ranked.filter((one) => one.confidences === kind).map(nameOf).join(', ')})`);
-    lines.unshift(`MIXED CONFIDENCES: ${told.join('; ')}: these average precisions do not compare`);
+    lines.unshift(`MIXED CONFIDENCES: ${told.join('; ')}: average precisions are not comparable`);
   }
   return [...new Set(lines)];
 }
@@ -97,24 +97,24 @@ function valueCell(metric, value, interval, ceiling) {
   ];
 }
 
-// Marks the highest of what competes: what was told the truth does not.
+// Rows that compete for the best value: methods that use ground truth do not.
 const competes = (one) => one.method !== 'oracle' && !(one.caveat || '').includes('a ceiling, not a result');
 const onSame = (rows, what) => new Set(rows.filter((one) => competes(one) && one.result).map(what)).size === 1;
 const limitOf = (one) => String(RUNS[one.run].limit);
 const scenesOf = (one) => [limitOf(one), ...one.result.scenes].join('\n');
 function bestOf(rows, value, what = scenesOf) {
-  // Rows on other scenes or other frames are not compared, and where all are equal none is the best.
+  // Rows on different scenes or frames are not compared, and if all are equal none is the best.
   const numbers = rows.filter(competes).map(value).filter(isNumber), most = Math.max(...numbers);
   return numbers.some((one) => one < most) && onSame(rows, what) ? most : null;
 }
 
-// Whether the numbers are those of all scenes together; where the two agree it does not matter.
+// Whether the numbers are pooled over all scenes; irrelevant if pooled and mean values agree.
 const isPooled = (one) =>
   !!one.result && one.headline.every((metric) => one.result.metrics[metric] === one.result.pooled[metric]);
 
 function summarySection() {
-  part('summary', 'Summary', 'Per cent with the 95 % interval over scenes, which is rough over fewer than ten. The tick on '
-    + 'a line is what the truth itself scores, no bound.', (section) => {
+  part('summary', 'Summary', 'In per cent, with the 95 % confidence interval over scenes (unreliable for fewer '
+    + 'than ten). The tick on each line is the ground-truth ceiling, which is not a strict upper bound.', (section) => {
     const warn = (...content) => section.append(h('p', { class: 'note warn' }, content));
     for (const [index, run] of RUNS.entries()) {
       const where = RUNS.length > 1 ? `${runNames[index]}: ` : '';
@@ -138,7 +138,7 @@ function summarySection() {
   });
 }
 
-// What the numbers mean, for tooltips and the list below the tables.
+// Descriptions of the metrics, for tooltips and the list below the tables.
 const MEANINGS = new Map(Object.entries({
   AP: 'instance average precision, mean over IoU thresholds',
   AP50: 'average precision at an IoU threshold of 0.5',
@@ -151,22 +151,22 @@ const MEANINGS = new Map(Object.entries({
   "label n'": 'the label computed afterwards from the best views of an instance is correct',
   'well-merged': 'instances that match exactly one object', 'under-merged': 'instances that cover only part of an object',
   'over-merged': 'instances that cover several objects',
-  "well-merged n'": 'the same, of instances that keep a name out of their best views',
-  "under-merged n'": 'the same, of instances that keep a name out of their best views',
-  "over-merged n'": 'the same, of instances that keep a name out of their best views',
+  "well-merged n'": 'the same, over instances with a label from their best views',
+  "under-merged n'": 'the same, over instances with a label from their best views',
+  "over-merged n'": 'the same, over instances with a label from their best views',
   answer: 'questions answered correctly', objects: 'questions with the correct objects',
 }));
 
 function meaningsOf(metrics) {
   const known = metrics.filter((metric) => MEANINGS.has(metric));
-  return !known.length ? null : h('details', null, h('summary', null, 'What the columns mean'),
+  return !known.length ? null : h('details', null, h('summary', null, 'Column descriptions'),
     h('dl', null, known.flatMap((metric) => [h('dt', null, metric), h('dd', null, MEANINGS.get(metric))])));
 }
 
 function foundTable(rows) {
-  const named = ([name, n]) => (n === 1 && name ? name : `${name || 'without a name'} × ${n}`);
+  const named = ([name, n]) => (n === 1 && name ? name : `${name || 'unnamed'} × ${n}`);
   return dataTable({
-    caption: 'Contents of the maps; size: longest edge of the box; ms per update: median, including perception',
+    caption: 'Contents of the maps; size: longest edge of the bounding box; ms per update: median, including perception',
     rows,
     columns: [
       { label: 'Scene', value: (one) => one.scene },
@@ -200,7 +200,7 @@ function summaryTable(rows) {
   const ceilings = (one) => metrics.map((metric) => metricText(metric, one.ceiling[metric])).join(' / ');
   return dataTable({
     caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean over scenes'}`
-      + `${marks ? '; the best is bold' : ''}`,
+      + `${marks ? '; best in bold' : ''}`,
     rows,
     columns: [
       { label: 'Method', value: nameOf },
@@ -209,7 +209,7 @@ function summaryTable(rows) {
         value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
         show: (one) => (one.ceiling ? ceilings(one) : '–') },
       { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },
-      { label: 'Within 5 cm', title: 'Fraction of ground-truth points within 5 cm of the map', num: true,
+      { label: 'Coverage (5 cm)', title: 'Fraction of ground-truth points within 5 cm of the map', num: true,
         value: covered, show: (one) => percent(covered(one)) },
     ],
   });
@@ -249,18 +249,18 @@ function matrixTable(protocol, name, all, head, valuesOf) {
   const rows = keys.map((key) => ({ key, best: best(key) }))
     .filter((row) => all.some((one) => isNumber(at(one, row.key))));
   const pooled = (one) => one.result.metrics[name];
-  const marked = rows.some((row) => row.best !== null) ? '; the best per row is bold' : '';
+  const marked = rows.some((row) => row.best !== null) ? '; best per row in bold' : '';
   const partial = all.some((one) => RUNS[one.run].is_partial) ? ' (PARTIAL)' : '';
   return dataTable({
     caption: `${protocol}: ${name} in per cent${partial}${marked}`,
     rows, filter: ofScenes ? 'scenes' : 'classes', tall: rows.length > 14,
     columns: [{ label: head, value: (row) => row.key, show: (row) => toGallery(row.key,
-      { protocol, [ofScenes ? 'scene' : 'name']: row.key, metric: name }, `The worst errors of ${row.key}`) }, ...all.map((one) => ({
+      { protocol, [ofScenes ? 'scene' : 'name']: row.key, metric: name }, `Worst errors of ${row.key}`) }, ...all.map((one) => ({
       label: nameOf(one), num: true, value: (row) => at(one, row.key),
       show: (row) => metricText(name, at(one, row.key)),
       best: (row) => row.best !== null && competes(one) && at(one, row.key) === row.best }))],
     foot: all.some((one) => isNumber(pooled(one)))
-      ? h('tfoot', null, h('tr', null, h('th', { scope: 'row' }, 'As reported'),
+      ? h('tfoot', null, h('tr', null, h('th', { scope: 'row' }, 'Overall'),
         all.map((one) => h('td', { class: 'num' }, metricText(name, pooled(one))))))
       : null,
   });

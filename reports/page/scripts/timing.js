@@ -1,4 +1,4 @@
-// Timing: course of the updates, methods, stages, intermediate maps.
+// Timing: updates over time, methods, stages, intermediate maps.
 
 function timingSection() {
   if (!DATA.timing.length) return;
@@ -20,9 +20,9 @@ function timingSection() {
 function coursePlot(section) {
   const scenes = [...new Set(DATA.timing.flatMap((one) => Object.keys(one.series)))], place = h('div');
   const scene = select('Scene', scenes.map((name) => [name, name]), scenes[0], plot);
-  const what = select('Time of', [['map', 'map only'], ['total', 'complete update']], 'map', plot);
-  const axes = [['updates', 'updates so far'], ['points', 'points of the map']];
-  const against = select('Against', axes, 'updates', plot);
+  const what = select('Time', [['map', 'map only'], ['total', 'complete update']], 'map', plot);
+  const axes = [['updates', 'number of updates'], ['points', 'number of map points']];
+  const against = select('x axis', axes, 'updates', plot);
   section.append(h('div', { class: 'toolbar' }, scene, what, against), place);
   function plot() {
     const name = scene.input.value, byPoints = against.input.value === 'points';
@@ -35,7 +35,7 @@ function coursePlot(section) {
       return { name: nameOf(one), style: styleOf(one.run, one.method), x, y };
     }).filter((line) => line.x.length);
     const per = Math.max(1, ...usable.map((one) => one.series[name].per));
-    const yLabel = `ms per update${per > 1 ? ` (means of up to ${per})` : ''}`, [, xLabel] = axes[byPoints ? 1 : 0];
+    const yLabel = `ms per update${per > 1 ? ` (mean of up to ${per} updates)` : ''}`, [, xLabel] = axes[byPoints ? 1 : 0];
     place.replaceChildren(linePlot({ label: `Milliseconds per update in ${name}`, lines, xLabel, yLabel }));
   }
   plot();
@@ -49,12 +49,12 @@ function methodTimes() {
   const ms = (label, value) => ({ label, num: true, value, show: (one) => msText(value(one)) });
   const bytes = (label, key) => ({ label, num: true, value: (one) => one[key], show: (one) => mib(one[key]) });
   return dataTable({
-    caption: 'All scenes; milliseconds per update, without the first three of each scene', rows: DATA.timing,
+    caption: 'All scenes; milliseconds per update, excluding the first three of each scene', rows: DATA.timing,
     columns: [
       { label: 'Method', value: nameOf }, { label: 'Updates', num: true, value: (one) => one.n_updates },
       ...['p50', 'p95', 'max', 'first'].map((key) => ms(key, (one) => stage(one, 'total')[key])),
       ms('map p50', (one) => stage(one, 'map').p50),
-      { label: 'With a larger map', value: (one) => growthWords(stage(one, 'map')) },
+      { label: 'Growth with map size', value: (one) => growthWords(stage(one, 'map')) },
       ms('Finish', (one) => one.finish_ms),
       { label: 'Points', num: true, value: (one) => one.n_points, show: (one) => countText(one.n_points) },
       bytes('Map MiB', 'map_bytes'), bytes('Peak MiB', 'peak_rss_bytes'), bytes('GPU MiB', 'device_bytes'),
@@ -73,8 +73,8 @@ function stageTimes(one) {
       ...['p50', 'p95', 'max', 'first'].map((key) => ({
         label: key, num: true, value: (row) => row[key], show: (row) => msText(row[key]) })),
       { label: 'Share', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` },
-      exponent('Exponent by map points', 'by_points'), exponent('Exponent by updates', 'by_updates'),
-      { label: 'With a larger map', value: growthWords },
+      exponent('Exponent over map points', 'by_points'), exponent('Exponent over updates', 'by_updates'),
+      { label: 'Growth with map size', value: growthWords },
     ],
   });
 }

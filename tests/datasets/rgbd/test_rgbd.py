@@ -68,7 +68,7 @@ def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
     words = ["run", "--scenes", "rgbd/desk", "--stride", "1", "--no-pictures", "--jobs", "1"]
     assert main([*words, "--out", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
-    assert "no protocol scores these scenes" in said.out
+    assert "no protocol applies to these scenes" in said.out
     assert "names and labels are unreliable here" in said.err and "ceiling" not in said.err
     assert main([*words, "--methods", "oracle", "--out", str(tmp_path / "other")]) == 3
     assert "rgbd/desk: oracle needs ground truth, the dataset has none" in capsys.readouterr().err

@@ -1,11 +1,11 @@
-// What of an open page somebody could not read, name or reach: `looks`, for tests alone.
+// Accessibility and layout checks of an open page: `looks`, only for tests.
 'use strict';
 globalThis.looks = (() => {
   const CONTROLS = 'a[href], button, select, input:not([type=hidden]), textarea, summary, [tabindex], [contenteditable]';
   const pen = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
   const known = new Map();
 
-  // Any colour of CSS as red, green, blue from 0 to 255 and how much it covers from 0 to 1.
+  // Any CSS colour as red, green, blue in 0..255 and alpha in 0..1.
   function rgba(text) {
     if (!known.has(text)) {
       pen.clearRect(0, 0, 1, 1);
@@ -44,8 +44,8 @@ globalThis.looks = (() => {
   }
   const told = (el, text = nameOf(el)) => `${placeOf(el)} “${squeezed(text).slice(0, 40)}”`;
 
-  // The colour beneath an element and that of its text upon it, and whether something else may lie between the two:
-  // a picture, a gradient, what an element out of the flow stands upon.
+  // The background of an element and the colour of its text on it, and whether the background may be something else:
+  // a picture, a gradient, or whatever is below a positioned element.
   function painted(el, colour) {
     const chain = [];
     for (let one = el; one; one = one.parentElement) chain.unshift(one);
@@ -88,14 +88,14 @@ globalThis.looks = (() => {
     }
   }
   const colourOf = (one) => rgba(one.el.ownerSVGElement ? one.style.fill : one.style.color);
-  // 4.5 for text, 3 for large text and for signs that are no text.
+  // 4.5 for text, 3 for large text and for symbols.
   function needed({ style, isSign }) {
     const size = parseFloat(style.fontSize);
     return isSign || size >= 24 || (size >= 18.66 && Number(style.fontWeight) >= 700) ? 3 : 4.5;
   }
 
   let pending = [];
-  // Texts that are too pale; those whose ground only the picture of the page tells are kept for `overOther`.
+  // Texts with too little contrast; those whose background needs a screenshot are kept for `overOther`.
   function paleTexts(root) {
     const found = new Set();
     pending = [];
@@ -104,11 +104,11 @@ globalThis.looks = (() => {
       const { beneath, above, isOverOther } = painted(one.el, colourOf(one));
       if (isOverOther) { pending.push({ ...one, above }); continue; }
       const ratio = contrastOf(beneath, above), least = needed(one);
-      if (ratio < least) found.add(`${told(one.el, one.text)}: contrast ${ratio.toFixed(2)}, not ${least}`);
+      if (ratio < least) found.add(`${told(one.el, one.text)}: contrast ${ratio.toFixed(2)}, below ${least}`);
     }
     return [...found];
   }
-  // Brings the next of the kept texts onto the screen; all of them that are there with it, and their boxes.
+  // Scrolls to the next kept text; returns all kept texts on the screen with their boxes.
   function overOther() {
     const on = (box) => box.width > 0 && box.top >= 0 && box.left >= 0 && box.bottom <= innerHeight && box.right <= innerWidth;
     const now = (one) => {
@@ -147,9 +147,9 @@ globalThis.looks = (() => {
       if (!el.matches('a, button, select, input, textarea, summary, canvas') && getComputedStyle(el).cursor === 'auto') continue;
       const boxes = [el, ...(['checkbox', 'radio'].includes(el.type) ? el.labels : [])].map((one) => one.getBoundingClientRect());
       const size = ['width', 'height'].map((side) => Math.max(...boxes.map((box) => box[side])));
-      if (boxes[0].right <= 0 || boxes[0].bottom + scrollY <= 0) continue; // off the page until it has the focus
+      if (boxes[0].right <= 0 || boxes[0].bottom + scrollY <= 0) continue; // outside the page until it has the focus
       if (Math.min(...size) < least - 0.01) {
-        found.add(`${told(el)}: a target of ${size.map((one) => one.toFixed(0)).join(' x ')} px, not ${least}`);
+        found.add(`${told(el)}: target of ${size.map((one) => one.toFixed(0)).join(' x ')} px, below ${least}`);
       }
     }
     return [...found];
@@ -158,14 +158,14 @@ globalThis.looks = (() => {
     const found = new Set();
     for (const one of texts()) {
       const scale = one.el.ownerSVGElement ? one.el.getScreenCTM().a : 1, size = scale * parseFloat(one.style.fontSize);
-      if (size < least - 0.01) found.add(`${told(one.el, one.text)}: text of ${size.toFixed(1)} px, not ${least}`);
+      if (size < least - 0.01) found.add(`${told(one.el, one.text)}: text of ${size.toFixed(1)} px, below ${least}`);
     }
     return [...found];
   }
-  // What reaches beyond the screen and stands in no box of its own that scrolls.
+  // Elements that extend beyond the screen and are not in a scrolling box.
   function sideways(width) {
     if (document.documentElement.scrollWidth <= width) return [];
-    const isBoxed = (el) => { // also by a box that cuts it
+    const isBoxed = (el) => { // or in a clipping box
       for (let one = el.parentElement; one && one !== document.body; one = one.parentElement) {
         if (getComputedStyle(one).overflowX !== 'visible') return true;
       }
@@ -177,18 +177,18 @@ globalThis.looks = (() => {
     return [`the page is ${document.documentElement.scrollWidth} px wide on a screen of ${width}: `
       + inner.slice(0, 5).map((el) => told(el)).join('; ')];
   }
-  // Texts that their box cuts without a way to scroll or an ellipsis.
+  // Texts that are clipped without scrolling or an ellipsis.
   function cutTexts() {
     const found = new Set();
     for (const { el, text } of texts()) {
       const style = getComputedStyle(el), cuts = (value) => value === 'hidden' || value === 'clip';
       if (el.value !== undefined || style.textOverflow === 'ellipsis') continue;
       if ((cuts(style.overflowX) && el.scrollWidth > el.clientWidth + 1)
-        || (cuts(style.overflowY) && el.scrollHeight > el.clientHeight + 1)) found.add(`${told(el, text)}: is cut`);
+        || (cuts(style.overflowY) && el.scrollHeight > el.clientHeight + 1)) found.add(`${told(el, text)}: is clipped`);
     }
     return [...found];
   }
-  // What a printed page would leave out, because a box scrolls or stands over others.
+  // Content missing from a printed page, because its box scrolls or covers others.
   function unprinted() {
     const found = new Set();
     for (const el of document.body.querySelectorAll('*')) {
@@ -222,42 +222,42 @@ globalThis.looks = (() => {
   function structure() {
     const found = [], all = (selector) => [...document.querySelectorAll(selector)], one = (selector) => all(selector).length === 1;
     const say = (is, text) => { if (!is) found.push(text); };
-    say(document.documentElement.lang, 'the page says no language');
+    say(document.documentElement.lang, 'the page has no language');
     say(document.title.trim(), 'the page has no title');
-    say(document.characterSet === 'UTF-8' && document.compatMode === 'CSS1Compat', 'the page is no UTF-8 or has no doctype');
-    say(document.querySelector('meta[name=viewport]'), 'the page says nothing of a phone’s screen');
-    say(one('main'), `the page has ${all('main').length} main parts, not 1`);
+    say(document.characterSet === 'UTF-8' && document.compatMode === 'CSS1Compat', 'the page is not UTF-8 or has no doctype');
+    say(document.querySelector('meta[name=viewport]'), 'the page has no viewport for phones');
+    say(one('main'), `the page has ${all('main').length} main elements, not 1`);
     const headings = all('h1, h2, h3, h4, h5, h6').filter(isShown);
-    say(headings.filter((el) => el.localName === 'h1').length === 1, 'the page has not exactly one h1');
+    say(headings.filter((el) => el.localName === 'h1').length === 1, 'the page does not have exactly one h1');
     headings.reduce((before, el) => {
       const level = Number(el.localName[1]);
       say(level <= before + 1, `${told(el)}: follows a heading of level ${before}`);
       return level;
     }, 0);
     for (const el of all('img')) {
-      say(el.alt.trim() || (el.hasAttribute('alt') && el.closest('[aria-hidden=true]')), `${placeOf(el)}: a picture without words`);
+      say(el.alt.trim() || (el.hasAttribute('alt') && el.closest('[aria-hidden=true]')), `${placeOf(el)}: picture without alternative text`);
     }
     for (const el of all('svg, canvas').filter(isShown)) {
       say(el.closest('[aria-hidden=true]') || (el.getAttribute('role') && (el.getAttribute('aria-label')
-        || el.getAttribute('aria-labelledby'))), `${placeOf(el)}: drawn, and has no role and label`);
+        || el.getAttribute('aria-labelledby'))), `${placeOf(el)}: drawing without role and label`);
     }
     for (const el of all('table').filter(isShown)) {
-      say(el.caption || el.getAttribute('aria-label') || el.getAttribute('aria-labelledby'), `${told(el)}: a table without a caption`);
-      say([...el.querySelectorAll('th')].every((cell) => cell.scope), `${told(el)}: a header that heads nothing`);
+      say(el.caption || el.getAttribute('aria-label') || el.getAttribute('aria-labelledby'), `${told(el)}: table without a caption`);
+      say([...el.querySelectorAll('th')].every((cell) => cell.scope), `${told(el)}: header without scope`);
     }
     const ids = all('[id]').map((el) => el.id);
     for (const id of new Set(ids.filter((text, k) => ids.indexOf(text) !== k))) found.push(`two elements have the id ${id}`);
     for (const name of ['aria-labelledby', 'aria-describedby', 'aria-controls', 'for']) {
       for (const el of all(`[${name}]`)) {
-        for (const id of el.getAttribute(name).split(/\s+/)) say(document.getElementById(id), `${told(el)}: ${name} names no element`);
+        for (const id of el.getAttribute(name).split(/\s+/)) say(document.getElementById(id), `${told(el)}: ${name} refers to no element`);
       }
     }
     for (const el of all('a[href^="#"]')) {
-      say(document.getElementById(decodeURIComponent(el.hash.slice(1).split('?')[0])), `${told(el)}: leads nowhere`);
+      say(document.getElementById(decodeURIComponent(el.hash.slice(1).split('?')[0])), `${told(el)}: dead link`);
     }
     for (const el of all('link[href], [src], [srcset], [poster], [background], form[action], object[data]')) {
       for (const key of ['href', 'src', 'srcset', 'poster', 'background', 'action', 'data']) {
-        say(!/^\s*(https?:|wss?:|\/\/)/.test(el.getAttribute(key) || ''), `${placeOf(el)}: ${key} leaves the page`);
+        say(!/^\s*(https?:|wss?:|\/\/)/.test(el.getAttribute(key) || ''), `${placeOf(el)}: ${key} is outside the page`);
       }
     }
     return found;
@@ -265,16 +265,16 @@ globalThis.looks = (() => {
   function order() {
     const found = [];
     for (const el of document.body.querySelectorAll('*')) {
-      if (el.tabIndex > 0) found.push(`${told(el)}: comes before the rest of the page by tabindex ${el.tabIndex}`);
+      if (el.tabIndex > 0) found.push(`${told(el)}: positive tabindex ${el.tabIndex}`);
       const style = getComputedStyle(el);
       if (style.order !== '0' || /reverse/.test(style.flexDirection)) {
-        if (el.querySelector(CONTROLS) || el.matches(CONTROLS)) found.push(`${told(el)}: stands elsewhere than its place in the order`);
+        if (el.querySelector(CONTROLS) || el.matches(CONTROLS)) found.push(`${told(el)}: visual order differs from document order`);
       }
     }
     return found;
   }
 
-  // All that can be operated, by a name that lasts: what it is, and which of its equals.
+  // All controls by a stable key: what it is, and its index among equal ones.
   function controls() {
     const counts = new Map();
     return stops().map((el) => {

@@ -1,7 +1,7 @@
-"""What a person could not read, reach or use of a page in a browser; each check gives lines that say where and what.
+"""Accessibility and layout checks of a page in a browser; each returns one line per problem, with its place.
 
-A check takes the browser with the page open and leaves it as a person with the defaults of a desktop sees it. What it
-looks at is the page as ``unfold`` leaves it.
+A check takes the browser with the page open and restores the desktop defaults. It expects the page as left by
+``unfold``.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from chromium import Chromium
 
 SCRIPT = Path(__file__).with_name("looks.js").read_text(encoding="utf-8")
 PHONE, DESKTOP = (390, 844), (1300, 900)
-MIN_TARGET, MIN_TEXT = 24, 12  # px on a phone: WCAG 2.5.8; what is smaller is not read at arm's length
-# A page is at rest once its sections are made and its views are drawn.
+MIN_TARGET, MIN_TEXT = 24, 12  # px on a phone: WCAG 2.5.8; smaller text is unreadable at arm's length
+# A page is at rest once its sections are built and its views are drawn.
 REST = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done))))"
 WHOLE = "!document.querySelector('[aria-busy=true]')"
-# A browser without a graphics card says of itself that it reads canvases slowly.
+# A browser without a GPU warns that it reads canvases slowly.
 OF_THE_BROWSER = "GL Driver Message (OpenGL, Performance"
 
 
 def complaints(browser: Chromium) -> list[str]:
-    """What the page complained of since it was opened, and every address outside it that it asked for."""
+    """Errors and warnings of the page since it was opened, and all its requests to other addresses."""
     return [line for line in browser.faults() if OF_THE_BROWSER not in line]
 
 
 def look(browser: Chromium, call: str) -> Any:
-    """What one of the functions of looks.js finds in the page."""
+    """The result of a function of looks.js in the page."""
     if not browser.run("!!globalThis.looks"):
         browser.run(SCRIPT)
     return browser.run(f"looks.{call}")
 
 
 def unfold(browser: Chromium) -> None:
-    """Bring all that a page holds into being: what is folded is opened, what waits to be scrolled to is scrolled to."""
+    """Build the whole page: open all details and scroll to everything that loads on scrolling."""
     browser.until(WHOLE)
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     browser.run(
@@ -47,7 +47,7 @@ def unfold(browser: Chromium) -> None:
 
 @contextmanager
 def seen_as(browser: Chromium, *, scheme: str = "light", size: tuple[int, int] = DESKTOP) -> Iterator[None]:
-    """The page in light or dark, on a screen of this size."""
+    """Show the page in light or dark mode, on a screen of this size."""
 
     def show(scheme: str, size: tuple[int, int]) -> None:
         features = [{"name": "prefers-color-scheme", "value": scheme}]
@@ -64,14 +64,14 @@ def seen_as(browser: Chromium, *, scheme: str = "light", size: tuple[int, int] =
 
 
 def pale_texts(browser: Chromium, scheme: str) -> list[str]:
-    """Texts whose contrast with what is beneath them is below 4.5, 3 for large ones."""
+    """Texts whose contrast with their background is below 4.5, or 3 for large texts."""
     with seen_as(browser, scheme=scheme):
         found: list[str] = look(browser, "paleTexts()")
         return found
 
 
 def on_a_phone(browser: Chromium) -> list[str]:
-    """What makes the page scroll sideways on 390 px, and targets, texts and cuts that are too small for it."""
+    """Elements wider than 390 px, targets and texts that are too small for a phone, and truncated texts."""
     with seen_as(browser, size=PHONE):
         browser.run("scrollTo(0, 0)")
         found: list[str] = look(browser, f"sideways({PHONE[0]})")
@@ -80,14 +80,14 @@ def on_a_phone(browser: Chromium) -> list[str]:
 
 
 def on_a_desktop(browser: Chromium) -> list[str]:
-    """The same of a desktop, where texts may be smaller."""
+    """Elements wider than a desktop, and truncated texts; small texts are allowed."""
     with seen_as(browser):
         found: list[str] = look(browser, f"sideways({DESKTOP[0]})")
         return [*found, *look(browser, "cutTexts()")]
 
 
 def structure(browser: Chromium) -> list[str]:
-    """What is no whole document: language, title, headings, words for pictures, names of controls, sources."""
+    """Faults of the document: language, title, headings, alternative texts, names of controls, external sources."""
     found: list[str] = look(browser, "structure()")
     nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
     for node in nodes:
@@ -98,12 +98,12 @@ def structure(browser: Chromium) -> list[str]:
             and not node.get("name", {}).get("value")
             and role not in ("RootWebArea", "row", "generic", "main")
         ):
-            found.append(f"{role}: a control without a name")
+            found.append(f"{role}: control without a name")
     return found
 
 
 def by_keyboard(browser: Chromium) -> list[str]:
-    """What Tab does not reach once and in the order of the page, and what only a mouse can do."""
+    """Controls that Tab does not reach exactly once and in page order, or that need a mouse."""
     with seen_as(browser):
         found: list[str] = look(browser, "order()")
         browser.run("document.activeElement.blur(); getSelection().removeAllRanges(); scrollTo(0, 0)")
@@ -122,29 +122,29 @@ def by_keyboard(browser: Chromium) -> list[str]:
                 break
             reached.append(here)
         else:
-            found.append(f"Tab never leaves the page: it goes on to {reached[-6:]}")
+            found.append(f"Tab never leaves the page: last reached {reached[-6:]}")
         ours = [one for one in reached if one != -2]
-        found += [f"{one}: has the focus and is no control that can be seen" for one in ours if isinstance(one, str)]
+        found += [f"{one}: has the focus but is not a visible control" for one in ours if isinstance(one, str)]
         places = [one for one in ours if isinstance(one, int)]
         found += [f"{names[k]}: Tab does not reach it" for k in range(len(names)) if k not in places]
         found += [f"{names[k]}: Tab reaches it twice" for k in sorted({*places}) if places.count(k) > 1]
         if places != sorted(places):
-            found.append(f"Tab goes through the page in another order than it is read: {places}")
+            found.append(f"Tab order differs from reading order: {places}")
         if len(places) > 1:
             look(browser, f"listed[{places[-1]}].focus()")
             browser.press("Shift+Tab")
             back = browser.run(at)
             if back not in (places[-2], -2):
-                found.append(f"Shift+Tab does not go back from {names[places[-1]]}")
+                found.append(f"Shift+Tab does not return from {names[places[-1]]}")
         browser.run("document.activeElement.blur()")
         return found
 
 
 CHECKS: Mapping[str, Callable[[Chromium], list[str]]] = {
-    "is a whole document": structure,
-    "can be read in light": lambda browser: pale_texts(browser, "light"),
-    "can be read in the dark": lambda browser: pale_texts(browser, "dark"),
+    "is a complete document": structure,
+    "is readable in light mode": lambda browser: pale_texts(browser, "light"),
+    "is readable in dark mode": lambda browser: pale_texts(browser, "dark"),
     "fits a desktop": on_a_desktop,
     "fits a phone": on_a_phone,
-    "can be reached by keyboard": by_keyboard,
+    "can be used by keyboard": by_keyboard,
 }

@@ -1,4 +1,4 @@
-"""The page of runs for its tests in a browser: how it is made, and what a person does with it."""
+"""The HTML report for browser tests: how it is built, and user actions on it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from painted_runs import COLLECTOR, painted_run, run, see_painted
 
 from su3d_bench.cli.main import main
 
-# WebGL without a graphics card.
+# WebGL without a GPU.
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
 
 
 def browser_for_pages(folder: Path) -> Chromium:
-    """A browser that draws maps too; the profile is in ``folder``."""
+    """A browser with WebGL; its profile is in ``folder``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chromium, "FLAGS", (*chromium.FLAGS, *SOFTWARE_GL))
         return Chromium(folder, width=DESKTOP[0], height=DESKTOP[1])
 
 
 def finished_runs(folder: Path) -> list[str]:
-    """Two runs: two methods on two scenes with maps midway, and one method of them on one of the scenes."""
+    """Two runs: two methods on two scenes with intermediate maps, and one of the methods on one of the scenes."""
     both = (COLLECTOR, f"{COLLECTOR}@noise_m=0.3")
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
@@ -40,7 +40,7 @@ def finished_runs(folder: Path) -> list[str]:
 
 
 def page_of_runs(folder: Path) -> Path:
-    """``report html``."""
+    """The output of ``report html``."""
     page = folder / "page.html"
     words = ["--out", str(page), "--quiet", "--jobs", "1", "--queries", "chair", "table"]
     runs = finished_runs(folder)
@@ -59,7 +59,7 @@ def options(browser: Chromium, part: str, label: str) -> list[str]:
 
 
 def choose(browser: Chromium, part: str, label: str, text: str) -> None:
-    """Choose an option as a person does: the value and then the event."""
+    """Choose an option like a user: set the value, then fire the event."""
     field = SELECT.format(part=part, label=label)
     browser.run(
         f"{{ const field = {field}; field.value = [...field.options].find((one) => one.text === {json.dumps(text)})"
@@ -83,7 +83,7 @@ def headers(browser: Chromium, part: str) -> list[str]:
 
 
 def picture(browser: Chromium, k: int = 0) -> bytes:
-    """What the ``k``-th 3D view shows, after it was drawn."""
+    """A screenshot of the ``k``-th 3D view, after it was drawn."""
     browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))")
     box = browser.run(
         f"(() => {{ const c = document.querySelectorAll('#maps canvas')[{k}].getBoundingClientRect(); return {{"

@@ -1,4 +1,4 @@
-"""Every page that the program makes, in a browser: read, reached and used in light, in the dark and on a phone."""
+"""Every kind of page in a browser: accessibility and layout in light mode, dark mode and on a phone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LONG = "the chair with a very long name that was given to it by nobody in partic
 
 
 def page_of_tables(folder: Path) -> Path:
-    """``--format html``, which all verbs with tables have."""
+    """The output of ``--format html``, shared by all commands with tables."""
     finished_runs(folder)
     page = folder / "board.html"
     words = ["--intervals", "--format", "html", "--out", str(page), "--quiet"]
@@ -33,13 +33,13 @@ def page_of_tables(folder: Path) -> Path:
 
 
 def page_of_annotation(folder: Path) -> Path:
-    """A sheet of three questions an item."""
+    """An annotation sheet with three questions per item."""
     write_sheets(made("annotation", ("chair", LONG)), folder / "out", folder / "key")
     return folder / "out" / "annotator-1" / PAGE
 
 
 def page_of_second_looks(folder: Path) -> Path:
-    """What ``sheets score`` leaves to look at again."""
+    """The list of items to review of ``sheets score``."""
     (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
     look = ReviewItem(
         "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.png",),
@@ -51,14 +51,14 @@ def page_of_second_looks(folder: Path) -> Path:
 
 
 def page_of_audit(folder: Path) -> Path:
-    """``questions audit``."""
+    """The page of a question audit."""
     words = ["query", "audit", "--scenes", f"{SCENES}/painted.py:Painted/a", "--n-questions", "6", "--quiet"]
     assert main([*words, "--out", str(folder)]) == 0
     return folder / "index.html"
 
 
 def site_of_registry(folder: Path) -> Path:
-    """``registry build``: two bundles, of which one says what its weights were trained on; one site for all pages."""
+    """The site of ``registry build``: two bundles, one with stated training data; shared by all pages."""
     registry, site = folder.parent / "registry", folder.parent / "registry-site"
     if not site.exists():
         registry.mkdir()
@@ -70,29 +70,29 @@ def site_of_registry(folder: Path) -> Path:
 
 
 def page_of_registry(folder: Path) -> Path:
-    """The first page of the site."""
+    """The index page of the registry site."""
     return site_of_registry(folder) / "index.html"
 
 
 def page_of_method(folder: Path) -> Path:
-    """The page of a method of the site."""
+    """A method page of the registry site."""
     return min((site_of_registry(folder) / "methods").iterdir())
 
 
 PAGES: Mapping[str, Callable[[Path], Path]] = {
-    "page of runs": page_of_runs,
+    "HTML report": page_of_runs,
     "tables": page_of_tables,
-    "sheet of annotation": page_of_annotation,
-    "second looks": page_of_second_looks,
+    "annotation sheet": page_of_annotation,
+    "items to review": page_of_second_looks,
     "audit": page_of_audit,
     "registry": page_of_registry,
-    "method of a registry": page_of_method,
+    "registry method": page_of_method,
 }
 
 
 @needs_chromium
 @pytest.mark.parametrize("name", PAGES)
-def test_each_page(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_page_is_accessible_and_fits(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     page = PAGES[name](tmp_path_factory.mktemp("page"))
     with browser_for_pages(tmp_path) as browser:
         browser.downloads_to(tmp_path)
@@ -100,5 +100,5 @@ def test_each_page(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathF
             browser.open(page)
             unfold(browser)
             found = find(browser)
-            assert not found, f"{page.name} {check}: not so\n" + "\n".join(found)
-        assert complaints(browser) == [], "no request leaves a page, and nothing is complained of"
+            assert not found, f"{page.name} {check}: failed\n" + "\n".join(found)
+        assert complaints(browser) == [], "no external requests, errors or warnings"

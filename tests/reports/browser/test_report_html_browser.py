@@ -1,4 +1,4 @@
-"""The page of runs in a real browser, opened as a file: its numbers, its maps and every control."""
+"""The HTML report in a browser, opened as a file: its numbers, its maps and every control."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from page_checks import WHOLE, complaints
 
 pytestmark = needs_chromium
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
-GALLERY = "Worst errors"  # its controls have tests of their own
+GALLERY = "Worst errors"  # its controls are tested separately
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def opened(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    """The page in a browser, as the tests before left it."""
+    """The page in a browser, in the state left by previous tests."""
     with runs_page.browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
         found.open(page)
         found.until(WHOLE)
@@ -37,7 +37,7 @@ def browser(opened: Chromium) -> Iterator[Chromium]:
     assert complaints(opened) == []
 
 
-def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
+def test_navigation_lists_every_section_and_scrolls_to_it(browser: Chromium) -> None:
     names = browser.run("[...document.querySelectorAll('#nav a')].map((one) => one.textContent)")
     before = ["Summary", "Maps", "Scenes", "Classes", "Confusion", "Errors"]
     assert names == [*before, GALLERY, "Timing", "Compare", "Provenance"]
@@ -46,12 +46,12 @@ def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium
     assert browser.run("Math.abs(document.getElementById('timing').getBoundingClientRect().top) < 120")
 
 
-def test_no_text_of_a_run_becomes_an_element(browser: Chromium) -> None:
+def test_text_of_a_run_is_never_markup_in_the_browser(browser: Chromium) -> None:
     assert "<img src=x onerror=window.struck=1>" in runs_page.text_of(browser, "#summary .notes")
     assert browser.run("window.struck === undefined && !document.querySelector('main img[src=x]')")
 
 
-def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> None:
+def test_header_sorts_in_both_directions_by_mouse_and_keyboard(browser: Chromium) -> None:
     browser.run("document.querySelectorAll('#summary table')[0].querySelectorAll('th button')[1].click()")
     down = runs_page.column(browser, "summary", 1)
     assert (
@@ -66,8 +66,7 @@ def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> No
     assert [float(value.split()[0]) for value in runs_page.column(browser, "summary", 1)] == sorted(values)
 
 
-# Every control of the page, by its section, kind and name; column headers and rows of tables apart.
-# Operates the k-th control of a kind in a section, and says whether it could: a choice of one cannot be changed.
+# Operates the k-th control of a kind in a section; returns whether it could (a select with one option cannot change).
 OPERATE = """(part, kind, k) => {
   const one = document.querySelectorAll(`${part} ${kind}`)[k];
   if (kind === 'select') {
@@ -83,19 +82,19 @@ OPERATE = """(part, kind, k) => {
 
 
 @pytest.mark.parametrize("part", ["summary", *(name.lower() for name in MIDDLE_SECTIONS), "provenance", "maps"])
-def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part: str) -> None:
+def test_each_control_changes_its_section(browser: Chromium, part: str) -> None:
     runs_page.open_maps(browser)
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = false; })")
     shown = f"document.getElementById('{part}').outerHTML + document.querySelector('#{part} select')?.value"
     n_operated = 0
-    if part == "confusion":  # the other methods confuse nothing
+    if part == "confusion":  # the other methods have no confusions
         runs_page.choose(
             browser, part, "Method", next(one for one in runs_page.options(browser, part, "Method") if "noise" in one)
         )
     for kind in ("button.sort", "summary", "input", "select", "button:not(.sort, .to-gallery)"):
         for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
             is_of_view = part == "maps" and kind == "button:not(.sort, .to-gallery)"
-            if is_of_view:  # so that the whole map is another picture than this one
+            if is_of_view:  # so that the picture differs from the view of the whole map
                 runs_page.press(browser, "#maps canvas", "ArrowLeft")
             before, seen = browser.run(shown), runs_page.picture(browser) if is_of_view else b""
             if kind == "select" and browser.run(
@@ -112,7 +111,7 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
     assert n_operated > 0
 
 
-def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
+def test_each_colouring_changes_the_picture_and_has_a_legend(browser: Chromium) -> None:
     runs_page.open_maps(browser)
     kinds = runs_page.options(browser, "maps", "Colour by")
     assert kinds == ["colour", "instance", "class", "ground-truth class", "error", "similarity to a text"]
@@ -121,7 +120,9 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
         runs_page.choose(browser, "maps", "Colour by", kind)
         seen[kind] = runs_page.picture(browser)
         assert runs_page.text_of(browser, "#maps .legend").strip()
-    assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
+    assert (
+        len(set(seen.values())) >= 5
+    )  # instances and classes may have the same colours if each instance has its own class
     runs_page.choose(browser, "maps", "Colour by", kinds[4])
     assert "correct class" in runs_page.text_of(browser, "#maps .legend")
     runs_page.choose(browser, "maps", "Colour by", kinds[5])
@@ -136,7 +137,7 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
     assert runs_page.headers(browser, "maps") == ["Instance", "Score", "Points"]
 
 
-def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
+def test_page_without_webgl_shows_a_message_and_all_numbers(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chromium, "FLAGS", (*chromium.FLAGS, "--disable-3d-apis"))

@@ -1,4 +1,4 @@
-"""The maps of the page in a real browser: two views side by side, missed objects, growth, links."""
+"""The maps of the HTML report in a browser: two views side by side, missed objects, timeline, links."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ READ = (
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two methods on two scenes; of the first map of scene a the chair is missed."""
+    """Two methods on two scenes; the first map of scene a misses the chair."""
     folder = tmp_path_factory.mktemp("maps")
     run = painted_run(folder / "run", methods=(COLLECTOR, f"{COLLECTOR}@noise_m=0.3"))
     place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"
@@ -37,7 +37,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert isinstance(stored, Instances)
     kept = [k for k in range(len(stored)) if stored.names[k] != "chair"]
     views = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1]].tolist() for k in kept]
-    views[0] = [view for view in views[0] if view[0] >= 3]  # the sofa comes late
+    views[0] = [view for view in views[0] if view[0] >= 3]  # the sofa appears late
     assert stored.features is not None
     named = [stored.names[k] for k in kept]
     masks = [stored.mask(k) for k in kept]
@@ -57,7 +57,7 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
 
 @pytest.fixture(autouse=True)
 def fresh(browser: Chromium, page: Path) -> Iterator[None]:
-    """Each test begins with the page as it opens, and no test makes it complain."""
+    """Each test starts with a freshly opened page and causes no errors or warnings."""
     browser.run("history.replaceState(null, '', location.pathname)")
     browser.open(page)
     browser.until(WHOLE)
@@ -87,7 +87,7 @@ def press(browser: Chromium, *keys: str, k: int = 0) -> None:
     browser.press(*keys)
 
 
-def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser: Chromium) -> None:
+def test_second_view_shows_ground_truth_or_another_map_and_moves_with_the_first(browser: Chromium) -> None:
     opened(browser)
     assert options(browser, "maps", "Compare with") == ["nothing", "ground truth", "collector@noise_m=0.3"]
     assert browser.run("document.querySelectorAll('#maps .pane')[1].hidden")
@@ -107,7 +107,7 @@ def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser
     browser.until("document.querySelectorAll('#maps .pane')[1].hidden")
 
 
-def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> None:
+def test_missed_objects_can_be_shown_and_hidden(browser: Chromium) -> None:
     opened(browser)
     browser.until(f"{field('Missed objects')}.parentNode.textContent.includes('(1)')")
     assert not browser.run(f"{field('Missed objects')}.disabled")
@@ -126,7 +126,7 @@ def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> 
     browser.until(f"!{field('Missed objects')}.parentNode.textContent.includes('not known')")
 
 
-def test_growth_shows_the_instances_that_frames_had_shown_by_then(browser: Chromium) -> None:
+def test_timeline_shows_only_instances_seen_so_far(browser: Chromium) -> None:
     opened(browser)
     note = "document.querySelector('#maps [role=status].keys').innerText"
     assert browser.run(note).startswith("Update 6 of 6, frame 5: 3 of 3 instances seen; the method had 4.")
@@ -147,9 +147,9 @@ def address(browser: Chromium) -> str:
     return str(browser.run("location.hash"))
 
 
-def test_the_address_follows_what_is_changed_and_brings_it_back(browser: Chromium, page: Path) -> None:
+def test_address_stores_and_restores_the_view(browser: Chromium, page: Path) -> None:
     opened(browser)
-    assert address(browser) == ""  # nobody has changed anything
+    assert address(browser) == ""  # nothing has been changed
     n_steps = browser.run("history.length")
     choose(browser, "Compare with", "ground truth")
     browser.until("!document.querySelectorAll('#maps .pane')[1].hidden")

@@ -1,4 +1,4 @@
-"""The gallery of a page: what its cards hold, and in a real browser its filters and the ways to it and back."""
+"""The gallery of the HTML report: content of its cards, and in a browser its filters and links."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from su3d_bench.core.types import Frame, SceneInfo
 
 
 class Mistaken(Collector):
-    """A collector with one error of a kind: in scene a two halves of the chair and a sofa that looks like a table, in
-    scene b no table."""
+    """A collector with one error per kind: in scene a the chair split in two and the sofa labelled table, in scene b
+    the table missed."""
 
     name = "mistaken"
 
@@ -47,7 +47,7 @@ class Mistaken(Collector):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two methods on two scenes, of which the second makes mistakes."""
+    """Two methods on two scenes; the second makes mistakes."""
     methods = (COLLECTOR, f"{__file__}:Mistaken")
     return painted_run(tmp_path_factory.mktemp("gallery") / "run", methods=methods)
 
@@ -78,7 +78,7 @@ def cards(text: str) -> list[dict[str, Any]]:
     ]
 
 
-def test_a_card_costs_what_its_kind_costs_where_it_is_the_only_one(page: Path) -> None:
+def test_single_card_of_a_kind_costs_as_much_as_the_kind(page: Path) -> None:
     text = page.read_text()
     found, n_compared = cards(text), 0
     for one in numbers(text)["errors"]:
@@ -97,7 +97,7 @@ def test_a_card_costs_what_its_kind_costs_where_it_is_the_only_one(page: Path) -
     assert n_compared == 3
 
 
-def test_the_points_of_all_cards_are_the_wrong_points(page: Path) -> None:
+def test_cards_contain_all_wrong_points(page: Path) -> None:
     text = page.read_text()
     for one in numbers(text)["errors"]:
         for of in (of for of in one["protocols"] if of["kind"] == "semantic"):
@@ -107,7 +107,7 @@ def test_the_points_of_all_cards_are_the_wrong_points(page: Path) -> None:
 
 
 def plane_seen(n_pixels: int = 40) -> Frame:
-    """A wall two metres before a camera that looks along z."""
+    """A frame of a wall two metres in front of a camera that looks along z."""
     depth = np.full((n_pixels, n_pixels), 2.0, np.float32)
     intrinsics = np.array([[n_pixels, 0, n_pixels / 2], [0, n_pixels, n_pixels / 2], [0, 0, 1]], np.float64)
     rgb = np.zeros((n_pixels, n_pixels, 3), np.uint8)
@@ -120,7 +120,7 @@ def on_wall(low: float, high: float, spacing: float, depth: float = 2.0) -> Any:
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], axis=1).astype(np.float32)
 
 
-def test_a_photo_shows_the_prediction_as_an_area_and_the_truth_as_a_line() -> None:
+def test_photo_shows_prediction_as_area_and_ground_truth_as_line() -> None:
     frame, small = plane_seen(), on_wall(-0.3, 0.3, 0.02)
     area = error_photo(frame, ErrorView((small,), ()))
     line = error_photo(frame, ErrorView((), (small,)))
@@ -143,7 +143,7 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
 
 @pytest.fixture
 def anew(browser: Chromium) -> Iterator[Chromium]:
-    """The gallery with nothing filtered, of masks by AP."""
+    """The gallery without filters, masks sorted by AP."""
     choose(browser, "gallery", "Protocol", "rooms-instance")
     browser.run("document.querySelector('#gallery .toolbar > button:last-of-type').click()")
     choose(browser, "gallery", "Metric", "AP")
@@ -153,7 +153,7 @@ def anew(browser: Chromium) -> Iterator[Chromium]:
 
 @needs_chromium
 @pytest.mark.parametrize("kind", ["missed", "label"])
-def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
+def test_card_links_to_its_instance_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
     choose(anew, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
     choose(anew, "gallery", "Kind", kind)
     told = next(card for card in cards(page.read_text()) if card["kind"] == kind)
@@ -177,7 +177,7 @@ def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, pa
         chosen = anew.run("document.querySelector('#maps .side tr[aria-selected=true]').innerText")
         assert chosen.split()[0] == anew.run(f"{heading}.innerText")
     else:
-        assert anew.run(f"{heading}.innerText") == f"Truth: {told['true'][0]}"
+        assert anew.run(f"{heading}.innerText") == f"Ground truth: {told['true'][0]}"
     anew.run("history.back()")
     anew.until("!location.hash.startsWith('#maps')")
     anew.until(f"Math.abs(scrollY - {before}) < 5")

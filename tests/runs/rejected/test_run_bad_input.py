@@ -127,7 +127,7 @@ def test_missing_ground_truth_leaves_the_scene_unscored(root: Path, capsys: pyte
     (root / "replica_v1" / "bathroom_0" / "habitat" / "mesh_semantic.ply").unlink()
     assert main([*RUN.split(), "--out", "out"]) == 0
     answer = capsys.readouterr()
-    assert "- opensu3d is unscored on replica/bathroom0" in answer.out
-    assert "| replica/bathroom0 | opensu3d | 14 " in answer.out.partition("**Found, not scored**")[2]
+    assert "- opensu3d is not scored on replica/bathroom0" in answer.out
+    assert "| replica/bathroom0 | opensu3d | 14 " in answer.out.partition("**Maps without scores**")[2]
     remark = remarks_of(answer.err)[0]
     assert remark.startswith("opensu3d, oracle: not scored under rooms-semantic: replica/bathroom0: no")

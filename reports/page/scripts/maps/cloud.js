@@ -1,6 +1,6 @@
-// The content of a map as reports/page/maps.py packs it, and what of it stands between an eye outside and the inside.
+// Unpacks a map (see reports/page/maps.py) and finds the walls, ceilings and floors that hide its inside.
 
-// The cells of a tree, level after level: a byte a cell whose bits are the eighths of it that hold anything.
+// The cells of an octree, level by level: one byte per cell, whose bits mark its occupied octants.
 function cellsOf(data, at, depth) {
   let x = [0], y = [0], z = [0];
   for (let level = 0; level < depth; level++) {
@@ -52,9 +52,9 @@ async function unpackMap(text) {
 const CELL_M = 0.2, MAX_LAYERS = 30, WALL_SHARE = 0.6, LAYER_SHARE = 0.3, LAYER_M = 0.15;
 const SURFACES = ['wall', 'ceiling', 'floor'];
 
-// Of each point three bytes: where the outside is of the wall, ceiling or floor that it is part of, else zeros.
-// A wall is a column of the map that is filled over most of its height, whatever stands there; so is what hangs on it.
-// Where the truth or the map calls a point wall, ceiling or floor, that goes before.
+// Per point three bytes: the outward normal of the wall, ceiling or floor that it is part of, otherwise zeros. A wall is
+// a vertical column of the map that is filled over most of its height, including things that hang on it. Labels wall,
+// ceiling and floor of the ground truth or the map take precedence.
 function outwardOf(map) {
   const outward = new Int8Array(3 * map.n);
   if (!map.n) return outward;
@@ -107,7 +107,7 @@ function outwardOf(map) {
   return outward;
 }
 
-// Of each point 1, 2, 3 where it is called wall, ceiling, floor; by the truth first.
+// Per point 1, 2, 3 if it is labelled wall, ceiling, floor; by ground truth first, then by the map; otherwise 0.
 function surfacesNamed(map) {
   const kind = (name) => SURFACES.findIndex((word) => String(name).toLowerCase().split(/[^a-z]+/).includes(word)) + 1;
   const classes = map.classes.map(kind);
@@ -117,7 +117,7 @@ function surfacesNamed(map) {
     ofPoint(map.truth, k) || ofPoint(map.classOfPoint, k) || instances[owner] || 0);
 }
 
-// Between which values along an axis, in metres from the lowest, all but a fiftieth at either end lie.
+// The 2nd and 98th percentiles along an axis, in metres from the lowest point.
 function spanOf(map, axis) {
   const values = new Uint16Array(map.n);
   for (let k = 0; k < map.n; k++) values[k] = map.positions[3 * k + axis];
@@ -126,7 +126,7 @@ function spanOf(map, axis) {
   return [nth(0.02), nth(0.98)];
 }
 
-// Across the wall that the columns around one form, away from the middle of the map.
+// The normal of the wall formed by the surrounding columns, pointing away from the centre of the map.
 function normalOf(one, walls, wide, middle) {
   let [n, x, y, xx, xy, yy] = [0, 0, 0, 0, 0, 0];
   for (let dj = -3; dj <= 3; dj++) {
@@ -141,12 +141,12 @@ function normalOf(one, walls, wide, middle) {
   [xx, xy, yy] = [xx / n - (x / n) ** 2, xy / n - (x * y) / n ** 2, yy / n - (y / n) ** 2];
   const away = [one.x - middle[0], one.y - middle[1]], far = Math.hypot(...away) || 1;
   const turn = 0.5 * Math.atan2(2 * xy, xx - yy), spread = Math.hypot((xx - yy) / 2, xy), mean = (xx + yy) / 2;
-  if (n < 3 || mean - spread > 0.4 * (mean + spread)) return away.map((v) => v / far); // a corner, or no wall at all
+  if (n < 3 || mean - spread > 0.4 * (mean + spread)) return away.map((v) => v / far); // a corner, or not a wall
   const normal = [-Math.sin(turn), Math.cos(turn)];
   return normal[0] * away[0] + normal[1] * away[1] < 0 ? normal.map((v) => -v) : normal;
 }
 
-// Instances that stand before walls rather than hang on them, and are no more than half as wide as the map.
+// Instances in front of walls rather than on them, less than half as wide as the map.
 function thingsBefore(map, columnOf, walls) {
   const inWall = new Map(), all = new Map();
   for (let k = 0; k < map.n; k++) {

@@ -1,4 +1,4 @@
-// What the view of the maps shows as the end of the page's address, and back. Nothing in an address is believed.
+// Converts the state of the map view to the fragment of the page's address and back; addresses are untrusted input.
 
 const LINK = '#maps?', MAX_LINK = 2000, MAX_FRAME = 1e9, MAX_OBJECT = 2 ** 31;
 const mapKey = (one) => (RUNS.length > 1 ? `${one.run + 1}:${one.method}` : one.method);
@@ -7,7 +7,7 @@ const mapIndex = (scene, key) => DATA.maps.findIndex((one) => one.scene === scen
 function cameraText(eye) {
   return [eye.azimuth, eye.elevation, eye.distance, ...eye.target].map((value) => Number(value.toFixed(3))).join('_');
 }
-// The camera that a text says, or null where it says none that could be.
+// The camera described by a text, or null if it is invalid.
 function cameraOf(text) {
   const parts = text.split('_'), values = parts.map(Number);
   if (values.length !== 6 || parts.some((part) => !part.trim()) || !values.every(Number.isFinite)) return null;
@@ -24,7 +24,7 @@ function linkText(state, eye) {
   if (eye) said.set('camera', cameraText(eye));
   return LINK + said.toString();
 }
-// What an address asks for, of what there is; null where it asks for no map of this page.
+// The valid parts of an address; null if it does not refer to a map of this page.
 function readLink(hash) {
   if (!hash.startsWith(LINK) || hash.length > MAX_LINK) return null;
   const said = new URLSearchParams(hash.slice(LINK.length)), text = (name) => said.get(name) || '';
@@ -40,7 +40,7 @@ function readLink(hash) {
     frame: whole('frame', MAX_FRAME), missed: yes('missed'), walls: yes('walls'), instance: whole('instance', 0xffff),
     object: whole('object', MAX_OBJECT), camera: cameraOf(text('camera')) };
 }
-// The address of what a single error is about: its instance, and the object of the truth beside; null without a map.
+// The address that shows an error: its instance, with the ground-truth object in the second view; null without a map.
 function linkToError(one) {
   const shown = DATA.maps.find((each) => each.run === one.run && each.scene === one.scene && each.method === one.method);
   if (!shown || shown.reason) return null;

@@ -1,4 +1,4 @@
-// The colours of a map's points, and what is said of them beneath the view.
+// The colours of a map's points, and the legend and facts shown with the view.
 
 const COLOURINGS = [
   ['colour', 'colour'], ['instance', 'instance'], ['class', 'class'], ['truth', 'ground-truth class'],
@@ -14,7 +14,7 @@ const ERRORS = [
 const JUDGED = [
   ['missed', [219, 41, 140]], ['not missed', [59, 140, 226]], ['not evaluated', [176, 180, 186]],
 ];
-const MAX_ENTRIES = 300; // of a legend
+const MAX_ENTRIES = 300; // in a legend
 const NEAR_NONE = 0xffff, NOT_SCORED = 0xfffe;
 
 function distinct(k) {
@@ -30,7 +30,7 @@ function heat(t) {
   return HEAT[k].map((value, c) => Math.round(value + (HEAT[k + 1][c] - value) * (at - k)));
 }
 
-// The kinds of colours that a map has.
+// The colourings available for a map.
 function colouringsOf(map) {
   const hasClass = map.classOfPoint || map.instances.some((one) => one.class !== undefined);
   const has = {
@@ -59,17 +59,17 @@ function judgedAt(judged, owner) {
   return judged.missed.includes(owner) ? 0 : 1;
 }
 
-// The colours of all points in one way, and the legend as pairs of a colour (null where there is none) and a text.
-// `judged`: of a truth beside a map, which of its objects the protocol counts and the map misses.
+// The colours of all points in one colouring, and the legend as pairs of a colour (or null) and a text. `judged`: for
+// ground truth next to a map, which of its objects the protocol counts and which the map misses.
 function painted(map, kind, query, judged) {
   const colours = new Uint8Array(3 * map.n), counts = new Map();
   const count = (what) => { counts.set(what, (counts.get(what) || 0) + 1); return what; };
   const share = (n) => `${((100 * n) / Math.max(1, map.n)).toFixed(0)} %`;
-  const tint = (c) => map.class_colours[c] || NOTHING; // those of the pictures
+  const tint = (c) => map.class_colours[c] || NOTHING; // as in the pictures
   const values = kind === 'similarity' ? map.instances.map((one) => one.similarity[query]) : [];
   const low = Math.min(...values), high = Math.max(...values);
   const owned = (k, rgb) => (map.owner[k] === NEAR_NONE ? NOTHING : rgb(map.owner[k]));
-  // One object, one colour: an instance that is an object of the truth has that object's, all others none of these.
+  // An instance that matches a ground-truth object has that object's colour; no other instance has a colour of an object.
   const nObjects = map.beside ? map.beside.objects : 0;
   const same = map.instances.filter((one) => one.object).length;
   function colourOfInstance(own) {
@@ -119,7 +119,7 @@ function legendEntry([rgb, text, instance]) {
 
 const titleOf = (map, one) => one.name || (one.class >= 0 ? map.classes[one.class] : '') || `instance ${one.id}`;
 
-// What is said of an instance at the pointer: its name, its class where that is another word, its score.
+// The tooltip of an instance: its name, its class if different, its score.
 function wordsOf(map, index) {
   const one = map.instances[index];
   if (!one) return null;
@@ -128,7 +128,7 @@ function wordsOf(map, index) {
     isNumber(one.score) ? `score ${one.score.toFixed(2)}` : ''].filter(Boolean);
 }
 
-// What is known of an object of the truth, as pairs of a name and a text.
+// The facts about a ground-truth object, as pairs of a name and a text.
 function factsOfTruth(truth, index, judged) {
   const one = truth.instances[index], metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
   const facts = [['Ground-truth class', titleOf(truth, one)], ['Points', countText(one.points)]];
@@ -137,7 +137,7 @@ function factsOfTruth(truth, index, judged) {
   return facts;
 }
 
-// The true class that most scored points of an instance have, and their share of them.
+// The most frequent ground-truth class among the scored points of an instance, and its share of them.
 function truthOfInstance(map, index) {
   const counts = new Map();
   for (let k = 0; k < map.n; k++) {
@@ -147,7 +147,7 @@ function truthOfInstance(map, index) {
   return most ? [map.classes[most[0]], most[1] / [...counts.values()].reduce((a, b) => a + b, 0)] : null;
 }
 
-// What is known of an instance, as pairs of a name and a text.
+// The facts about an instance, as pairs of a name and a text.
 function factsOfInstance(map, index) {
   const one = map.instances[index], facts = [];
   const metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
@@ -159,7 +159,7 @@ function factsOfInstance(map, index) {
   if (one.size) facts.push(['Size', `${metres(one.size, ' × ')} m`], ['Centre', `${metres(one.centre, ', ')} m`]);
   if (one.views) {
     const named = `${plural(one.n_views, 'frame')}: ${one.views.join(', ')}`;
-    facts.push(['Seen in', one.n_views ? named + (one.n_views > one.views.length ? ', …' : '') : 'not recorded']);
+    facts.push(['Visible in', one.n_views ? named + (one.n_views > one.views.length ? ', …' : '') : 'not recorded']);
   }
   if (one.similarity && one.similarity.length) {
     const k = one.similarity.indexOf(Math.max(...one.similarity));
@@ -168,7 +168,7 @@ function factsOfInstance(map, index) {
   return facts;
 }
 
-// A frame in which the instance is seen, with a box around it; null where the page holds none.
+// A frame that shows the instance, with a box around it; null if the page has none.
 function viewOfInstance(map, one, thumbnails) {
   const image = one.view !== undefined && thumbnails[one.view];
   if (!image) return null;
@@ -177,5 +177,5 @@ function viewOfInstance(map, one, thumbnails) {
   const alt = `Frame ${one.view} with ${titleOf(map, one)}`;
   return h('figure', { class: 'thumb' },
     h('div', { class: 'thumb' }, h('img', { alt, src: `data:image/jpeg;base64,${image}` }), frame),
-    h('figcaption', null, `Frame ${one.view}: location of its points`));
+    h('figcaption', null, `Frame ${one.view}, box around its points`));
 }

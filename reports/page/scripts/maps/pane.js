@@ -1,11 +1,11 @@
-// One view of a map with its title, the name of what the pointer is on, and its legend.
+// One view of a map with its title, tooltip and legend.
 
 const DARK_PAPER = [26 / 255, 32 / 255, 39 / 255], LIGHT_PAPER = [246 / 255, 247 / 255, 249 / 255];
-const NO_VIEW = 'This browser has no WebGL 2 (or no DecompressionStream), so the maps cannot be drawn. All numbers are '
-  + 'unaffected.';
+const NO_VIEW = 'This browser has no WebGL 2 (or no DecompressionStream), so the maps cannot be drawn. The tables '
+  + 'are not affected.';
 const VIEW_LOST = 'The browser lost the 3D context; wait for it to be restored or reload the page.';
 
-// `nameOf(found)`: what is said of what the pointer is on, a name and further lines.
+// `nameOf(found)`: the tooltip of the object under the pointer, a name and further lines.
 function mapPane({ eye, keysId, onMove, onPick, nameOf }) {
   const canvas = h('canvas', { tabindex: '0', role: 'application', 'aria-label': '3D view of the map',
     'aria-describedby': keysId });
@@ -51,7 +51,7 @@ function mapPane({ eye, keysId, onMove, onPick, nameOf }) {
     if (!map && pane.view) pane.view.nothing();
     if (!map) legend.replaceChildren();
   };
-  // Colours the map that is shown; the view has it from the first time on.
+  // Colours the map; the first call also gives it to the view.
   pane.paint = (heading, kind, query, judged) => {
     const made = painted(pane.map, kind, query, judged), isNew = pane.drawn !== pane.map;
     pane.drawn = pane.map;

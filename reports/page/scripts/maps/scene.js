@@ -1,10 +1,10 @@
-// The section of the maps: choices, the views, the list of instances, what is known of one.
+// The section Maps: controls, views, list of instances, details of the selected instance.
 
-const CLICK_ONE = 'Click an instance in the view or in the list to see its name, caption, scores and views.';
-const GROWN = 'Each instance of the final map appears, complete, from the first frame in which it is seen; instances that '
-  + 'were merged or removed earlier are not shown.';
-const NO_POINTS = 'This map has no points.', DAMAGED = 'This map is damaged; build the page again.';
-const MAX_READ = 6; // maps that are kept unpacked
+const CLICK_ONE = 'Click an instance in the view or in the list to see its name, caption, scores and frames.';
+const GROWN = 'Each instance of the final map appears with all its points from the first frame that shows it; instances '
+  + 'that were merged or removed earlier are not shown.';
+const NO_POINTS = 'This map has no points.', DAMAGED = 'This map is corrupted; build the page again.';
+const MAX_READ = 6; // unpacked maps kept in memory
 // The maps follow the script, so that the page appears before they are loaded.
 const isWhole = new Promise((done) => {
   if (document.readyState === 'loading') document.addEventListener('DOMContentLoaded', () => done(), { once: true });
@@ -62,7 +62,7 @@ function mapsContent(section) {
     button('Zoom out', '−', () => pane.view.zoom(1.25)), button('Whole map', 'Whole', () => pane.view.whole()));
   pane.stage.append(buttons);
   other.node.hidden = true;
-  const detail = h('div', { class: 'detail', role: 'status', 'aria-label': 'Chosen instance' }), list = h('div');
+  const detail = h('div', { class: 'detail', role: 'status', 'aria-label': 'Selected instance' }), list = h('div');
   const panes = h('div', { class: 'panes' }, pane.node, other.node);
   section.append(
     h('div', { class: 'toolbar' }, scene, which, besideField, colouring, queryField, cutField, growField, missedField,
@@ -70,7 +70,7 @@ function mapsContent(section) {
     h('div', { class: 'viewer' }, h('div', null, panes, growthNote, keys), h('div', { class: 'side' }, detail, list)));
 
   let map = null, truth = null, current = null, picked = -1, object = -1, rows = [], listedBy = null, loads = 0, asides = 0;
-  let asked = null, address = null, isWriting = null; // the address when somebody last changed something here
+  let asked = null, address = null, isWriting = null; // the address at the last user interaction
   const judged = () => (map && map.beside && map.beside.counted ? map.beside : null);
 
   function listMaps() {
@@ -86,7 +86,7 @@ function mapsContent(section) {
     const truths = map && map.beside ? [['truth', 'ground truth']] : [], before = besideField.input.value;
     besideField.setOptions([['', 'nothing'], ...truths, ...besides], asked ? asked.beside : sameBeside(before));
   }
-  // The map of the same run and method in the scene that is shown now.
+  // The map of the same run and method in the current scene.
   function sameBeside(before) {
     const one = DATA.maps[Number(before)];
     if (before === '' || before === 'truth' || !one) return before;
@@ -96,7 +96,7 @@ function mapsContent(section) {
     if (!sceneText.has(name)) sceneText.set(name, JSON.parse(byId(`scene-${scenes.indexOf(name)}`).textContent));
     return sceneText.get(name);
   }
-  // A map or truth, unpacked once; null where it is damaged.
+  // A map or ground truth, unpacked once; null if it is corrupted.
   function unpacked(key, text) {
     if (!read.has(key)) read.set(key, unpackMap(text).catch(() => null));
     if (read.size > MAX_READ) read.delete(read.keys().next().value);
@@ -109,7 +109,7 @@ function mapsContent(section) {
   async function load() {
     const index = Number(which.input.value), one = DATA.maps[index], mine = ++loads;
     panes.setAttribute('aria-busy', 'true');
-    if (pane.view) pane.tell('Reading the map');
+    if (pane.view) pane.tell('Loading the map');
     await isWhole;
     if (mine !== loads) return;
     const isOther = !current || current.scene.scene !== one.scene;
@@ -147,7 +147,7 @@ function mapsContent(section) {
     if (link) follow(link);
     panes.removeAttribute('aria-busy');
   }
-  // What of an address is not part of a map itself.
+  // The parts of an address that concern the view rather than the map.
   function follow(link) {
     if (link.cut !== null) cut.value = String(link.cut);
     if (link.missed !== null) missedField.input.checked = link.missed && !missedField.input.disabled;
@@ -180,8 +180,8 @@ function mapsContent(section) {
     const known = judged() ? owners.length : 'not known';
     missedField.label.replaceChildren(swatchOf(JUDGED[0][1]), ` Missed objects (${known})`);
     missedField.input.disabled = !owners.length;
-    missedField.title = judged() ? `By the error analysis of ${judged().protocol}: objects without a mask that lies more than half in them, `
-      + 'covers more than half of them, or is part of a set that makes them up' : '';
+    missedField.title = judged() ? `Error analysis of ${judged().protocol}: objects for which no mask `
+      + 'lies more than half inside, covers more than half, or is part of a set that forms the object' : '';
     const isWanted = owners.length > 0 && missedField.input.checked;
     const found = isWanted ? await truthBeside() : null;
     if (of !== map) return;
@@ -200,7 +200,7 @@ function mapsContent(section) {
   function applyCut() {
     if (!map) return;
     const share = Number(cut.value) / 100, height = map.low[2] + share * (map.high[2] - map.low[2]);
-    cut.setAttribute('aria-valuetext', share >= 1 ? 'nothing' : `${height.toFixed(1)} m`);
+    cut.setAttribute('aria-valuetext', share >= 1 ? 'off' : `${height.toFixed(1)} m`);
     for (const { view } of [pane, other]) if (view) view.cutAt(share >= 1 ? Infinity : height);
     keepLink();
   }
@@ -241,7 +241,7 @@ function mapsContent(section) {
     if (listedBy !== orderOfList()) listInstances();
     keepLink();
   }
-  // The truth has neither errors nor similarities of its own: it shows what was missed, or its classes.
+  // The ground truth has no errors or similarities: it shows which objects were missed, or its classes.
   function paintBeside() {
     if (!other.map || !map) return;
     const isTruth = besideField.input.value === 'truth', one = DATA.maps[Number(besideField.input.value)];
@@ -258,7 +258,7 @@ function mapsContent(section) {
     listedBy = orderOfList();
     rows = map.instances.map((one, index) => ({ one, index, selected: index === picked }));
     if (!rows.length) {
-      list.replaceChildren(h('p', { class: 'intro' }, 'This map has one feature per point and no instances.'));
+      list.replaceChildren(h('p', { class: 'intro' }, 'This map has per-point features and no instances.'));
       return;
     }
     const query = Number(queryField.input.value) || 0;
@@ -289,7 +289,7 @@ function mapsContent(section) {
     else showFacts(other.map, owner);
   }
   const flyTo = (one) => { if (pane.view && one && one.centre) pane.view.lookAt(one.centre, Math.hypot(...one.size)); };
-  // The object of the truth beside that an address asks for, by its number.
+  // Selects the ground-truth object of an address, by its id.
   function pickObject({ object: number, instance, camera }) {
     object = other.map.instances.findIndex((one) => one.id === number);
     other.choose(object);
@@ -313,7 +313,7 @@ function mapsContent(section) {
   }
   function showDetail() {
     if (map && map.instances[picked]) { showFacts(map, picked); return; }
-    const text = map && map.instances.length ? CLICK_ONE : 'Nothing to choose here.';
+    const text = map && map.instances.length ? CLICK_ONE : 'No instances to select.';
     detail.replaceChildren(h('p', { class: 'keys' }, text), h('div', null, noteList(current.scene.remarks)));
   }
   const factList = (facts) =>
@@ -325,7 +325,7 @@ function mapsContent(section) {
       viewOfInstance(of, one, current.scene.thumbnails) || '');
   }
   function showTruth(of, index) {
-    detail.replaceChildren(h('h3', null, `Truth: ${titleOf(of, of.instances[index])}`),
+    detail.replaceChildren(h('h3', null, `Ground truth: ${titleOf(of, of.instances[index])}`),
       factList(factsOfTruth(of, index, judged())));
   }
   pane.canvas.addEventListener('keydown', (event) => {
@@ -336,8 +336,8 @@ function mapsContent(section) {
     else if (event.key === 'Escape') pick(-1);
   });
 
-  // The address follows what somebody changes here, once they pause, unless they have gone on to another one since; it
-  // adds nothing to the history.
+  // The address follows the state of the view after a pause, unless it has changed since (a jump to another section);
+  // it adds no entry to the history.
   function keepLink() {
     if (address === null || !map || asked) return;
     clearTimeout(isWriting);
@@ -354,7 +354,7 @@ function mapsContent(section) {
         instance: picked >= 0 ? picked : null,
         object: object >= 0 && aside === 'truth' && other.map ? other.map.instances[object].id : null,
       };
-      try { history.replaceState(null, '', linkText(state, eye)); } catch (error) { /* forbidden of files somewhere */ }
+      try { history.replaceState(null, '', linkText(state, eye)); } catch (error) { /* some browsers forbid it for local files */ }
       address = location.hash;
     }, 300);
   }
@@ -368,7 +368,7 @@ function mapsContent(section) {
     scene.input.value = link.scene;
     listMaps();
     which.input.value = String(link.index);
-    history.scrollRestoration = 'manual'; // the address says where
+    history.scrollRestoration = 'manual'; // the address determines the position
     section.scrollIntoView();
     return true;
   }
@@ -376,7 +376,7 @@ function mapsContent(section) {
 
   listMaps();
   followLink();
-  // The graphics card is asked for, and the first map is read, once the view comes near the screen.
+  // WebGL is initialised and the first map is loaded when the view comes near the screen.
   new IntersectionObserver((entries, observer) => {
     if (!entries.some((one) => one.isIntersecting)) return;
     observer.disconnect();

@@ -1,8 +1,7 @@
-// What the graphics card does with the points of a map.
+// WebGL shaders, textures and buffers for the points of a map.
 
-// A wall, ceiling or floor that the eye sees from outside stands in the way: `only` says whether those points are
-// left out (0), drawn alone (1), or drawn like any other (2). Points of an instance that came later than `now` are
-// not there.
+// A wall, ceiling or floor seen from outside hides the inside: `only` selects whether those points are omitted (0), the
+// only ones drawn (1), or drawn like any other (2). Points of an instance that first appears after `now` are not drawn.
 const POINT_VERTEX = `#version 300 es
 in vec3 place; in vec3 colour; in vec3 outward; in uint owner; in uint born;
 uniform mat4 camera; uniform vec3 origin, eye; uniform float spread, cut, pixels;
@@ -31,7 +30,7 @@ void main() {
 }`;
 const SHADE_VERTEX = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
-// Eye-dome lighting: a pixel is darker the farther it lies behind its neighbours. Over what is solid lies what is thin.
+// Eye-dome lighting: a pixel is darker the farther it is behind its neighbours. The thin layer is blended over the solid.
 const SHADE_FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D solid, solidDepth, thin, thinDepth; uniform float near, far, reach; uniform vec3 paper;
@@ -74,7 +73,7 @@ function linkedProgram(gl, vertex, fragment) {
   throw new Error(gl.getProgramInfoLog(linked));
 }
 
-// The colours, keys and depth of one layer of a picture.
+// The framebuffer of one layer: colours, keys and depth.
 function pictureLayer(gl) {
   const frame = gl.createFramebuffer(), textures = [gl.createTexture(), gl.createTexture(), gl.createTexture()];
   const formats = [[gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE],
@@ -100,7 +99,7 @@ function pictureLayer(gl) {
   return { frame, colours: textures[0], depth: textures[2], resize, clear };
 }
 
-// The points of one cloud in the memory of the card.
+// The vertex buffers of one point cloud.
 function pointBuffers(gl, program) {
   const array = gl.createVertexArray(), buffers = {};
   function put(name, values, size, type, how) {

@@ -1,11 +1,11 @@
-// A view of a map's points: plain WebGL2, drawn when something changes, shaded by depth alone.
+// A view of a map's points: plain WebGL 2, drawn only on changes, shaded by depth only.
 
 const FIELD_OF_VIEW = 0.8, TURN = 0.12, NO_OWNER = 0xffff, GHOST = [0.86, 0.16, 0.55];
 const DRAWN = { behind: 0, before: 1, all: 2 };
 const LIMITS = { distance: [0.2, 200], elevation: [-1.2, 1.56] };
 const within = (value, [low, high]) => Math.min(high, Math.max(low, value));
 
-// Views of one `eye` move together: `onMove` is called when this one moved it.
+// Views that share an `eye` move together: `onMove` is called after this view has moved it.
 function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
   const gl = canvas.getContext('webgl2', { antialias: false });
   if (!gl) return null;
@@ -124,8 +124,8 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
   function redraw() {
     if (!pending) { pending = true; requestAnimationFrame(draw); }
   }
-  // Reads without making the processor wait for the graphics card: into a buffer first, from it once a fence is passed.
-  // What is there: {kind: 'own' or 'ghost', owner}; null where nothing is.
+  // What is at a pixel: {kind: 'own' or 'ghost', owner}; null if nothing is. Does not block on the GPU: pixels are read
+  // into a buffer, and from there after a fence.
   async function at(x, y) {
     if (!cloud || gl.isContextLost()) return null;
     if (pending || !made.size[0]) draw();
@@ -152,7 +152,7 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     gl.deleteBuffer(buffer);
     if (mine !== cloud) return null;
-    // The pixel itself first, then its surroundings; a ghost before what is behind it.
+    // The pixel itself first, then its neighbourhood; a ghost before what is behind it.
     const places = side * side;
     const away = (k) => Math.hypot((k % side) - reach, Math.floor((k % places) / side) - reach);
     const nearest = [...Array(2 * places).keys()].sort((a, b) => away(a) - away(b) || b - a);
@@ -164,7 +164,7 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
   async function pickAt(x, y) {
     onPick(await at(x, y), x, y);
   }
-  // One look at a time, of the place where the pointer is by then.
+  // One read at a time, at the latest position of the pointer.
   let looksAt = null, isLooking = false;
   async function hoverAt(x, y) {
     looksAt = [x, y];
@@ -188,12 +188,12 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
     onMove();
   }
   function pan(across, along) {
-    // In shares of the height of the view.
+    // As fractions of the height of the view.
     const { right, up } = axes(), size = 2 * eye.distance * Math.tan(FIELD_OF_VIEW / 2);
     eye.target = eye.target.map((v, i) => v - size * (across * right[i] - along * up[i]));
     onMove();
   }
-  // How much of the height of the view its width shows; from farther away a narrow view shows as much as a wide one.
+  // Width over height, clipped to 0.45..1; narrow views are farther away, so that they show as much as wide ones.
   const narrowness = () => Math.min(1, Math.max(0.45, canvas.clientWidth / Math.max(1, canvas.clientHeight)));
   function whole() {
     if (!cloud || !cloud.n) return;
@@ -244,7 +244,7 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
   canvas.addEventListener('pointerleave', () => { looksAt = null; onHover(null); });
   canvas.addEventListener('contextmenu', (event) => event.preventDefault());
   canvas.addEventListener('wheel', (event) => {
-    // Until the view was clicked, the wheel scrolls the page.
+    // The wheel scrolls the page until the view is clicked.
     if (document.activeElement !== canvas) return;
     event.preventDefault();
     zoom(Math.exp(Math.max(-60, Math.min(60, event.deltaY)) * 0.004));
@@ -269,7 +269,7 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
 
   return {
     redraw, zoom, turn, pan, whole, narrowness,
-    // `bornAt`: the step of growth at which each instance came, all at once where there is none.
+    // `bornAt`: the timeline step at which each instance appears; 0 if unknown.
     show(next, values, bornAt) {
       cloud = next;
       colours = values;
