@@ -172,7 +172,7 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     expect(
         "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
     )
-    assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was taken up"
+    assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was resumed"
     assert here(place) == {*HUB, "sam-vit-h", "ram-plus"}
 
 

@@ -39,7 +39,7 @@ class Oracle:
         return PerceptionNeeds(frames=False)
 
     def receive_truth(self, truth: GroundTruth) -> None:
-        """Take the truth; only the runner calls this, and only for this method."""
+        """Take the ground truth; only the runner calls this, and only for this method."""
         self._truth = truth
 
     def start(self, scene: SceneInfo) -> None:
@@ -49,7 +49,7 @@ class Oracle:
         """Frames tell the oracle nothing."""
 
     def finish(self) -> Instances:
-        """The points of the truth; those of no instance stay in the map, in no mask."""
+        """The points of the ground truth; those of no instance stay in the map, in no mask."""
         truth = self._truth
         assert truth is not None
         masks = {key: mask for key, mask in _masks_of(truth).items() if truth.semantic[mask[0]] > 0}

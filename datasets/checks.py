@@ -1,4 +1,4 @@
-"""What a scene holds and what is wrong with it: every file, every frame, and whether frames and truth meet.
+"""What a scene holds and what is wrong with it: every file, every frame, and whether frames and ground truth meet.
 
 Where a reader gives up at the first fault, the check goes on: a dataset that has ``problems(scene)`` names its faults
 itself, one line each, and the files that it lists are looked at one by one.
@@ -74,8 +74,8 @@ class TruthVariant:
 class Inspection:
     """What is known of a scene after a check; ``digest`` is the data key that results of this scene carry.
 
-    ``n_frames`` is None where the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None where
-    there is no truth or no frame; ``up``, which axis of the files points up, where no frame was read.
+    ``n_frames`` is None if the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None if
+    there is no ground truth or no frame; ``up``, which axis of the files points up, where no frame was read.
     """
 
     scene: str
@@ -181,7 +181,7 @@ class _Findings:
             self.add(Finding("error", check, where, text))
 
     def attempt(self, check: str, work: Callable[[], Any]) -> Any:
-        """What ``work`` gives; None where it fails, which is a finding unless only ground truth is missing."""
+        """What ``work`` gives; None if it fails, which is a finding unless only ground truth is missing."""
         try:
             return work()
         except GroundTruthMissing:

@@ -1,6 +1,6 @@
 """What can be wrong with the frames of a scene and with how they lie to its ground truth, as findings.
 
-The checks know no dataset: they take what was measured of each frame, and the points of the truth.
+The checks know no dataset: they take what was measured of each frame, and the points of the ground truth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, 
 
 Severity = Literal["error", "warning", "note"]
 DEPTH_STEP = 4  # statistics look at every 4th row and column
-SEEN_POINTS = 300  # points kept of a frame, to be held against the truth
+SEEN_POINTS = 300  # points kept of a frame, to be compared with the ground truth
 PLAUSIBLE_MEDIAN_DEPTH_M = (0.2, 20.0)  # indoors; depth sensors begin at about 0.2 m
 PLAUSIBLE_FAR_DEPTH_M = 20.0  # of 99 of 100 pixels; halls aside, rooms end before
 LITTLE_DEPTH, LITTLE_DEPTH_OF_SCENE = 0.05, 0.3  # shares of pixels with a depth
@@ -69,7 +69,7 @@ class FrameFacts:
 
 @dataclass(frozen=True)
 class Meeting:
-    """How many of the seen points lie within ``distance_m`` of the truth, and what would bring them there."""
+    """How many of the seen points lie within ``distance_m`` of the ground truth, and what would bring them there."""
 
     share: float
     distance_m: float
@@ -214,7 +214,7 @@ def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
 def check_truth(
     frames: Sequence[FrameFacts], truth_points: Float32Array, boxes: ObjectBoxes | None = None
 ) -> tuple[Meeting | None, list[Finding]]:
-    """How far frames and truth meet, and what does not; nothing is held against a truth without points.
+    """How far frames and ground truth meet, and what does not; nothing is compared with a ground truth without points.
 
     Of objects known by their ``boxes`` alone what is inside one of them is near, not what is near a point.
     """
@@ -238,7 +238,7 @@ def check_truth(
 
 
 def _cameras(frames: Sequence[FrameFacts], truth_points: Float32Array, do_meet: bool) -> Iterator[Finding]:
-    """Cameras outside the truth's box; where all the same what they see is the truth, that is no error."""
+    """Cameras outside the ground truth's box; if what they see is nevertheless the ground truth, that is no error."""
     if not frames:
         return
     low = truth_points.min(axis=0).astype(np.float64) - CAMERA_SLACK_M
@@ -309,7 +309,7 @@ def _spacing(tree: Any) -> float:
 
 
 def _hint(share: Any, as_given: float) -> str:
-    """The usual mistakes turned round: a clause on the one that brings the points to the truth, or nothing."""
+    """The usual mistakes turned round: a clause on the one that brings the points to the ground truth, or nothing."""
     tries = {
         "with the poses inverted": share(lambda facts: _inverse(facts.camera_to_world), np.ones(3)),
         "with camera axes of OpenGL": share(lambda facts: facts.camera_to_world, np.array([1.0, -1.0, -1.0])),

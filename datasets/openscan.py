@@ -90,7 +90,7 @@ Records = Annotated[list[Record], Field(min_length=1, max_length=MOST_RECORDS), 
 
 
 def read_attributes(path: Path) -> Mapping[str, Attributes]:
-    """The words of every object of each scan, by its id there; a ``DataError`` where the file is damaged."""
+    """The words of every object of each scan, by its id there; a ``DataError`` if the file is damaged."""
     where = f"openscan: {path.name}"
     scenes: dict[str, dict[int, Mapping[str, str]]] = {}
     for number, record in enumerate(read_json(path, where, Records, f"download it again, see {PAGE}"), 1):

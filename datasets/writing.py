@@ -58,7 +58,7 @@ class SceneTarget:
 
 
 class Layout(ABC):
-    """How the scenes of one dataset are named, and how their frames and their truth are written.
+    """How the scenes of one dataset are named, and how their frames and their ground truth are written.
 
     ``name`` is that of ``--layout``, ``reader`` the dataset that reads it. ``settings`` is what moves a byte of a scene
     besides the scene itself, the layout's version first.
@@ -72,7 +72,7 @@ class Layout(ABC):
     def scenes_folder(self, out: Path) -> Path: ...
 
     def scene_name(self, scene: str) -> str:
-        """What the scene is called in the layout; a ``DataError`` where it has no name for it."""
+        """What the scene is called in the layout; a ``DataError`` if it has no name for it."""
         return scene
 
     @abstractmethod
@@ -80,7 +80,7 @@ class Layout(ABC):
 
     @abstractmethod
     def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
-        """Write what all scenes share; a ``StoreError`` where there is another."""
+        """Write what all scenes share; a ``StoreError`` if there is another."""
 
     @abstractmethod
     def frame_names(self, index: int) -> Sequence[str]:
@@ -101,7 +101,7 @@ class Layout(ABC):
 def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
     """The scenes that are not yet whole below ``out``, which is made ready for them; one caller at a time.
 
-    Raises ``StoreError`` where ``out`` cannot be written or holds one of the scenes, or what they share, from
+    Raises ``StoreError`` if ``out`` cannot be written or holds one of the scenes, or what they share, from
     elsewhere.
     """
     folder = layout.scenes_folder(out)

@@ -252,7 +252,7 @@ def export_encoder(files: ModelFiles, folder: Path) -> None:
 
 
 def check_parity(name: str, parts: Sequence[Parity]) -> None:
-    """Raise ``CheckFailed`` where a tower's features differ by more than the tolerance."""
+    """Raises ``CheckFailed`` if a tower's features differ by more than the tolerance."""
     for parity in parts:
         if parity.max_abs_difference > LARGEST_OF_FEATURES or parity.min_cosine < SMALLEST_COSINE:
             raise CheckFailed(
@@ -391,7 +391,7 @@ LARGEST_OF_LOGITS = 1e-3
 def export_ram_plus(files: ModelFiles, folder: Path, checkout: Path, python: Path) -> None:
     """Write ``ram_plus.onnx``, its list of tags and the manifest into ``folder``.
 
-    ``checkout``: a clone of recognize-anything, whose code ``python`` runs. Raises ``ConfigError`` where it is none,
+    ``checkout``: a clone of recognize-anything, whose code ``python`` runs. Raises ``ConfigError`` if it is none,
     ``DataError`` for weights that are no table of tensors, and ``CheckFailed`` where the code fails or ONNX Runtime's
     answers are not those of the authors' ``generate_tag``; then nothing is left in ``folder``.
     """
@@ -473,7 +473,7 @@ def compared(
 ) -> tuple[Parity, int]:
     """How far ``session`` is from ``logit`` (N, T), and how many of ``tag`` (N, T) are too near ``threshold`` (T,).
 
-    Too near is: within the tolerance, where a last bit decides. Raises ``CheckFailed`` where the logits differ by more
+    Too near is: within the tolerance, where a last bit decides. Raises ``CheckFailed`` if the logits differ by more
     than the tolerance, or other tags hold.
     """
     tags, theirs = zip(*(session.run(["tag", "logit"], {"image": image[None]}) for image in images), strict=True)

@@ -88,7 +88,7 @@ def read_tensors(path: Path) -> Mapping[str, Any]:
 
 
 def fill(model: Any, tensors: Mapping[str, Any]) -> None:
-    """Give ``model`` its weights under the names of the authors' own loader; ``ValueError`` where they do not fit."""
+    """Give ``model`` its weights under the names of the authors' own loader; ``ValueError`` if they do not fit."""
     kept = {
         name.replace("vision_multi", "tagging_head"): tensor
         for name, tensor in tensors.items()
@@ -106,7 +106,7 @@ def fill(model: Any, tensors: Mapping[str, Any]) -> None:
 def own_answers(model: Any, images: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """The last layer's output (N, T) in the authors' ``generate_tag`` for ``images``, and which tags (N, T) it names.
 
-    Raises ``ValueError`` where the tags that it names are not those whose probability is above their threshold.
+    Raises ``ValueError`` if the tags that it names are not those whose probability is above their threshold.
     """
     import torch
 

@@ -90,7 +90,7 @@ class _HeldOut:
         return self.features[rows] @ self.encoder.encode_texts(texts).T
 
     def places(self, rows: NDArray[np.intp], names: Sequence[str], field: str) -> Int64Array:
-        """Where among ``names`` the truths of crops ``rows`` stand."""
+        """Where among ``names`` the ground truths of crops ``rows`` stand."""
         return np.array([names.index(getattr(self.crops.truths[row], field)) for row in rows], np.int64)
 
     def class_figures(self, chosen: BoolArray, prompt: str, label: str) -> list[Figure]:

@@ -204,7 +204,7 @@ _WORDS = (attrgetter("colour"), attrgetter("material"), attrgetter("size_word"),
 
 
 class TruthTable:
-    """The truths of N crops as numbers, so that ``matches`` of a batch takes a millisecond."""
+    """The ground truths of N crops as numbers, so that ``matches`` of a batch takes a millisecond."""
 
     def __init__(self, truths: Sequence[CropTruth]) -> None:
         self.class_names = tuple(sorted({truth.class_name for truth in truths} - {""}))

@@ -31,7 +31,7 @@ MIN_VIEW_PIXELS = 80
 SHOWN_OF_WINDOW, SHOWN_OF_NEIGHBOUR = 0.02, 0.5
 # Ratio from which a window tells the kind of room, if it covers this part of the image.
 ROOM_PART_OF_IMAGE = 0.25
-HELD = ("on", "in")  # the holder is shown "with" what it holds; of other pairs the truth has both directions
+HELD = ("on", "in")  # the holder is shown "with" what it holds; of other pairs the ground truth has both directions
 TIGHT_RATIOS = (0.8, 1.0, 1.2)
 WIDE_RATIOS = (2.0, 2.0, 4.0)
 # A region of the segmenter teaches the object that owns at least this part of its pixels.
@@ -208,7 +208,7 @@ class _View:
                 self._related.setdefault(link.object, []).append(("with", link.subject))
 
     def truth_of(self, object_id: int, window: Int64Array) -> CropTruth:
-        """The truth of a window around ``object_id``, with those neighbours alone that the window shows."""
+        """The ground truth of a window around ``object_id``, with those neighbours alone that the window shows."""
         x0, y0, x1, y1 = window.tolist()
         inside = np.bincount(self.instance[y0:y1, x0:x1].ravel(), minlength=len(self.counts))
         area = (x1 - x0) * (y1 - y0)
@@ -230,7 +230,7 @@ class _View:
         )
 
     def whole(self) -> CropTruth:
-        """The truth of the whole image: the kind of room, and what stands out in it."""
+        """The ground truth of the whole image: the kind of room, and what stands out in it."""
         large = np.flatnonzero(self.counts >= 0.01 * self.instance.size)
         seen = [self._objects[int(object_id)] for object_id in large if object_id]
         shown = {Neighbour("with", item.class_name, item.colour): None for item in seen if item.support != "room"}

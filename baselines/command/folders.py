@@ -98,7 +98,7 @@ class FrameFolder:
             ("width", self._size[0], "pixels"),
             ("height", self._size[1], "pixels"),
             ("colour", f"colour/NNNNNN.{self.colour}", "8-bit RGB"),
-            ("depth", "depth/NNNNNN.png", "16-bit, along the optical axis, 0 where there is none"),
+            ("depth", "depth/NNNNNN.png", "16-bit, along the optical axis, 0 if there is none"),
             ("depth_unit_m", 0.001, "metres of one unit"),
             ("pose", "pose/NNNNNN.txt", "4x4, camera to world, metres; x right, y down, z forward"),
             ("intrinsics", "intrinsics.txt", "3x3, pixels"),
@@ -110,13 +110,13 @@ class FrameFolder:
             ("mesh", "mesh.ply" if self.surface is not None else None, "the scan's mesh, without labels"),
             ("n_vertices", 0 if self.surface is None else len(self.surface.vertices), "of the mesh"),
             ("frames", self._numbers, "the numbers NNNNNN, in the order of the updates"),
-            ("times_s", self._times_s, "seconds, one a frame"),
+            ("times_s", self._times_s, "seconds, one per frame"),
         ]
         return write_toml([((key,), value, remark) for key, value, remark in values])
 
 
 def matrix_text(matrix: Float64Array) -> str:
-    """A matrix, a row a line, such that reading it gives the same float64."""
+    """A matrix, a row per line, such that reading it gives the same float64."""
     return "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in matrix)
 
 
@@ -179,7 +179,7 @@ def as_prediction(content: Content, surface: Surface | None, names: Mapping[int,
 def class_names(content: Content, dataset: str, protocol: str | None) -> dict[int, str]:
     """The names of the class numbers of ``content``: in ``protocol``, else in all that score the dataset by default.
 
-    Empty where it has none. Raises ``PredictionError`` where the protocols give one number different names.
+    Empty where it has none. Raises ``PredictionError`` if the protocols give one number different names.
     """
     if not isinstance(content, VertexMasks | VertexLabels):
         return {}

@@ -40,7 +40,7 @@ PEAK_FILES = (
 class Finished:
     """A program that has ended; ``exit_code`` is negative where a signal ended it, as in ``subprocess``.
 
-    ``peak_memory_bytes``: None where it was not measured; ``memory_source`` says how it was, or why not.
+    ``peak_memory_bytes``: None if it was not measured; ``memory_source`` says how it was, or why not.
     """
 
     exit_code: int
@@ -208,7 +208,7 @@ class _Supervised:
             self._orders.flush()
 
     def _answer(self, wait_s: float | None) -> dict[str, Any] | None:
-        """The next answer, empty where no supervisor is left to give one; None where none came within ``wait_s``."""
+        """The next answer, empty if no supervisor is left to give one; None if none came within ``wait_s``."""
         until = None if wait_s is None else time.monotonic() + wait_s
         while b"\n" not in self._said:
             left_s = None if until is None else max(until - time.monotonic(), 0.0)

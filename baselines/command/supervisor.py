@@ -147,7 +147,7 @@ def _signal_group(program: int, number: signal.Signals) -> None:
 
 
 def _descendants() -> list[int]:
-    """The processes below this one; none where the system has no /proc."""
+    """The processes below this one; none if the system has no /proc."""
     children: dict[int, list[int]] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):

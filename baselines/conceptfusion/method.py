@@ -95,7 +95,7 @@ def paint(
         return PixelFeatures(np.zeros((height, width), np.int32), np.zeros((1, n_dimensions), np.float16))
     rows, columns = picked(masks.shape[1], height), picked(masks.shape[2], width)
     is_inside = masks[:, rows[:, None], columns].reshape(k, -1)
-    # a feature for each set of masks that some pixel lies under, rather than one a pixel
+    # a feature for each set of masks that some pixel lies under, rather than one per pixel
     packed = np.ascontiguousarray(np.packbits(is_inside, axis=0).T)
     _, example, row = np.unique(
         packed.view(np.dtype((np.void, packed.shape[1]))).ravel(), return_index=True, return_inverse=True

@@ -129,7 +129,7 @@ class FeatureTable:
         self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
-        # mapped anew at each use, for the file grows between them
+        # mapped again at each use, for the file grows between them
         return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
 
     def features(self) -> HalfArray:

@@ -39,7 +39,7 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
 
 
 def overlap_similarity(detections: Sequence[MapObject], objects: Sequence[MapObject], voxel_m: float) -> Float64Array:
-    """The share (M, N) of each detection's points nearer than ``voxel_m`` to the object; 0 where boxes do not meet."""
+    """The share (M, N) of each detection's points nearer than ``voxel_m`` to the object; 0 if boxes do not meet."""
     similarity = np.zeros((len(detections), len(objects)))
     for i, j in np.argwhere(box_iou(detections, objects) >= LEAST_IOU):
         similarity[i, j] = objects[j].share_near(detections[i].points, voxel_m)

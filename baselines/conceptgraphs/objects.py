@@ -110,7 +110,7 @@ def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int
 
 
 def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Float64Array:
-    """The points of the largest DBSCAN cluster; all of them where there is none, or none of at least five points.
+    """The points of the largest DBSCAN cluster; all of them if there is none, or none of at least five points.
 
     Of clusters of equal size the one whose first point comes first, as Python's ``Counter`` counts them.
     """
@@ -398,7 +398,7 @@ def merged(into: MapObject, other: MapObject, config: MappingConfig, *, with_dbs
 
 
 def denoised(item: MapObject, config: MappingConfig) -> MapObject:
-    """``item`` averaged anew and reduced to its largest cluster."""
+    """``item`` averaged again and reduced to its largest cluster."""
     points = cleaned(item.points, config)
     if len(points) < LEAST_AFTER_DENOISING:
         return item
@@ -440,7 +440,7 @@ def merge_overlapping(objects: Sequence[MapObject], config: MappingConfig) -> li
     """The objects after those that lie in another that looks like them went into it.
 
     Pairs go by falling ratio; of equal ratios the last by (i, j) first, which is what the original's reversed sort
-    gives where its sort keeps the order of equals. As in the original, ratios are not computed anew after a merge, and
+    gives where its sort keeps the order of equals. As in the original, ratios are not computed again after a merge, and
     an object that has gone into another can go into a second one too.
     """
     if config.merge_overlap_thresh <= 0:

@@ -1,4 +1,4 @@
-"""Projection of points into a depth image, and how many pixels a mask covers; imported lazily."""
+"""Projection of points into a depth image, and how many pixels per mask covers; imported lazily."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def prompted_mask(
 ) -> BoolArray | None:
     """The mask (H, W) of which the segmenter is surest in ``n_rounds``, each of ``n_points`` random ones of ``pixels``.
 
-    The first of equals; None where every round is empty or of certainty 0, where the original stops with an error.
+    The first of equals; None if every round is empty or of certainty 0, where the original stops with an error.
     """
     best, best_score = None, 0.0
     for _ in range(n_rounds):
@@ -296,7 +296,7 @@ class OpenMask3D:
         return frame
 
     def _look(self, mask: int, frame: Frame, visible: np.ndarray) -> Float32Array:
-        """The features of the crops of one view of ``mask``; none where its prompts find nothing."""
+        """The features of the crops of one view of ``mask``; none if its prompts find nothing."""
         config, regions = self.config, self._tools.regions
         pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
         # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.

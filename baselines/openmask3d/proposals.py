@@ -58,7 +58,7 @@ def split_into_parts(
 def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
     """Each mask made of whole segments: those of which it holds more than half, as both networks are evaluated.
 
-    ``segments`` (N,) are numbered from 0 on, one a point; masks that hold no segment by more than half become empty.
+    ``segments`` (N,) are numbered from 0 on, one per point; masks that hold no segment by more than half become empty.
 
     >>> points = np.zeros((5, 3), np.float32)
     >>> masks = Proposals(np.array([0, 3]), np.array([0, 1, 3]), points=points, scores=np.ones(1), source="made")
@@ -127,7 +127,7 @@ def linked_within(points: Float64Array, gap_m: float) -> Int64Array:
 def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:
     """The masks of ``scene`` over the vertices of ``surface``, in the order of the file; classes are left aside.
 
-    Raises ``PredictionError`` where the files hold no masks, cannot be used, or are of another mesh.
+    Raises ``PredictionError`` if the files hold no masks, cannot be used, or are of another mesh.
     """
     from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
 
@@ -167,7 +167,7 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
 # Square metres of surface from which on size no longer speaks for a part. Chosen on rooms/living0 and rooms/office0.
 FULL_AREA_M2 = 0.5
-LEAST_BORDER = 0.2  # added to the relative length of a border, which is 0 where a part touches nothing
+LEAST_BORDER = 0.2  # added to the relative length of a border, which is 0 if a part touches nothing
 LONE_BEND = 0.3  # bend of the border of a part that touches nothing
 
 
@@ -235,10 +235,10 @@ class ProposalConfig(BaseModel):
     """Where proposals come from; the defaults are Mask3D's in OpenMask3D, as far as the original has the setting.
 
     ``proposals``: ``files`` of ``proposals_folder``, ``surface`` for weight-free ones made from the mesh, ``oracle``
-    for the truth's instances; ``auto`` takes files where a folder is set, else the surface.
+    for the ground truth's instances; ``auto`` takes files where a folder is set, else the surface.
     ``split_parts``: the original's last step on its masks: their connected parts, then whole segments by majority
     where ``segment_vote`` is on. Exports have gone through it, so it is done for ``surface`` alone; ``always`` does it
-    for files, too. Proposals from the truth stay as they are.
+    for files, too. Proposals from the ground truth stay as they are.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")

@@ -109,7 +109,7 @@ class SAM3D:
         self._clear()
 
     def _clear(self) -> None:
-        self._clouds: list[GroupedCloud] = []  # one a frame, or the map alone where it is incremental
+        self._clouds: list[GroupedCloud] = []  # one per frame, or the map alone where it is incremental
         self._views: list[_View] = []
         self._surface: Surface | None = None
         self._scene = ""
@@ -153,7 +153,7 @@ class SAM3D:
         self._tools = tools
 
     def start(self, scene: SceneInfo) -> None:
-        """Forgets the scene before, and reads the mesh of the new one where there is one."""
+        """Forgets the scene before, and reads the mesh of the new one if there is one."""
         self._clear()
         self._scene = f"{scene.dataset}/{scene.scene}"
         self._surface = self._read_surface()

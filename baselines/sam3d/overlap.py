@@ -177,7 +177,7 @@ def cal_group(other: Int64Array, group: Int64Array, pairs: Pairs, ratio: float) 
 
 
 def merge(first: GroupedCloud, second: GroupedCloud, rules: MergeRules, timer: StageTimer) -> GroupedCloud | None:
-    """Both clouds as one by bidirectional group overlap; None where both hold a NaN, the other where one does.
+    """Both clouds as one by bidirectional group overlap; None if both hold a NaN, the other where one does.
 
     The second call of ``cal_group`` shifts the ids of ``first`` beyond those of ``second``: an identity that the first
     call found survives only where the second finds it too, counted after the first. Small groups go, from a cloud that
@@ -222,7 +222,7 @@ def _joined(first: GroupedCloud, second: GroupedCloud, of_first: Relabelled, of_
 def merge_regions(clouds: Sequence[GroupedCloud], rules: MergeRules, timer: StageTimer) -> GroupedCloud | None:
     """All clouds merged pairwise in a binary tree: [0, 1], [2, 3], ...; an odd last one passes unchanged.
 
-    None where no cloud is without NaN; the original never ends then.
+    None if no cloud is without NaN; the original never ends then.
     """
     left = list(clouds)
     while len(left) > 1:

@@ -145,7 +145,7 @@ def corridors_section(runs: Sequence[Path]) -> str:
 
 
 def growth_table(every: Sequence[Sequence[UpdateTimes]]) -> list[list[str]]:
-    """A row a method: how large its map became, and what an update of the smallest and the largest maps cost."""
+    """A row per method: how large its map became, and what an update of the smallest and the largest maps cost."""
     head = ["method", "m", "updates", "points, from", "to", "ms, smallest tenth", "largest", "worst", "exponent", ""]
     rows = [[*head, "stages that grow"]]
     for times in every:
@@ -194,7 +194,7 @@ def _stage(summary: MethodSummary, name: str) -> StageSummary:
 
 
 def section_of(page: str, title: str) -> str:
-    """The section of ``page`` below the line ``title``, with it; empty where there is none."""
+    """The section of ``page`` below the line ``title``, with it; empty if there is none."""
     return next((one for one in sections_of(page) if one.startswith(f"{title}\n")), "")
 
 

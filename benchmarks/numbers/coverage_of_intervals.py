@@ -209,7 +209,7 @@ REASONS: Mapping[str, str] = {
 
 @dataclass
 class Tally:
-    """Of how many intervals there were, how many held the truth; by kind of interval."""
+    """Of how many intervals there were, how many held the ground truth; by kind of interval."""
 
     held: dict[str, int]
     n: dict[str, int]

@@ -142,7 +142,7 @@ class Copy:
         os.utime(path, (self._stamp, self._stamp))
 
     def passes(self, tests: Sequence[str], limit_s: float) -> bool | None:
-        """Whether all ``tests`` pass; None where they take longer than ``limit_s``."""
+        """Whether all ``tests`` pass; None if they take longer than ``limit_s``."""
         options = ["-x", "-q", "-p", "no:cacheprovider", f"--basetemp={self.folder / '.tests'}"]
         environment = os.environ | {"PYTHONPATH": str(self.folder), "HYPOTHESIS_STORAGE_DIRECTORY": os.devnull}
         process = subprocess.Popen(
@@ -173,7 +173,7 @@ class Verdict:
 
 
 def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Iterator[Verdict]:
-    """A verdict a mutant, as they come; ``RuntimeError`` where the tests fail without any fault."""
+    """A verdict a mutant, as they come; ``RuntimeError`` if the tests fail without any fault."""
     copies: queue.Queue[Copy] = queue.Queue()
     for index in range(n_copies):
         copies.put(Copy(folder / f"copy{index}"))

@@ -31,7 +31,7 @@ LIMITS = (0.25, 0.5, 0.75)
 
 
 def best_ious(rules: ProtocolRules, truth: GroundTruth, proposals: Proposals) -> Float64Array:
-    """For each counted object (O,) the largest IoU of a proposal with it, on the points of the truth."""
+    """For each counted object (O,) the largest IoU of a proposal with it, on the points of the ground truth."""
     scored = [entry.id for entry in rules.scored]
     ids, first, n = np.unique(truth.instance, return_index=True, return_counts=True)
     counts = (ids > 0) & np.isin(truth.semantic[first], scored) & (n >= (rules.min_region_size or 1))
@@ -46,7 +46,7 @@ def best_ious(rules: ProtocolRules, truth: GroundTruth, proposals: Proposals) ->
 
 
 def measured(config: ProposalConfig, scenes: list[str], rules: ProtocolRules, dataset_of: Callable[[str], Any]) -> str:
-    """A row of the table, after the name: number, recalls, mean IoU, seconds a scene."""
+    """A row of the table, after the name: number, recalls, mean IoU, seconds per scene."""
     found, n_proposals, seconds = [], 0, []
     for scene in scenes:
         name, _, own = scene.partition("/")

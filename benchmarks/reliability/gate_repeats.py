@@ -2,7 +2,7 @@
 
 ``python benchmarks gate_repeats [--repeats 50] [--json build/measured/gate_repeats.json]``: the same small run again
 and again, OpenSU3D with perfect masks on the forty updates of a room; the first five teach the reference, the
-others are checked against it, and each once more with a method slower by half, which must fail. Some seconds a run.
+others are checked against it, and each once more with a method slower by half, which must fail. Some seconds per run.
 Exit code 1 where a repeat fails or a slower one passes.
 """
 
@@ -29,7 +29,7 @@ TAUGHT, N_UPDATES, SLOWER = 5, 40, 1.5
 
 
 def made(scene: str, folder: Path) -> Path:
-    """One run of the request, made anew."""
+    """One run of the request, made again."""
     words = ["run", "--scenes", scene, "--methods", "opensu3d", "--profile", "oracle", "--limit", str(N_UPDATES)]
     words += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1", "--quiet"]
     with contextlib.redirect_stdout(io.StringIO()):

@@ -1,4 +1,4 @@
-"""Runs and verbs killed at random moments, last written files spoilt as by a power cut, then taken up again.
+"""Runs and verbs killed at random moments, last written files corrupted as by a power cut, then resumed.
 
     python benchmarks kill_at_random --kills 200
     python benchmarks kill_at_random --kills 20 --seed 7 --only processes export
@@ -66,7 +66,7 @@ COLUMNS = (
 )  # fmt: skip
 COUNTED = ("faults", "orphans", "leftovers")
 NOTE = (
-    "compared: what was taken up again to its end and had the bytes of the undisturbed one; a fault is a file that "
+    "compared: what was resumed to its end and had the bytes of the undisturbed one; a fault is a file that "
     "differs, a half-written one taken for whole, a lock that stayed, a traceback or another end than the signal's; an "
     "orphan is a process that works on 5 s after its run was killed, a leftover a file or folder that nothing owns."
 )
@@ -198,14 +198,14 @@ class Trial:
         self._tally.done["compared"] += 1
         self._end_orphans()
         if code != COMPLETE:
-            self._tally.fault(f"taken up again it ended with {code}: {run.said()}")
+            self._tally.fault(f"resumed it ended with {code}: {run.said()}")
             return
         found = outcome(folder)
         for name in sorted(found.keys() | self.expected.keys()):
             if name not in self.expected:
                 self._tally.leftover(name)
             elif name not in found or found[name] != self.expected[name]:
-                self._tally.fault(f"taken up again: {name} {'differs' if name in found else 'is missing'}")
+                self._tally.fault(f"resumed: {name} {'differs' if name in found else 'is missing'}")
         for path in self._cache.rglob("*"):
             if path.is_file() and path.suffix != ".npz":
                 self._tally.leftover(f"in the cache: {path.name}")

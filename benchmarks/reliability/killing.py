@@ -48,7 +48,7 @@ class Tally:
         print(f"{kind} {lines[-1]}", flush=True)
 
     def kill(self, victim: str, sent: signal.Signals, spoilt: int | None) -> None:
-        """Count one that struck; ``spoilt`` files where the power was cut too."""
+        """Count one that struck; ``corrupted`` files where the power was cut too."""
         self.done["kills"] += 1
         self.done[f"of a {victim}"] += 1
         self.done[sent.name] += 1

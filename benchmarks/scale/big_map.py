@@ -79,7 +79,7 @@ def detections_of(position: int, objects: range, features: Float32Array, names: 
 
 
 def fill(method: OpenSU3D, n_points: int, n_instances: int) -> GroundTruth:
-    """Put the objects into the map of ``method``, as many updates would have; gives the truth at each 20th."""
+    """Put the objects into the map of ``method``, as many updates would have; gives the ground truth at each 20th."""
     generator = np.random.default_rng(0)
     names = tuple(entry.name for entry in CLASSES)
     features = RandomDirections(DIMENSIONS).encode_texts([RULES.texts_of(name)[0] for name in names])
@@ -155,7 +155,7 @@ def main() -> None:
         title = f"A map of {arguments.points / 1e6:g} million points and {arguments.instances:,} instances"
         notes = [
             "Memory is the resident set at its highest in each step. The score is that of rooms-semantic; for instance "
-            "AP the truth of a scene may hold 999 instances at most."
+            "AP the ground truth of a scene may hold 999 instances at most."
         ]
         columns = ["step", "time", "peak memory, MiB", "what came out"]
         write_measured(arguments.json, title, "python benchmarks big_map", columns, rows, notes)

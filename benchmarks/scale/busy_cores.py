@@ -173,7 +173,7 @@ def idling(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]
 
 
 def first_starts(rounds: Sequence[Sequence[Sample]]) -> Iterator[tuple[str, str]]:
-    """When one scene alone is taken up, the best of ``rounds``."""
+    """When one scene alone is resumed, the best of ``rounds``."""
     begins = [next(one for one in samples if one.n_begun) for samples in rounds]
     done = [next(one for one in samples if one.n_updates) for samples in rounds]
     for name, found in (("begins", begins), ("is done", done)):

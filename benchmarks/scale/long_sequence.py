@@ -139,7 +139,7 @@ def main() -> None:
     start = time.perf_counter()
     instances = method.finish()
     notes = [
-        f"In the second half memory grows by {slope:,.0f} bytes a frame (a straight line through every "
+        f"In the second half memory grows by {slope:,.0f} bytes per frame (a straight line through every "
         f"{SAMPLE_EVERY}th): its row of the update table and {MOST_MASKS} or fewer views of things.",
         f"The map at the end: {len(instances.ids):,} instances after {time.perf_counter() - start:.1f} s.",
     ]

@@ -128,7 +128,7 @@ def simulate(plan: Plan, source: RunFolder) -> None:
 
 
 def varied(score: SceneScore, generator: np.random.Generator) -> SceneScore:
-    """``score`` with other confidences, or with confusions drawn anew."""
+    """``score`` with other confidences, or with confusions drawn again."""
     counts = score.counts
     if isinstance(counts, InstanceCounts):
         return replace(score, counts=replace(counts, score=generator.random(len(counts.score))))

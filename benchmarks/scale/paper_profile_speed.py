@@ -155,7 +155,7 @@ def main() -> int:
         else f"cpu, {torch.get_num_threads()} threads"
     )
     print(f"{what}, {precision}, image {rgb.shape[1]}x{rgb.shape[0]}, median of {repeats}\n")
-    print("| stage | s a frame | frames a second |\n|---|---|---|")
+    print("| stage | s per frame | frames per second |\n|---|---|---|")
     for part in wanted.parts:  # one network is in memory at a time
         for name, work in PARTS[part](wanted.device, precision, rgb):
             taken = seconds(work, wanted.device, repeats)

@@ -52,7 +52,7 @@ class ChallengeQuery:
 
 @dataclass(frozen=True)
 class Challenge:
-    """The part of the challenge that lies in ``folder``; None where there is none."""
+    """The part of the challenge that lies in ``folder``; None if there is none."""
 
     folder: Path | None
 
@@ -65,7 +65,7 @@ class Challenge:
                 if not text.strip() or len(text) > MOST_CHARACTERS or not text.isprintable():
                     raise DataError(f"{at}: '{printable(text, 40)}' is no query; expected the words to search for")
                 if found.setdefault(scene, text) != text:
-                    raise DataError(f"{at}: scene {scene} has two queries; the challenge has one a scene")
+                    raise DataError(f"{at}: scene {scene} has two queries; the challenge has one per scene")
         return found
 
     @cached_property
@@ -83,7 +83,7 @@ class Challenge:
         return (*self._lists("queries"), *(() if truth is None else (truth,)))
 
     def query(self, scene: str) -> str:
-        """The text of a scene; ``GroundTruthMissing`` where no list has one."""
+        """The text of a scene; ``GroundTruthMissing`` if no list has one."""
         if scene not in self.queries:
             wanted = f"{LISTS_FOLDER}/queries_development_scenes.csv"
             raise GroundTruthMissing(f"arkitscenes/{scene}: no query in {wanted}; {self._advice}")
@@ -92,7 +92,7 @@ class Challenge:
     def ground_truth(self, scene: str, vertices: Float32Array) -> GroundTruth:
         """The objects that answer the query of a scene, on the ``vertices`` (V, 3) m of its mesh in their order.
 
-        ``GroundTruthMissing`` where the challenge publishes none.
+        ``GroundTruthMissing`` if the challenge publishes none.
         """
         path, where = self._truth_file(scene), f"arkitscenes/{scene}"
         if path is None:

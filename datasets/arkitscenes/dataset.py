@@ -1,6 +1,6 @@
 """ARKitScenes as the OpenSUN3D challenge uses it: a phone's recording, its mesh, and a text to be found in each scene.
 
-The raw and the 3DOD release are read; the query and the truth come from a clone of the challenge's repository.
+The raw and the 3DOD release are read; the query and the ground truth come from a clone of the challenge's repository.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     @cached_property
     def challenge(self) -> challenge_files.Challenge:
-        """The challenge's lists and truths, as far as they are here."""
+        """The challenge's lists and ground truths, as far as they are here."""
         return challenge_files.find_challenge(self.root, self.options.challenge)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
@@ -90,7 +90,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         return self.challenge.groups
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: images, and query and truth."""
+        """A word on the scene from a quick look: images, and query and ground truth."""
         try:
             words = f"{len(self.recording(scene).images)} images"
         except FramesMissing:
@@ -127,7 +127,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         return self.challenge.ground_truth(scene, self.surface(scene).vertices)
 
     def asked_text(self, scene: str) -> str:
-        """What the scene is searched for; ``GroundTruthMissing`` where no list has its query."""
+        """What the scene is searched for; ``GroundTruthMissing`` if no list has its query."""
         return self.challenge.query(scene)
 
     def queries(self, scene: str) -> Sequence[challenge_files.ChallengeQuery]:

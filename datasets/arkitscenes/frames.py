@@ -94,7 +94,7 @@ def camera_folder(colour: str) -> str:
 
 @dataclass(frozen=True)
 class Image:
-    """The names below the folder of one frame's files; ``confidence`` is None where it is not asked for."""
+    """The names below the folder of one frame's files; ``confidence`` is None if it is not asked for."""
 
     time_ms: int
     colour: str
@@ -138,7 +138,7 @@ def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
 
 
 def open_recording(folder: Path, scene: str, images: Images, least_confidence: int, where: str) -> PhoneRecording:
-    """The recording of a scene; ``FramesMissing`` where it has no images, ``DataError`` where none can be used."""
+    """The recording of a scene; ``FramesMissing`` if it has no images, ``DataError`` if none can be used."""
     colour_folder = COLOUR_FOLDER[images]
     with recorded_frames.reading(where):
         colours = times_in(folder / colour_folder, scene, ".png")

@@ -49,7 +49,7 @@ ENDINGS = {COLOUR: "png", DEPTH: "png", POSE: "txt"}
 
 
 class Hm3dSem(RecordedDataset[NoOptions]):
-    """HOV-SG's walks through HM3DSem, with the truth that its tools create; read below the data root."""
+    """HOV-SG's walks through HM3DSem, with the ground truth that its tools create; read below the data root."""
 
     name = "hm3dsem"
     reader_version = 2
@@ -97,7 +97,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
         return WorldUp("y", False, "Habitat's worlds are so", "predictions of HOV-SG lie in this world, so it stays")
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What is wrong with poses, truth and annotation, a line each; images are left to the frames."""
+        """What is wrong with poses, ground truth and annotation, a line each; images are left to the frames."""
         yield from faults_of([lambda: self.recording(scene), lambda: self._check_annotation(scene)])
 
     def _check_annotation(self, scene: str) -> None:
@@ -126,7 +126,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
 
 
 def annotation_file(root: Path, walk: Path) -> Path | None:
-    """The ``.semantic.txt`` of a walk's scene, beside the walk or in the release; None where it is not there."""
+    """The ``.semantic.txt`` of a walk's scene, beside the walk or in the release; None if it is not there."""
     name = f"{walk.name.partition('-')[2]}.semantic.txt"
     folders = [walk, *(root / place / walk.name for place in RELEASE_PLACES)]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)

@@ -1,4 +1,4 @@
-"""The truth of a walk: ``scene_info.json`` with floors, rooms and objects, and the cloud of each object.
+"""The ground truth of a walk: ``scene_info.json`` with floors, rooms and objects, and the cloud of each object.
 
 Files and keys are those that create_hm3dsem_walks_gt.py of hovsg/HOV-SG (commit 71a8069) writes and its
 hm3dsem_evaluator.py reads. The semantic mesh of HM3D, whose objects are colours of a texture, is not read: the clouds
@@ -75,7 +75,7 @@ class WalkInfo(FileModel):
     @model_validator(mode="after")
     def _check_ids(self) -> WalkInfo:
         if len({one.id for one in self.objects}) != len(self.objects):
-            raise ValueError("an object stands there twice")
+            raise ValueError("an object is listed twice")
         if not {room.floor_id for room in self.regions} <= {level.id for level in self.levels}:
             raise ValueError("a 'floor_id' names no level")
         return self
@@ -153,12 +153,12 @@ def read_annotation(path: Path, where: str) -> dict[int, tuple[str, str, int]]:
         except (ValueError, StopIteration, csv.Error):
             raise DataError(f'{where}:{number}: is {line[:60]!a}; expected id,colour,"category",region') from None
         if rows.setdefault(row[0], row[1]) != row[1] or len(rows) > MAX_OBJECTS:
-            raise DataError(f"{where}:{number}: object {row[0]} stands there twice; copy the file again")
+            raise DataError(f"{where}:{number}: object {row[0]} is listed twice; copy the file again")
     return rows
 
 
 def check_annotation(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> None:
-    """A ``DataError`` where an object of the walk is not that of the scene's annotation."""
+    """A ``DataError`` if an object of the walk is not that of the scene's annotation."""
     for one in info.objects:
         own = one.hex, one.category, one.region_id
         if annotation.get(one.id) != own:

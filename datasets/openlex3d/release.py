@@ -109,12 +109,12 @@ class OpenLexFiles:
 
 
 def read_prompts(path: Path, where: str) -> tuple[str, ...]:
-    """One prompt a line, without the white space around it."""
+    """One prompt per line, without the white space around it."""
     text = _read_text(path, where)
     lines = text.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n").split("\n")
     prompts = tuple(line.strip() for line in lines)
     if not any(prompts):
-        raise DataError(f"{where}: has no prompt; expected one a line")
+        raise DataError(f"{where}: has no prompt; expected one per line")
     return prompts
 
 
@@ -156,7 +156,7 @@ def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
         tiers = tuple(found.synonyms), tuple(found.depictions), tuple(found.vis_sim)
         labels = ObjectLabels(*tiers, tuple(found.clutter or ()))
         if labels_of.setdefault(sample.object_id, labels) != labels:
-            raise DataError(f"{where}: object {sample.object_id} stands there twice with other labels; keep one")
+            raise DataError(f"{where}: object {sample.object_id} is listed twice with other labels; keep one")
     return labels_of
 
 
@@ -208,7 +208,7 @@ class LabelledPoints:
 
 
 def points_of(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
-    """The points of a scene of ``replica``, ``scannetpp`` or ``hm3d``; ``GroundTruthMissing`` where they are not."""
+    """The points of a scene of ``replica``, ``scannetpp`` or ``hm3d``; ``GroundTruthMissing`` if they are not."""
     return {"replica": _of_replica, "scannetpp": _of_scannetpp, "hm3d": _of_hm3d}[dataset](data_root, scene)
 
 
@@ -236,7 +236,7 @@ def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
 
 
 def sampled_points_file(data_root: Path, scene: str) -> Path | None:
-    """Where the sampled points of a scene are; None where they are not."""
+    """Where the sampled points of a scene are; None if they are not."""
     name = f"{SAMPLED_FOLDER}/{scene}.pth"
     return next((file for base in SCANNETPP_BASES if (file := data_root / base / name).is_file()), None)
 
@@ -297,7 +297,7 @@ def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
     advice = "unpack the release again"
     ids = [one.id for one in read_json(folder / SCENE_INFO, f"{where}: {SCENE_INFO}", SceneInfo, advice).objects]
     if len(set(ids)) != len(ids):
-        raise DataError(f"{where}: {SCENE_INFO}: an object stands there twice; {advice}")
+        raise DataError(f"{where}: {SCENE_INFO}: an object is listed twice; {advice}")
     clouds: list[Float32Array] = []
     n_points = 0
     for one in ids:
@@ -349,7 +349,7 @@ def categories_truth(files: OpenLexFiles, labelled: LabelledPoints) -> OpenLexTr
 
 
 def queries_truth(files: OpenLexFiles, labelled: LabelledPoints, level: Level) -> QueryTruth:
-    """The truth of ``openlex3d-queries``: all points with their objects, seen or not."""
+    """The ground truth of ``openlex3d-queries``: all points with their objects, seen or not."""
     return QueryTruth(
         labelled.points,
         labelled.object_of_point,
@@ -369,7 +369,7 @@ class OpenLexRelease:
 
     @staticmethod
     def datasets_at(folder: Path) -> tuple[str, ...]:
-        """The datasets whose labels a folder of ground truth has; none where it is not the release."""
+        """The datasets whose labels a folder of ground truth has; none if it is not the release."""
         return tuple(name for name in DATASETS if (folder / name / PROMPTS_NAME).is_file())
 
     def scenes(self) -> tuple[str, ...]:
@@ -382,7 +382,7 @@ class OpenLexRelease:
         return digest_json({file.name: digest_file(file) for file in files if file.is_file()})
 
     def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
-        """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""
+        """The ground truth of a scene; ``GroundTruthMissing`` if one of its files is not there."""
         files = OpenLexFiles(self.folder, self.dataset, scene)
         labelled = _kept_points(self.dataset, self.data_root, scene)
         if variant == VISIBLE:
@@ -391,7 +391,7 @@ class OpenLexRelease:
 
 
 def label_files(root: Path, dataset: str, scene: str) -> tuple[Path, ...]:
-    """The files of a scene's labels below the data root, sampled points too; none where the release is not there."""
+    """The files of a scene's labels below the data root, sampled points too; none if the release is not there."""
     found = _find(root, dataset, scene)
     if found is None:
         return ()
@@ -403,7 +403,7 @@ def label_files(root: Path, dataset: str, scene: str) -> tuple[Path, ...]:
 
 
 def truth_below(root: Path, dataset: str, scene: str, variant: str) -> Any:
-    """The truth of a dataset's scene, from the release and the base data below the data root.
+    """The ground truth of a dataset's scene, from the release and the base data below the data root.
 
     An ``OpenLexTruth`` or a ``QueryTruth``, as ``variant`` says; neither is a ``GroundTruth``.
     """
@@ -433,5 +433,5 @@ def _names(scene: str) -> tuple[str, ...]:
 
 @lru_cache(maxsize=1)
 def _kept_points(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
-    """The points of a scene; the last ones are kept, because every protocol asks for them anew."""
+    """The points of a scene; the last ones are kept, because every protocol asks for them again."""
     return points_of(dataset, data_root, scene)

@@ -171,7 +171,7 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     @cached_property
     def tree(self) -> SceneTree:
-        """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
+        """Where the scenes are; a ``ScenesMissing`` that says how to get data if there are none."""
         tree = self.find_tree()
         if not tree.folders:
             raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
@@ -243,7 +243,7 @@ class FileDataset(ABC, Generic[OptionsT]):
         return f"{self.name}/{scene}"
 
     def folder(self, scene: str) -> Path:
-        """The folder of a scene; a ``DataError`` where there is none."""
+        """The folder of a scene; a ``DataError`` if there is none."""
         if scene not in self.tree.folders:
             hint = suggest(scene, list(self.tree.folders), f"{self.tree.places[0]} has")
             raise DataError(f"{self.name}: no scene '{scene}'{hint}")

@@ -43,7 +43,7 @@ def vertex_positions(file: PlyFile, where: str) -> Float32Array:
 
 
 def check_finite(points: Float32Array, where: str, noun: str = "vertex") -> None:
-    """Raise ``DataError`` where a point (N, 3) is nowhere."""
+    """Raise ``DataError`` if a point (N, 3) is nowhere."""
     is_finite = np.isfinite(points).all(axis=1)
     if not is_finite.all():
         row = int(np.argmin(is_finite))
@@ -68,7 +68,7 @@ def fans(corners: ListColumn) -> tuple[Int32Array, Int64Array]:
 
 
 def check_one_mesh(n_segments: int, n_vertices: int, names: tuple[str, str], where: str) -> None:
-    """A ``DataError`` where the list of segments and the mesh, by their ``names``, differ in length."""
+    """A ``DataError`` if the list of segments and the mesh, by their ``names``, differ in length."""
     if n_segments != n_vertices:
         raise DataError(
             f"{where}: {names[0]} has {n_segments} vertices, {names[1]} has {n_vertices}; they belong to two meshes"
@@ -81,7 +81,7 @@ def with_segments(surface: Surface, ids: Int64Array) -> Surface:
 
 
 def majority(of_vertex: Int32Array, triangles: Int32Array) -> Int32Array:
-    """What most corners of each triangle (T, 3) have; 0 where all three differ."""
+    """What most corners of each triangle (T, 3) have; 0 if all three differ."""
     first, second, third = of_vertex[triangles].T
     same = np.where((first == second) | (first == third), first, np.where(second == third, second, 0))
     return same.astype(np.int32)

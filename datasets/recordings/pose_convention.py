@@ -84,7 +84,7 @@ class Verdict:
 
 
 def judge_scene(dataset: Dataset, scene: str, frames: Sequence[Frame] | None = None) -> Verdict | None:
-    """The verdict on a scene in the words of its dataset; None where the reading is right, or none is asked for.
+    """The verdict on a scene in the words of its dataset; None if the reading is right, or none is asked for.
 
     ``frames`` are those at full rate where they are at hand; some twenty of them are read.
     """
@@ -113,7 +113,7 @@ def _in_words(finding: Finding) -> str:
 
 
 def _doubt(shares: Float64Array) -> str | None:
-    """Why the frames do not confirm that the poses are no inverses, which is the usual mistake; None where they do."""
+    """Why the frames do not confirm that the poses are no inverses, which is the usual mistake; None if they do."""
     as_read, inverse = shares[:, 0], shares[:, READINGS.index(("inverse", 1.0))]
     if not len(shares) or max(as_read.max(), inverse.max()) < MIN_SHARE:
         best = f", at most {as_read.max():.0%} of what one sees" if len(shares) else ""

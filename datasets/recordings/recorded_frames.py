@@ -194,7 +194,7 @@ class RecordedFrames(Sequence[Frame]):
         return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
 
     def check_size(self, width: int, height: int, where: str) -> None:
-        """A ``DataError`` where a colour image of this size is not of the recording's camera."""
+        """A ``DataError`` if a colour image of this size is not of the recording's camera."""
         expected, (cx, cy) = self._recording.image_size, self._recording.intrinsics[:2, 2]
         if expected is not None and expected != (width, height):
             raise DataError(
@@ -208,7 +208,7 @@ class RecordedFrames(Sequence[Frame]):
             )
 
     def check_depth(self, values: UInt16Array, where: str) -> None:
-        """A ``DataError`` where a depth image cannot be right."""
+        """A ``DataError`` if a depth image cannot be right."""
 
     def _depth_values(self, frame: RecordedFrame, rgb: UInt8Array) -> UInt16Array:
         where, content = self._read(frame.depth)

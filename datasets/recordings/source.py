@@ -79,7 +79,7 @@ class RgbdSource(Protocol):
         ...
 
     def timestamp_s(self, i: int) -> float:
-        """When record ``i`` was taken; at 30 frames a second where the recording has no times that increase."""
+        """When record ``i`` was taken; at 30 frames per second where the recording has no times that increase."""
         ...
 
     def colour(self, i: int) -> UInt8Array:
@@ -87,7 +87,7 @@ class RgbdSource(Protocol):
         ...
 
     def depth(self, i: int) -> images.UInt16Array:
-        """Values (H, W) as stored, 0 where invalid, in the depth size of ``camera``."""
+        """Values (H, W) as stored, 0 if invalid, in the depth size of ``camera``."""
         ...
 
     def files(self) -> Sequence[Path]:
@@ -146,7 +146,7 @@ class Registration:
 
     @cached_property
     def _from_pose(self) -> Float64Array | None:
-        """What a pose of the depth camera is multiplied with; None where poses stay as they are."""
+        """What a pose of the depth camera is multiplied with; None if poses stay as they are."""
         if self.grid == "depth" or self.is_needless:
             return None
         return np.linalg.inv(self.depth_to_colour).astype(np.float64)
@@ -212,7 +212,7 @@ class Registration:
 
 
 def filled(depth_m: Float32Array) -> Float32Array:
-    """Depth with that of the nearest pixel that has some where there is none; 1 m where none has any."""
+    """Depth with that of the nearest pixel that has some if there is none; 1 m where none has any."""
     is_empty = depth_m <= 0
     if not is_empty.any():
         return depth_m
@@ -228,7 +228,7 @@ def filled(depth_m: Float32Array) -> Float32Array:
 
 
 def make_registration(camera: SensorPair, grid: Grid, where: str) -> Registration:
-    """The registration of a pair of cameras; a ``DataError`` where they are no pinhole cameras a rigid motion apart."""
+    """The registration of a pair of cameras; a ``DataError`` if they are no pinhole cameras a rigid motion apart."""
     for name, matrix in (("colour", camera.colour_extrinsic), ("depth", camera.depth_extrinsic)):
         if not are_rigid(matrix[None])[0]:
             raise DataError(f"{where}: the {name} extrinsic is not a rigid motion; expected a 4x4 pose, metres")

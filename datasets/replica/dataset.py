@@ -33,7 +33,7 @@ class Replica(FileDataset[NoOptions]):
 
     @cached_property
     def rendered(self) -> folders.RenderTree:
-        """The render tree, without scenes where there is none."""
+        """The render tree, without scenes if there is none."""
         return folders.find_render_tree(self.root) or folders.RenderTree(self.root / folders.RENDER_FOLDERS[0], ())
 
     def scenes(self) -> Sequence[str]:
@@ -164,7 +164,7 @@ class Replica(FileDataset[NoOptions]):
         return self.rendered.folder / f"{scene}_mesh.ply"
 
     def folder(self, scene: str) -> Path:
-        """Where the scene's render is or would be; a ``DataError`` where nothing of the scene is here."""
+        """Where the scene's render is or would be; a ``DataError`` if nothing of the scene is here."""
         if not self._is_rendered(scene) and not self._is_annotated(scene):
             known = self.scenes()
             hint = suggest(scene, known, f"{self.rendered.folder} has")
@@ -190,7 +190,7 @@ class Replica(FileDataset[NoOptions]):
         return tuple(path for path in dict.fromkeys(paths) if path.exists())
 
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
-        """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
+        """Variant -> its files, of what others than Replica's makers released; none if nothing of it is here."""
         sequence = folders.find_semantic_sequence(self.root, scene)
         reference = self.folder(scene) / folders.REFERENCE_CLOUD
         clouds = () if sequence is None else (*truth.cloud_files(sequence), reference)
@@ -218,7 +218,7 @@ class Replica(FileDataset[NoOptions]):
         if path is None:
             folder = folders.INSTANCE_FOLDERS[0] if variant == "openmask3d" else folders.SEMANTIC_LABEL_FOLDERS[0]
             raise GroundTruthMissing(
-                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
+                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label per vertex, in "
                 f"{self.rendered.folder}; {folders.HOW_TO_GET_LABELS[variant]}"
             )
         make = truth.instance_file_truth if variant == "openmask3d" else truth.class_file_truth
@@ -246,7 +246,7 @@ class Replica(FileDataset[NoOptions]):
         return truth.read_annotated_mesh(self._original(scene), self.where(scene))
 
     def _instead(self, scene: str) -> str:
-        """A clause on what scores the scene without its mesh; empty where nothing does."""
+        """A clause on what scores the scene without its mesh; empty if nothing does."""
         try:
             checks.object_boxes_of(self._info(scene), self.where(scene))
         except DataError:
@@ -254,7 +254,7 @@ class Replica(FileDataset[NoOptions]):
         return "; the protocol replica-boxes scores it by the boxes of its objects"
 
     def _original(self, scene: str) -> Path:
-        """The scene's folder in the original release, with both files of the truth."""
+        """The scene's folder in the original release, with both files of the ground truth."""
         original, where = folders.find_original_scene(self.root, scene), self.where(scene)
         if original is None:
             raise GroundTruthMissing(

@@ -30,7 +30,7 @@ SEMANTIC_FOLDERS = (
 )
 FUSED_CLOUD = "saved-maps-gt/pointclouds"  # in Sequence_1
 REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the render tree
-# Text files of one label a vertex stand in such folders, below the data root or a render tree.
+# Text files of one label per vertex stand in such folders, below the data root or a render tree.
 LABEL_PLACES = (*RENDER_FOLDERS, "opennerf/datasets", "datasets")
 INSTANCE_FOLDERS = ("ground_truth", "instance_gt", "instance_gt/validation", "replica_gt_instances")
 SEMANTIC_LABEL_FOLDERS = ("semantic_gt", "replica_gt_semantics")
@@ -52,7 +52,7 @@ class RenderTree:
 
 
 def find_render_tree(root: Path) -> RenderTree | None:
-    """The first of ``RENDER_FOLDERS`` below ``root`` that holds a scene; None where none does."""
+    """The first of ``RENDER_FOLDERS`` below ``root`` that holds a scene; None if none does."""
     for name in RENDER_FOLDERS:
         folder = root / name
         # The data root itself holds other datasets too, whose folders are not scenes of this one.
@@ -83,7 +83,7 @@ def original_name(scene: str) -> str:
 
 
 def find_original_scene(root: Path, scene: str) -> Path | None:
-    """The folder of the original release with ``habitat/`` in it; None where no tree below ``root`` has it."""
+    """The folder of the original release with ``habitat/`` in it; None if no tree below ``root`` has it."""
     return _scene_with("habitat", root, ORIGINAL_FOLDERS, scene)
 
 
@@ -101,7 +101,7 @@ def unrendered_scenes(root: Path) -> tuple[str, ...]:
 
 
 def find_semantic_sequence(root: Path, scene: str) -> Path | None:
-    """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None where there is none."""
+    """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None if there is none."""
     folder = _scene_with(f"Sequence_1/{FUSED_CLOUD}", root, SEMANTIC_FOLDERS, scene)
     return None if folder is None else folder / "Sequence_1"
 

@@ -61,7 +61,7 @@ def read_camera(path: Path, where: str) -> Camera:
 
 
 def read_trajectory(path: Path, where: str) -> Float64Array:
-    """Camera-to-world poses (n, 4, 4), one a line; ``where`` begins each message."""
+    """Camera-to-world poses (n, 4, 4), one per line; ``where`` begins each message."""
     return poses_of_lines(trajectory_lines(path, where), f"{where}: traj.txt")
 
 
@@ -69,7 +69,7 @@ def trajectory_lines(path: Path, where: str) -> list[str]:
     """The lines of ``traj.txt``, at least one."""
     lines = read_text(path, f"{where}: traj.txt").rstrip().splitlines()
     if not lines:
-        raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
+        raise DataError(f"{where}: traj.txt is empty; expected one pose per line")
     return lines
 
 

@@ -103,7 +103,7 @@ def _objects(path: Path, scan: str, class_of_label: Mapping[str, int], where: st
     for row in _rows(path, scan, "objects", list[GraphObject], where):
         class_id = class_of_label.get(row.label)
         if class_id is not None and answer.setdefault(row.id + 1, class_id) != class_id:
-            raise DataError(f"{where}: {scan}: object {row.id} stands there twice, with two classes")
+            raise DataError(f"{where}: {scan}: object {row.id} is listed twice, with two classes")
     return answer
 
 

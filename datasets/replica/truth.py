@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class AnnotatedMesh:
     """``vertices`` (V, 3); ``corners`` of F polygons; ``object_of_face`` (F,) as in the file; per face its class and
-    instance id (F,), 0 where void; ``class_of_instance`` of every object that has a class."""
+    instance id (F,), 0 if void; ``class_of_instance`` of every object that has a class."""
 
     vertices: Float32Array
     corners: ListColumn
@@ -100,7 +100,7 @@ def read_info(path: Path, where: str) -> Info:
     for one in info.objects:
         if (class_id := class_of_object[one.id]) != one.class_id:
             raise DataError(
-                f"{where}: object {one.id} stands there twice, as class {one.class_id} and as class {class_id}"
+                f"{where}: object {one.id} is listed twice, as class {one.class_id} and as class {class_id}"
             )
     return info
 
@@ -284,7 +284,7 @@ def _labels_of_mesh(path: Path, meshes: Mapping[str, Path], where: str) -> tuple
     name = next((name for name, n in n_vertices.items() if 0 < n == n_lines), None)
     if name is None:
         counts = " and ".join(f"{name} {n}" for name, n in n_vertices.items())
-        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label per vertex")
     return values, name
 
 
@@ -300,7 +300,7 @@ def _vertices(mesh: Path, where: str) -> Float32Array:
 
 
 def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array, int]:
-    """The numbers of a text, one a line, and how many lines it has; beyond ``at_most`` lines they are only counted.
+    """The numbers of a text, one per line, and how many lines it has; beyond ``at_most`` lines they are only counted.
 
     A line may be of any length: one without end is cut at ``BLOCK_BYTES``.
     """
@@ -311,7 +311,7 @@ def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array
             word = line.strip()
             if not WHOLE_NUMBER.fullmatch(word):
                 shown = ascii(word[:20].decode("ascii", "replace"))
-                raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number a line")
+                raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number per line")
             if n_lines <= at_most:
                 values.append(int(word))
     return np.array(values, np.int32), n_lines

@@ -77,7 +77,7 @@ class Rgbd(RecordedDataset[RgbdOptions]):
         return SceneTree(self.root, (*self.options.files, place), {name: (path,) for name, path in path_of.items()})
 
     def is_reading_checked(self, scene: str) -> bool:
-        """Whether the description lets depth be held against the poses."""
+        """Whether the description lets depth be compared with the poses."""
         return self._open(scene)[0].check_convention
 
     def correction_of_reading(self, scene: str, finding: Finding) -> str:

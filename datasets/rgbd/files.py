@@ -36,8 +36,8 @@ class RgbdDescription(BaseModel):
       with ``*`` or ``?`` in all of them, the k-th file of each in numeric order. JPEG, PNG, PPM; PNG, PGM of 16 bits
     - ``pose``: text files of a 4x4 matrix; or ``trajectory``: one file with a pose for every image or, where images are
       missing, for every number from the first to the last. ``trajectory_format``: ``open3d`` (blocks of five lines,
-      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers a line) or
-      ``matrix`` (16 numbers a line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
+      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers per line) or
+      ``matrix`` (16 numbers per line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
     - ``pose_direction`` and ``camera_axes``: what the matrices map, and whether y points down and z into the scene
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
@@ -128,7 +128,7 @@ MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamp
 MAX_DISTANCE_M = 1e6  # of a camera from the origin
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MATRIX_ROWS = {"kitti": (3, "the upper rows of a 4x4 matrix"), "matrix": (4, "a 4x4 matrix row by row")}
-FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers a line
+FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers per line
 HEADER = re.compile(r"[#%/\s]*[A-Za-z_](?!(?i:nf|an)\b)")  # a word, which is neither inf nor nan
 DIRECTION = re.compile(r"(world|w|cam(?:era)?|c)[\W_]*(?:2|to)[\W_]*(?:world|w|cam(?:era)?|c)", re.IGNORECASE)
 Pose = Float64Array | None  # None: tracking was lost, the matrix holds numbers that are not finite
@@ -235,7 +235,7 @@ def read_pose(folder: Path, name: str, where: str) -> tuple[Float64Array, str]:
 
 
 def direction_in(header: str) -> str | None:
-    """What a header says that a matrix maps; None where it does not."""
+    """What a header says that a matrix maps; None if it does not."""
     found = DIRECTION.search(header)
     if found is None:
         return None

@@ -128,7 +128,7 @@ class BuiltRoom:
 
     @property
     def scan(self) -> RoomScan:
-        """The surface that the walk sees, made anew."""
+        """The surface that the walk sees, made again."""
         return scan_room(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m)
 
     def _kept_in(self, what: str) -> Path | None:

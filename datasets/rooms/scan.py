@@ -17,7 +17,7 @@ from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
-VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
+VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm per pixel at 1 m
 TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few
 
 

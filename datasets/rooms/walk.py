@@ -156,7 +156,7 @@ def _smooth(at: Float64Array, values: Float64Array, time: Float64Array) -> Float
 
 
 def _wobble(rng: np.random.Generator, n_frames: int) -> Float64Array:
-    """Six slow unrests of a hand, each about -1..1, at 30 frames a second."""
+    """Six slow unrests of a hand, each about -1..1, at 30 frames per second."""
     time = np.arange(n_frames)[:, None] / 30.0
     total = np.zeros((n_frames, 6))
     for hertz, weight in ((0.35, 0.6), (0.9, 0.3), (1.7, 0.1)):

@@ -1,4 +1,4 @@
-"""ScanNet: recordings as ``.sens`` files or as either reader exports them, truth from the annotated meshes."""
+"""ScanNet: recordings as ``.sens`` files or as either reader exports them, ground truth from the annotated meshes."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return truth.instance_mesh(self._annotated_scan(scene), self._label_tables)
 
     def surface(self, scene: str) -> Surface:
-        """The decimated mesh, with the published segments where they are here; scans without truth have both."""
+        """The decimated mesh, with the published segments where they are here; scans without ground truth have both."""
         self.folder(scene)
         mesh = folders.find_file(self.tree, scene, truth.mesh_name(scene))
         if mesh is None:
@@ -216,7 +216,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return truth.read_axis_alignment(path, self.where(scene))
 
     def nyu40_class(self, category: str) -> str | None:
-        """The class of NYU40 that the table of the release gives a raw category; None where it has none."""
+        """The class of NYU40 that the table of the release gives a raw category; None if it has none."""
         table = next((table for table in self._label_tables if table.name == truth.TABLE_NAME), None)
         if table is None:
             raise DataError(
@@ -237,7 +237,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return tuple(path for path in (*paths, *folders.label_tables(self.tree), self._openscan) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
-        """The path of each file of the truth."""
+        """The path of each file of the ground truth."""
         self.folder(scene)
         path_of = {name: folders.find_file(self.tree, scene, name) for name in truth.truth_names(scene)}
         missing = [name for name, path in path_of.items() if path is None]

@@ -62,7 +62,7 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
     """The recording in a scan's folder; where there are several the ``.sens`` file, else that of the Python reader.
 
     Exports may lie in the folder itself, in ``exported/`` or in a folder with the name of the scene. ``DataError``
-    names all that was looked for where there is none.
+    names all that was looked for if there is none.
     """
     with reading(where):
         form, place = _find(folder, scene, kind) or (None, folder)
@@ -96,7 +96,7 @@ def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path]
 
 
 def python_layout(folder: Path) -> PythonLayout | None:
-    """The layout in which frames lie in ``folder``; None where none do."""
+    """The layout in which frames lie in ``folder``; None if none do."""
     layouts = [
         layout for layout in PYTHON_LAYOUTS if (folder / layout.colour).is_dir() or (folder / layout.pose).is_dir()
     ]

@@ -35,7 +35,7 @@ START = struct.Struct("<IQ")  # version, length of the sensor's name
 REST = struct.Struct("<64f2i4If")  # four matrices, two codes, two sizes, depth shift
 COUNT = struct.Struct("<Q")
 MAX_NAME_BYTES = 4096  # ScanNet has 15, 'StructureSensor'
-MAX_FRAMES = 10_000_000  # 92 hours at 30 frames a second
+MAX_FRAMES = 10_000_000  # 92 hours at 30 frames per second
 MAX_HEADER_BYTES = START.size + MAX_NAME_BYTES + REST.size + COUNT.size
 
 
@@ -60,7 +60,7 @@ class SensHeader:
     depth_shift: float
 
     def camera(self, where: str) -> SensorPair:
-        """The two cameras; a ``DataError`` where they cannot be."""
+        """The two cameras; a ``DataError`` if they cannot be."""
         return SensorPair(
             colour_size=(self.colour_width, self.colour_height),
             depth_size=(self.depth_width, self.depth_height),
@@ -203,7 +203,7 @@ class SensFile:
         return images.sized(images.decode_colour, content, size, where, "as the header says")
 
     def depth(self, i: int) -> images.UInt16Array:
-        """The depth image (H, W) of frame ``i`` in raw units, 0 where invalid."""
+        """The depth image (H, W) of frame ``i`` in raw units, 0 if invalid."""
         content, header = self.depth_bytes(i), self.header
         where = f"{self._place(i, self._depth_span(i)[0])}: depth"
         n_bytes = 2 * header.depth_width * header.depth_height

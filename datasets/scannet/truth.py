@@ -1,8 +1,8 @@
 """Ground truth of a scan, one row a vertex of ``_vh_clean_2.ply`` in the order of the file.
 
-As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 where no object claims the vertex; the
+As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 if no object claims the vertex; the
 class is the NYU40 id in ``_vh_clean_2.labels.ply``, or for ScanNet200 the raw id of the object's category. Classes that
-a protocol does not have stay in the truth, they are void there.
+a protocol does not have stay in the ground truth, they are void there.
 
 The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes
 then come from the objects' categories, by that table or, where it is not here, by that of the second release. A file
@@ -106,7 +106,7 @@ def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
     category_of: dict[int, str] = {}
     for entry in content.segGroups:
         if category_of.setdefault(entry.id, entry.category) != entry.category:
-            raise DataError(f"{where}: object {entry.id} stands there twice, with two categories; copy the file again")
+            raise DataError(f"{where}: object {entry.id} is listed twice, with two categories; copy the file again")
     return content.segGroups
 
 
@@ -241,7 +241,7 @@ class AnnotatedScan:
         return np.array([*(entry.id + 1 for entry in self.objects), 0], np.int32)[self.object_of_vertex]
 
     def of_category(self, value_of: Mapping[str, int]) -> Int32Array:
-        """What ``value_of`` says of each vertex's category; 0 where no object or no entry is."""
+        """What ``value_of`` says of each vertex's category; 0 if no object or no entry is."""
         values = [*(value_of.get(entry.category, 0) for entry in self.objects), 0]
         return np.array(values, np.int32)[self.object_of_vertex]
 
@@ -300,7 +300,7 @@ def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64A
 
 
 def _mesh(path: Path, where: str) -> tuple[Float32Array, Int32Array]:
-    """Vertices (V, 3) and rows of three of them; none where the file has no faces."""
+    """Vertices (V, 3) and rows of three of them; none if the file has no faces."""
     file = read_ply(path, where)
     vertices, element = meshes.vertex_positions(file, where), file.element("face")
     if element is None or element.n_rows == 0:
@@ -373,7 +373,7 @@ def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
 
 
 def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> InstanceMesh:
-    """The triangles, each with the instance of most of its vertices, 0 where all three differ; classes of NYU40.
+    """The triangles, each with the instance of most of its vertices, 0 if all three differ; classes of NYU40.
 
     The class of an instance is that of most of its vertices, the lowest where several have as many.
     """
@@ -401,7 +401,7 @@ def meta_name(scan: str) -> str:
 def read_axis_alignment(path: Path, where: str) -> Float64Array:
     """The rigid motion (4, 4) from the scan's frame to one along the walls; ``where`` begins each message.
 
-    The identity where the file has no such line, as that of some scans. Released meshes and poses are not aligned.
+    The identity if the file has no such line, as that of some scans. Released meshes and poses are not aligned.
     """
     where = f"{where}: {path.name}"
     facts = {}

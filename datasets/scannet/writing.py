@@ -130,7 +130,7 @@ def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> lis
 
 
 def object_of_vertex(scan: RoomScan) -> Int64Array:
-    """Object id (V,) of each vertex, that of its last face; 0 where no face uses it."""
+    """Object id (V,) of each vertex, that of its last face; 0 if no face uses it."""
     owner = np.zeros(len(scan.vertices), np.int64)
     owner[scan.faces] = scan.object_id[:, None]
     return owner
@@ -188,12 +188,12 @@ def _facts_of(dataset: Rooms, scene: str) -> str:
 
 
 def _write_json(path: Path, value: Any) -> None:
-    """JSON on one line: a mesh has a number a vertex."""
+    """JSON on one line: a mesh has a number per vertex."""
     write_text(path, json.dumps(value, separators=(",", ":")) + "\n")
 
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
-DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release
+DEPTH_SHIFT = 1000.0  # units per metre, of every recording of the release
 SCANS_FOLDER = "scans"
 SENSOR_NAME = "StructureSensor"  # as the release has it, readers may know it
 PIECES = ".frames"

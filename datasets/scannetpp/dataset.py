@@ -1,4 +1,4 @@
-"""ScanNet++, both releases: the iPhone's RGB-D recording, and truth from the annotated laser scans.
+"""ScanNet++, both releases: the iPhone's RGB-D recording, and ground truth from the annotated laser scans.
 
 The DSLR's images, which have no depth, are left out.
 """
@@ -134,7 +134,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return truth.instance_mesh(self.annotated_scan(scene))
 
     def surface(self, scene: str) -> Surface:
-        """The mesh, with the published segments where they are here; scenes without truth have both."""
+        """The mesh, with the published segments where they are here; scenes without ground truth have both."""
         folder = self.folder(scene) / SCANS
         segments = folder / truth.SEGMENTS_NAME
         return truth.read_surface(folder / truth.MESH_NAME, segments if segments.is_file() else None, self.where(scene))
@@ -151,7 +151,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
             return frames.open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
-        """The path of each file of the truth."""
+        """The path of each file of the ground truth."""
         folder = self.folder(scene) / SCANS
         missing = [name for name in truth.TRUTH_NAMES if not (folder / name).is_file()]
         if missing:
@@ -164,7 +164,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return {name: folder / name for name in truth.TRUTH_NAMES}
 
     def _find_benchmark_folder(self, scene: str) -> Path | None:
-        """Where the lists of the benchmark lie, beside the scene first; None where none has all of them."""
+        """Where the lists of the benchmark lie, beside the scene first; None if none has all of them."""
         near = self.folder(scene).parent.parent
         places = [release / truth.BENCHMARK_FOLDER for release in (near, *self.releases)]
         return next((place for place in places if all((place / name).is_file() for name in truth.LIST_NAMES)), None)
@@ -193,7 +193,7 @@ def read_split(path: Path) -> tuple[str, ...]:
     scenes = read_text(path, where).split()
     wrong = next((scene for scene in scenes if not re.fullmatch(SCENE_NAMES, scene)), None)
     if wrong is not None or len(scenes) > MOST_SCENES:
-        raise DataError(f"{where}: {(wrong or '')[:40]!a} is no scene; expected one a line, such as 036bce3393")
+        raise DataError(f"{where}: {(wrong or '')[:40]!a} is no scene; expected one per line, such as 036bce3393")
     return tuple(dict.fromkeys(scenes))
 
 

@@ -56,7 +56,7 @@ def describe_recording(folder: Path, kind: PoseSource) -> str:
 
 @dataclass(frozen=True, eq=False)
 class IphoneRecording:
-    """A recording with its poses; ``colour_of`` and ``depth_of`` are the extracted files by their frame, None where
+    """A recording with its poses; ``colour_of`` and ``depth_of`` are the extracted files by their frame, None if
     images come out of the video and ``depth.bin``."""
 
     folder: Path
@@ -122,7 +122,7 @@ def _colour_size(folder: Path, colour_of: Mapping[int, str] | None, where: str) 
 
 
 def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, where: str) -> Mapping[int, str] | None:
-    """The extracted files by their frame; None where the ``packed`` file is to be read."""
+    """The extracted files by their frame; None if the ``packed`` file is to be read."""
     if not (folder / name).is_dir():
         if not os.path.lexists(folder / packed):
             raise DataError(f"{where}: neither {name}/ nor {packed} is in {folder}; copy one of them there")
@@ -193,7 +193,7 @@ class IphoneFrames(Sequence[Frame]):
 
     @cached_property
     def _straightening(self) -> tuple[Float32Array, Float32Array] | None:
-        """Column and row of the image, as the lens bent it, that each pixel (H, W) sees; None where it bends nothing.
+        """Column and row of the image, as the lens bent it, that each pixel (H, W) sees; None if it bends nothing.
 
         COLMAP gives all frames one camera where it gives a distortion.
         """

@@ -79,7 +79,7 @@ def _length(content: bytes, first: int, at: int) -> tuple[int, int]:
 
 
 Item = TypeVar("Item")
-N_KEPT = 12  # wanted items that were passed; as many threads may ask out of their order before all begins anew
+N_KEPT = 12  # wanted items that were passed; as many threads may ask out of their order before all begins again
 
 
 class ForwardReader(Generic[Item]):
@@ -93,7 +93,7 @@ class ForwardReader(Generic[Item]):
         self._lock = Lock()
 
     def at(self, number: int) -> Item | None:
-        """The item of that number; None where there are fewer."""
+        """The item of that number; None if there are fewer."""
         with self._lock:
             if number in self._kept:
                 return self._kept[number]
@@ -140,7 +140,7 @@ class DepthFile:
         self._stream = ForwardReader(self._stream_images, wanted)
 
     def values(self, number: int) -> UInt16Array:
-        """Millimetres (192, 256), 0 where there is none."""
+        """Millimetres (192, 256), 0 if there is none."""
         found = self._stream.at(number) if self._index is None else self._packed_values(self._index, number)
         if found is None:
             have = "fewer images" if self._index is None else f"{len(self._index)} images"

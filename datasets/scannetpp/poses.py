@@ -123,7 +123,7 @@ def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
             raise DataError(f"{place}: has {len(words)} words; expected 'id qw qx qy qz tx ty tz camera name'")
         number = frame_number(words[9].rpartition("/")[2], place)
         if number in pose_of:
-            raise DataError(f"{place}: frame {number} stands there twice; copy the file again")
+            raise DataError(f"{place}: frame {number} is listed twice; copy the file again")
         pose_of[number] = _inverse_pose(numbers(words[1:8], place), place)
     if not pose_of:
         raise DataError(f"{where}: lists no frame; copy the file again")
@@ -140,7 +140,7 @@ def _lines(path: Path, where: str) -> Iterator[bytes]:
 
 
 def n_registered(path: Path) -> int | None:
-    """How many images the head of ``images.txt`` says it lists; None where it says nothing."""
+    """How many images the head of ``images.txt`` says it lists; None if it says nothing."""
     with opened(path) as stream:
         match = re.search(rb"^# Number of images: ([0-9]{1,7})\b", stream.read(HEAD_BYTES), re.MULTILINE)
     return None if match is None else int(match[1])

@@ -3,7 +3,7 @@
 Objects go in the order of the file. Each lays its class on its vertices, on each vertex at most three; a fourth finds
 no room. ``every_semantic`` are those classes, the truth of semantic evaluation (``multilabel.max_gt`` 3). Where there
 are several, that of the object that laid itself on fewest vertices stands for the vertex, of as many the first: the
-truth of instance evaluation.
+ground truth of instance evaluation.
 
 What the toolkit does besides, and so does this: an object whose word the benchmark does not have is passed over;
 instances are numbered by their place in the file from 0, and 0 counts as none, so that the first object of a file is
@@ -140,7 +140,7 @@ def _read_names(path: Path, where: str) -> tuple[str, ...]:
         if not name.strip() or not name.isprintable() or len(name) > MOST_LETTERS:
             raise DataError(f"{where} line {number}: {name[:40]!a} is no name of a class; copy the file again")
     if not 1 <= len(names) <= MOST_CLASSES:
-        raise DataError(f"{where}: has {len(names)} lines; expected one a class")
+        raise DataError(f"{where}: has {len(names)} lines; expected one per class")
     if len(set(names)) != len(names):
         twice = next(name for row, name in enumerate(names) if name in names[:row])
         raise DataError(f"{where}: has {twice[:40]!a} twice; copy the file again")
@@ -246,7 +246,7 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
 
 
 def vertex_truth(scan: AnnotatedScan) -> GroundTruth:
-    """The truth of both official evaluations; vertices that they leave out have the class ``LEFT_OUT``."""
+    """The ground truth of both official evaluations; vertices that they leave out have the class ``LEFT_OUT``."""
     instance = scan.object_of_vertex
     has_instance = np.isin(scan.class_of_vertex, list(scan.classes.with_instances)) & (instance > 1)
     return GroundTruth(
@@ -261,7 +261,7 @@ def vertex_truth(scan: AnnotatedScan) -> GroundTruth:
 
 
 def instance_mesh(scan: AnnotatedScan) -> InstanceMesh:
-    """The triangles, each with the object of most of its vertices, 0 where all three differ; walls and floors are
+    """The triangles, each with the object of most of its vertices, 0 if all three differ; walls and floors are
     objects here."""
     return InstanceMesh(
         scan.surface.vertices,

@@ -7,7 +7,7 @@ A sequence is a folder below the data root, ``tum/`` or ``TUM/`` with
 - ``groundtruth.txt``: lines ``time tx ty tz qx qy qz qw``, camera-to-world, seconds and metres
 - ``camera.txt`` (optional, ours): one line ``fx fy cx cy``, pixels; without it, the benchmark's figures for the camera
   that the sequence's name tells (``fr1``, ``freiburg2``, ...), else the ROS default
-- the images: 8-bit colour; 16-bit depth registered to it, 5000 units a metre, 0 where there is none
+- the images: 8-bit colour; 16-bit depth registered to it, 5000 units per metre, 0 if there is none
 
 There is no ground truth of objects.
 """
@@ -197,7 +197,7 @@ def read_trajectory(path: Path, where: str) -> tuple[Float64Array, Float64Array]
 def pose_at(
     time_s: float, times_s: Float64Array, rows: Float64Array, max_difference_s: float, *, interpolate: bool
 ) -> Float64Array | None:
-    """Camera-to-world pose (4, 4) at ``time_s``; None where no row is within ``max_difference_s``."""
+    """Camera-to-world pose (4, 4) at ``time_s``; None if no row is within ``max_difference_s``."""
     after = int(np.searchsorted(times_s, time_s))
     near = [k for k in (after - 1, after) if 0 <= k < len(times_s) and abs(times_s[k] - time_s) <= max_difference_s]
     if not near:

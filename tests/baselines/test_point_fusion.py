@@ -13,7 +13,7 @@ TOWARDS = np.array([0.0, 0.0, 1.0])
 
 
 def row_of_pixels(width: int = 4, depth_m: float = 1.0) -> View:
-    """One row of pixels a metre apart at depth 1 m, seen by a camera of focal length 1 at the origin."""
+    """One row of pixels per metre apart at depth 1 m, seen by a camera of focal length 1 at the origin."""
     points = np.stack([np.arange(width) * depth_m, np.zeros(width), np.full(width, depth_m)], axis=1)
     return View(
         1, width, points, np.tile(TOWARDS, (width, 1)), np.ones(width, bool), np.ones(width), np.eye(3), np.eye(4)

@@ -1,4 +1,4 @@
-"""3D proposals: read from files, made from the mesh's shape, carried over from the truth; each rule by hand."""
+"""3D proposals: read from files, made from the mesh's shape, carried over from the ground truth; each rule by hand."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def protocols_page(protocols: Sequence[ProtocolRules]) -> str:
     return _page(
         "The protocols",
         "<p>A protocol is the rules by which a map becomes numbers. Each has a page, made from the file that the "
-        "program reads: every rule with its source, whose evaluation it repeats, how far both were held against each "
+        "program reads: every rule with its source, whose evaluation it repeats, how far both were compared with each "
         "other, and what its numbers may not be compared with.</p>",
         table(head, rows, is_stacked=True),
     )

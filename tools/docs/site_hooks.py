@@ -48,7 +48,7 @@ def on_post_template(output: str, template_name: str, **rest: Any) -> str:
 
 
 def repository_of(project: Path) -> str | None:
-    """The address on a code host that the project's metadata has; None where it has none."""
+    """The address on a code host that the project's metadata has; None if it has none."""
     urls = tomllib.loads(project.read_text())["project"].get("urls", {})
     found = next((str(url) for name, url in urls.items() if name.lower() in ("repository", "source")), None)
     return found and found.rstrip("/")

@@ -63,7 +63,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, is_stacked: boo
 
     ``is_stacked``: on a phone, its cells stand one below another.
     """
-    # a line a cell: the search would take the words of two cells for one
+    # a line per cell: the search would take the words of two cells for one
     heads = ["<thead><tr>", *(f"<th>{cell}</th>" for cell in head), "</tr></thead>"] if head else []
     lines = [line for row in rows for line in ("<tr>", *(f"<td>{cell}</td>" for cell in row), "</tr>")]
     whole = "\n".join(["<table>", *heads, "<tbody>", *lines, "</tbody></table>"])

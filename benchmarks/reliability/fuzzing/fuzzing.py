@@ -55,7 +55,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Outcome:
-    """``fault`` is None where the input was read (``is_read``) or properly refused."""
+    """``fault`` is None if the input was read (``is_read``) or properly refused."""
 
     is_read: bool
     fault: str | None
@@ -91,7 +91,7 @@ class Sample:
         return Input(index, file, mutated(self.whole[file], rng), None)
 
     def meet(self, one: Input) -> Outcome:
-        """What the reader does with the damaged sample, which is mended afterwards."""
+        """What the reader does with the damaged sample, which is fixed afterwards."""
         path = self.folder / one.file
         self._put(path, one.content, one.shape)
         try:
@@ -149,7 +149,7 @@ def every_one_of(asked: Iterator[Read]) -> None:
         except Su3dError as error:
             if (fault := fault_of_message(str(error))) is not None:
                 raise BadMessage(fault) from error
-            first = first or (None if isinstance(error, GroundTruthMissing) else error)  # no truth is no damage
+            first = first or (None if isinstance(error, GroundTruthMissing) else error)  # no ground truth is no damage
     if first is not None:
         raise first
 

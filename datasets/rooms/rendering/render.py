@@ -16,7 +16,7 @@ FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 where a ray misses."""
+    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 if a ray misses."""
 
     rgb: UInt8Array
     depth_m: Float32Array

@@ -1,4 +1,4 @@
-"""Walks through HM3DSem: frames and truth as HOV-SG's tools write them, and one line for what is damaged."""
+"""Walks through HM3DSem: frames and ground truth as HOV-SG's tools write them, and one line for what is damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ScanNet's truth on a hand-worked mesh: both label sets, both releases, each fault once, damaged files."""
+"""ScanNet's ground truth on a hand-worked mesh: both label sets, both releases, each fault once, damaged files."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ NONE = -1
 
 
 class Cloud(NamedTuple):
-    """Points (N, 3) and the ID (N,) of each, ``NONE`` where there is none."""
+    """Points (N, 3) and the ID (N,) of each, ``NONE`` if there is none."""
 
     points: Array
     ids: Array
@@ -177,7 +177,7 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConf
 
 
 def one_a_voxel(voxel: Array, is_instance: Array, step: int) -> Array:
-    """Whether a point is the first of its voxel, or the last (step -1): of those of instances where there is one."""
+    """Whether a point is the first of its voxel, or the last (step -1): of those of instances if there is one."""
     in_turn = np.lexsort([step * np.arange(len(voxel)), ~is_instance])
     _, first = np.unique(voxel[in_turn], return_index=True)
     return np.isin(np.arange(len(voxel)), in_turn[first])

@@ -49,7 +49,7 @@ def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
 
 
 def _points(n: int) -> Float32Array:
-    """A point a metre, so that each has one neighbour within reach: itself."""
+    """A point per metre, so that each has one neighbour within reach: itself."""
     points = np.zeros((n, 3), np.float32)
     points[:, 0] = np.arange(n)
     return points

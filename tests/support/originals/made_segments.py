@@ -34,7 +34,7 @@ def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
 
 
 def has_left_out(rules: ProtocolRules) -> bool:
-    """Whether the truth has points that evaluations leave out; elsewhere they have no label."""
+    """Whether the ground truth has points that evaluations leave out; elsewhere they have no label."""
     return rules.label_space == "scannetpp"
 
 

@@ -30,7 +30,7 @@ KEY_CODES = {
 
 
 def find_chromium() -> str | None:
-    """The browser's program; None where none is installed."""
+    """The browser's program; None if none is installed."""
     return next((found for name in NAMES if (found := shutil.which(name)) is not None), None)
 
 

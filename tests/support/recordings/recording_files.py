@@ -25,7 +25,7 @@ def depth_values(index: int) -> UInt16Array:
 
 
 def text_of(matrix: np.ndarray) -> str:
-    """A row a line, in full precision."""
+    """A row per line, in full precision."""
     return "\n".join(" ".join(repr(float(value)) for value in row) for row in matrix) + "\n"
 
 

@@ -51,7 +51,7 @@ def write_truth(
     prefix: str = "scannet.",
     mesh: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """The four files of a scan's truth; ``groups`` are (id, raw category, segments)."""
+    """The four files of a scan's ground truth; ``groups`` are (id, raw category, segments)."""
     write_mesh(folder / f"{scan}_vh_clean_2.ply", *(mesh or grid()))
     write_mesh(folder / f"{scan}_vh_clean_2.labels.ply", *(mesh or grid()), np.array(labels))
     segments_file = f"{scan}_vh_clean_2.0.010000.segs.json"
@@ -99,7 +99,7 @@ def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), hea
 
 
 def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int = 5, lost: Sequence[int] = ()) -> Path:
-    """A scan with recording and truth; the folder that it lies in."""
+    """A scan with recording and ground truth; the folder that it lies in."""
     folder = root / place / scan
     write_recording(folder / f"{scan}.sens", n_frames, lost)
     write_floor_truth(folder, scan)

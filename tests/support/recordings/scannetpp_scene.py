@@ -57,7 +57,7 @@ def write_lists(root: Path) -> None:
 
 
 def write_scans(folder: Path, segments: Any, groups: Any, masked: Any = (), mesh: Any = None) -> None:
-    """The four files of a scan's truth; ``groups`` are (word, segments)."""
+    """The four files of a scan's ground truth; ``groups`` are (word, segments)."""
     write_mesh(folder / "mesh_aligned_0.05.ply", *(mesh or grid()))
     rows = enumerate(groups)
     entries = [{"id": k, "objectId": k + 1, "label": word, "segments": list(parts)} for k, (word, parts) in rows]

@@ -1,4 +1,4 @@
-"""Bundles for registries: of painted scenes, which are soon made, and of a small room, which can be scored anew."""
+"""Bundles for registries: of painted scenes, which are soon made, and of a small room, which can be scored again."""
 
 from __future__ import annotations
 

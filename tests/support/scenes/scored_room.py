@@ -1,4 +1,4 @@
-"""A small room, its truth as a prediction, and noisy scenes, for the tests of scoring."""
+"""A small room, its ground truth as a prediction, and noisy scenes, for the tests of scoring."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def retrieval_set(
 
 
 def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
-    """One instance for each (label n, label n', merging) of the truth; equal labels are asked once.
+    """One instance for each (label n, label n', merging) of the ground truth; equal labels are asked once.
 
     Where they are not, label 1 is n' in every other item. An empty label n': these labels leave the instance out.
     """
@@ -60,7 +60,7 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
 
 
 def reasoning_set(truths: Sequence[tuple[str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
-    """One question for each (answer, objects) of the truth."""
+    """One question for each (answer, objects) of the ground truth."""
     asked = []
     for k, (answer, objects) in enumerate(truths):
         truth = {"answer": answer, "objects": objects}
