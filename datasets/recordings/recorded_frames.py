@@ -1,5 +1,5 @@
 """Shared by readers of loose recordings: size-limited text files, confined paths, rigid poses, and frames
-frames that are read from one colour and one depth file each.
+that are each read from one colour and one depth file.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class Replica(FileDataset[NoOptions]):
         return [tree.folder] if tree is not None else [self.root / name for name in folders.RENDER_FOLDERS]
 
     def status(self, scene: str) -> str:
-        """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks every file's presence."""
+        """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks that files exist."""
         n_frames = "no frames"
         if self._is_rendered(scene):
             try:

@@ -123,7 +123,7 @@ def kept_arrays(
 ) -> Arrays:
     """The arrays of these ``names`` in ``path`` if their checksums are right, otherwise from ``make``, then stored.
 
-    If the folder is not writable and ``is_forgiven``, the next process computes them again.
+    If writing fails with one of ``forgiven``, the next process computes the arrays again.
     """
     if path is None:
         return make()

@@ -129,7 +129,7 @@ def _grid_normals(points: Float64Array) -> Float64Array:
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int | None = None) -> Shape:
-    """The profile (radius, height) rotated about z; it runs from the axis at the bottom, up the outside, down inside."""
+    """The profile (radius, height) rotated about z; it runs from the axis at the bottom up the outside, down inside."""
     points = np.array(profile, np.float64)
     largest = points[:, 0].max()
     n = segments or int(np.clip(2 * round(np.pi * largest / 0.022), 10, 28))
