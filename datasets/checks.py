@@ -176,7 +176,7 @@ class _Findings:
         text = str(error) if isinstance(error, OSError) else error_line(error)
         text = printable(text.removeprefix(f"{self.scene}: "))
         first = text.partition(" ")[0].rstrip(":")
-        is_of_a_file = "." in first and not FRAME_OF_A_FILE.search(text)  # in a recording, other frames may be broken too
+        is_of_a_file = "." in first and not FRAME_OF_A_FILE.search(text)  # in a recording, other frames may be broken
         if not (is_of_a_file and self.mentions(Path(first))):
             self.add(Finding("error", check, where, text))
 

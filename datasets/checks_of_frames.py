@@ -208,7 +208,7 @@ def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
         yield Finding("warning", "motion", "", text)
     extent = float(np.ptp(poses[:, :3, 3], axis=0).max()) if len(poses) else 0.0
     if extent > PLAUSIBLE_WALK_M:
-        yield Finding("warning", "motion", "", f"the cameras are spread over {extent:.3g} m; check that the poses are in metres")
+        yield Finding("warning", "motion", "", f"the cameras are spread over {extent:.3g} m; are the poses in metres?")
 
 
 def check_truth(

@@ -60,8 +60,8 @@ class SceneTarget:
 class Layout(ABC):
     """How the scenes of one dataset are named, and how their frames and ground truth are written.
 
-    ``name`` is the value of ``--layout``, ``reader`` the dataset that reads it. ``settings`` affect the bytes of a scene
-    besides the scene itself; the layout's version comes first.
+    ``name`` is the value of ``--layout``, ``reader`` the dataset that reads it. ``settings`` affect the bytes written
+    for a scene; the layout's version comes first.
     """
 
     name: str

@@ -112,7 +112,7 @@ class Challenge:
             raise DataError(f"{where}:{line + 1}: {values[line]} is not an object number; {self._advice}")
         coded = values_of_numbers(values)
         number = np.maximum(coded - INSTANCES_PER_CLASS, 0)
-        if (coded == INSTANCES_PER_CLASS).any():  # an object in the challenge's script, but its number 0 means none here
+        if (coded == INSTANCES_PER_CLASS).any():  # an object in the challenge's script, but 0 means none here
             number = np.unique(np.append(coded, 0), return_inverse=True)[1][:-1]
         source = f"vertices of the mesh with the object numbers in {path.name} of the OpenSUN3D challenge"
         is_object = (coded > 0).astype(np.int32)

@@ -131,7 +131,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         return self.challenge.query(scene)
 
     def queries(self, scene: str) -> Sequence[challenge_files.ChallengeQuery]:
-        """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` if either is missing."""
+        """The scene's query with the numbers of the objects that answer it, or ``GroundTruthMissing``."""
         return (
             challenge_files.answered(self.ground_truth(scene, challenge_files.VARIANT), self.challenge.query(scene)),
         )

@@ -127,7 +127,7 @@ class PhoneRecording:
 
 
 def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
-    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; empty if the folder is missing."""
+    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; may be empty."""
     form = re.compile(rf"{scene}_(\d{{1,9}}(?:\.\d{{1,9}})?){re.escape(suffix)}")
     try:
         names = sorted(os.listdir(folder))
@@ -244,7 +244,7 @@ class PhoneFrames(Sequence[Frame]):
             confidence = decode_colour(self._content(image.confidence), self._at(image.confidence))[..., 0]
             self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
             if confidence.max(initial=0) > MOST_CONFIDENCE:
-                raise DataError(f"{self._at(image.confidence)}: has values up to {confidence.max()}; expected 0, 1 and 2")
+                raise DataError(f"{self._at(image.confidence)}: has values up to {confidence.max()}; expected 0 to 2")
             confidence = recorded_frames.nearest_at(confidence, (values.shape[1], values.shape[0]))
             depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))
         return recorded_frames.nearest_at(depth_m, size)

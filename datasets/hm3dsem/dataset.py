@@ -94,7 +94,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
     def up(self, scene: str) -> WorldUp:
         """Y, as in Habitat."""
         self.folder(scene)
-        return WorldUp("y", False, "Habitat's worlds have y up", "it is kept because HOV-SG's predictions are in this world")
+        return WorldUp("y", False, "Habitat's worlds have y up", "it is kept for HOV-SG's predictions")
 
     def problems(self, scene: str) -> Iterator[str]:
         """Faults of poses, ground truth and annotation, one line each; images are checked as frames."""
@@ -169,5 +169,5 @@ def read_poses(path: Path, names: Sequence[str], where: str) -> Float64Array:
     is_sound = np.isfinite(poses).all(axis=(1, 2))
     is_sound[is_sound] = are_rigid(poses[is_sound])
     if not is_sound.all():
-        raise DataError(f"{where}: {names[int(np.argmin(is_sound))]}: is not a rigid transform; generate the walk again")
+        raise DataError(f"{where}: {names[int(np.argmin(is_sound))]}: not a rigid transform; generate the walk again")
     return poses @ TO_HABITAT

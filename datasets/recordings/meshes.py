@@ -26,7 +26,7 @@ def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
         first = int(np.flatnonzero(is_outside)[0])
         row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
         raise DataError(
-            f"{where}: face {row} refers to vertex {corners.values[first]}, but the mesh has {n_vertices} (0..{n_vertices - 1})"
+            f"{where}: face {row} refers to vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
         )
     return corners
 
@@ -71,7 +71,7 @@ def check_one_mesh(n_segments: int, n_vertices: int, names: tuple[str, str], whe
     """Raise ``DataError`` if the list of segments and the mesh, called ``names``, differ in length."""
     if n_segments != n_vertices:
         raise DataError(
-            f"{where}: {names[0]} has {n_segments} vertices, {names[1]} has {n_vertices}; they belong to different meshes"
+            f"{where}: {names[0]} has {n_segments} vertices, {names[1]} has {n_vertices}; they are of different meshes"
         )
 
 

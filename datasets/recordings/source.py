@@ -235,7 +235,7 @@ def make_registration(camera: SensorPair, grid: Grid, where: str) -> Registratio
     for name, matrix in (("colour", camera.colour_intrinsics), ("depth", camera.depth_intrinsics)):
         is_upper = matrix[1, 0] == 0 and (matrix[2] == (0, 0, 1)).all()
         if not is_upper or np.abs(matrix).max() > MAX_INTRINSIC:
-            raise DataError(f"{where}: the {name} intrinsics are not a camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1")
+            raise DataError(f"{where}: the {name} intrinsics are no camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1")
     return Registration(camera, grid)
 
 

@@ -236,7 +236,7 @@ class Replica(FileDataset[NoOptions]):
         if not reference.exists():
             raise GroundTruthMissing(
                 f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {folders.REFERENCE_CLOUD}, are "
-                f"missing in {reference.parents[2]}; create them with ConceptGraphs' run_slam_rgb.py (stride 5, 480x640)"
+                f"missing in {reference.parents[2]}; make them with ConceptGraphs' run_slam_rgb.py (stride 5, 480x640)"
             )
         return truth.conceptgraphs_truth(sequence, reference, where)
 

@@ -339,7 +339,7 @@ def conceptgraphs_truth(sequence: Path, reference: Path, where: str) -> GroundTr
     labels = largest_column(labels_file, N_EMBEDDING, labels_where)
     if len(labels) != len(points):
         raise DataError(
-            f"{labels_where}: has {len(labels)} rows, {points_file.name} has {len(points)}; both must belong to one cloud"
+            f"{labels_where}: has {len(labels)} rows, {points_file.name} has {len(points)}; they must match"
         )
     return GroundTruth(
         moved(points, first_pose),

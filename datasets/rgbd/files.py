@@ -41,10 +41,10 @@ class RgbdDescription(BaseModel):
     - ``pose_direction`` and ``camera_axes``: what the matrices map, and whether y points down and z into the scene
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
-      left; with 3, a value p is ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: values in units that, besides 0,
+      left; with 3, a value p is ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: values that, besides 0,
       mean no depth; 65535 is not needed, it means none if it is far from all other depths of its image
     - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
-    - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are rotated so that it becomes z.
+    - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are rotated so that it is z.
       Without it the world is unchanged, with a warning if the frames show another axis to point up
     - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that need one
     - ``frames_per_second``: gives the frame times if the trajectory has none
@@ -168,12 +168,10 @@ def _numbered(names: Sequence[str], pattern: str, where: str) -> dict[int, str]:
         if match := form.fullmatch(name):
             number = int(match[1])
             if number > MAX_NUMBER:
-                raise DataError(
-                    f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; use * in the pattern instead"
-                )
+                raise DataError(f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; use * in the pattern instead")
             if number in name_of:
                 raise DataError(
-                    f"{where}: {name_of[number][:60]} and {name[:60]} have the same number; expected one file per number"
+                    f"{where}: {name_of[number][:60]} and {name[:60]} have the same number; expected one file each"
                 )
             name_of[number] = name
     return name_of

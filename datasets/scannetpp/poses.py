@@ -157,7 +157,7 @@ def frame_number(name: str, where: str) -> int:
 def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
     length = math.hypot(*values[:4])
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in values) or abs(length - 1) > 1e-2:
-        raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a translation in metres; copy the file again")
+        raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a translation (m); copy the file again")
     w, x, y, z = (value / length for value in values[:4])
     to_camera = rotations_of(np.array([[x, y, z, w]]))[0]
     pose = np.eye(4)

@@ -45,7 +45,7 @@ Stamped = tuple[float, str]  # time in seconds, file name
 class TumOptions(BaseModel):
     """How images and poses are matched.
 
-    ``max_difference_s``: images further apart in time are not paired; a colour image without a pose within it is excluded.
+    ``max_difference_s``: images further apart in time are not paired, nor are images and poses.
     ``pose``: interpolated at the colour image's time (linear, spherical; only the nearest if
     the other is further away than ``max_difference_s``), or the ``nearest``. ``intrinsics``: fx fy cx cy, replacing
     ``camera.txt`` and the benchmark's values.

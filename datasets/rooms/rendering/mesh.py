@@ -103,7 +103,7 @@ def _wound(shape: Shape) -> Shape:
 
 @dataclass(frozen=True)
 class Grid:
-    """Patches cut into cells: ``rows`` (V, 3) of quad, u, v; ``faces`` (F, 4) of vertex indices; owner quad per face."""
+    """Patches cut into cells: ``rows`` (V, 3) of quad, u, v; ``faces`` (F, 4) of vertex indices; owner of each face."""
 
     rows: Float64Array
     faces: Int32Array
