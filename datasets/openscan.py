@@ -110,7 +110,7 @@ def attribute_ids(attributes: Attributes, variant: str, where: str) -> dict[int,
         if known is None and words[key].strip().lower() not in WITHOUT:
             raise DataError(
                 f"{where}: object {object_id} has the {key} '{printable(words[key], 60)}', which is not one of the "
-                f"{len(label_set(variant).ids)} OpenScan attributes; score its prepared texts with --ground-truth instead"
+                f"{len(label_set(variant).ids)} OpenScan attributes; score its texts with --ground-truth instead"
             )
         ids[object_id] = known or 0
     return ids

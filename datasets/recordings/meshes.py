@@ -26,7 +26,7 @@ def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
         first = int(np.flatnonzero(is_outside)[0])
         row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
         raise DataError(
-            f"{where}: face {row} refers to vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
+            f"{where}: face {row} uses vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
         )
     return corners
 

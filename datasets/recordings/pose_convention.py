@@ -247,7 +247,7 @@ def guess_up(poses: Float64Array, frames: Sequence[Frame]) -> WorldUp:
         return WorldUp(
             AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of the surfaces are perpendicular to it"
         )
-    return WorldUp(AXES[candidates[0]], False, "judging by the camera orientations")
+    return WorldUp(AXES[candidates[0]], False, "by camera orientation")
 
 
 def _shares_level(frames: Sequence[Frame]) -> Float64Array:

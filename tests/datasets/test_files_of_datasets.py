@@ -1,4 +1,4 @@
-"""What all datasets of files do: a line for each fault of a file, a hint where no data is, a digest of every file."""
+"""All file-based datasets: one line per fault of a file, a hint if data is missing, a digest of every file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from test_tum import write_sequence
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing
 
-Content = Any  # of a file: None removes it, a function of the data root changes what it likes
+Content = Any  # of a file: None removes it, a function of the data root may change anything
 RENDER, HABITAT = "Replica/room0", "replica_v1/room_0/habitat"
 SCANS, IPHONE, WALK = f"scans/{SCAN}", f"data/{pp.SCENE}/iphone", f"hm3dsem_walks/val/{hm.SCENE}"
 VIDEO, MESHES = f"ChallengeDevelopmentSet/{ark.SCENE}", f"data/{pp.SCENE}/scans"
@@ -75,7 +75,7 @@ def change(root: Path, name: str, content: Content) -> None:
 
 
 def faults(dataset: Any, scene: str) -> list[str]:
-    """The line of everything that fails; ground truth that is not there is no fault."""
+    """The message of everything that fails; missing ground truth is not a fault."""
     lines: list[str] = []
     variants = [*dataset.variants, *dict(getattr(dataset, "further_truths", {})).values()]
     asks: list[Callable[[], object]] = [lambda: lines.extend(dataset.problems(scene))]
@@ -92,7 +92,7 @@ def faults(dataset: Any, scene: str) -> list[str]:
 
 
 def boxed(**changes: Any) -> dict[str, Any]:
-    """The table of objects with a box, some of whose parts are other ones."""
+    """The table of objects with a box, with ``changes`` to the first box."""
     table = rep.info_table(rep.TWO_OBJECTS)
     table["objects"][0]["oriented_bbox"] = rep.box(**changes)
     return table
@@ -152,17 +152,17 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("replica", "Replica/ground_truth/room0.txt", "1\n" * 3, "has 3 labels, room0_mesh.ply 9 and habitat/mesh_sem"),
     ("replica", "Replica/ground_truth/room0.txt", "102005\n" * 9, "102005 is of class 102, Replica has 1 to 101"),
     ("replica", "Replica/ground_truth/room0.txt", "1\n\x1b[31m\n", r"line 2 is '\x1b[31m'; expected one whole number"),
-    ("replica", "Replica/semantic_gt/room0.txt", "1\n" * 9, "holds the class 1, none of the 51 Replica ids"),
+    ("replica", "Replica/semantic_gt/room0.txt", "1\n" * 9, "has class 1, not one of the 51 Replica ids"),
     ("scannet", "", of_other_scene, "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
-    ("scannet", "", lambda root: write_mesh(root / SCANS / f"{SCAN}_vh_clean_2.ply", *grid()), "belong to two meshes"),
+    ("scannet", "", lambda root: write_mesh(root / SCANS / f"{SCAN}_vh_clean_2.ply", *grid()), "of different meshes"),
     ("scannet", TABLE, "id\tnyu40id\n1\t1\n", "has no column 'raw_category'"),
     ("scannet", TABLE, table_text([("chair", 2, 41, "")]), "line 2: 'nyu40id' is '41'; expected a whole number from 1"),
     ("scannet", TABLE, table_text() + "3\tla\x1bmp\t\t\t4\n", "line 8: has no raw_category, id, nyu40id"),
-    ("scannet", f"{SCANS}/{SCAN}.txt", "colorHeight\n", "line 1: 'colorHeight' is no 'key = value'"),
+    ("scannet", f"{SCANS}/{SCAN}.txt", "colorHeight\n", "line 1: 'colorHeight' is not 'key = value'"),
     ("scannet", f"{SCANS}/{SCAN}.txt", f"axisAlignment = {IDENTITY[2:]}\n", "has 15 values; expected 16 finite"),
     ("scannet", f"{SCANS}/{SCAN}.txt", f"axisAlignment = 2{IDENTITY[1:]}\n", "'axisAlignment' is not a rigid motion"),
     ("scannet", "openscan_val_raw.json", [RECORD, RECORD], "record 2: object 0 of scene0000_00 has a record already"),
-    ("scannet", "openscan_val_raw.json", [RECORD | {"affordance": "slep"}], "has the affordance 'slep', which is none"),
+    ("scannet", "openscan_val_raw.json", [RECORD | {"affordance": "slep"}], "the affordance 'slep', which is not one"),
     ("scannet python", f"{SCANS}/color/2.jpg", None, "color/2.jpg is missing; export the recording again"),
     ("scannet python", f"{SCANS}/depth/0.jpg", b"", "depth/ holds '0.jpg', which belongs to no frame"),
     ("scannet python", f"{SCANS}/intrinsic/intrinsic_color.txt", None, "intrinsic/intrinsic_color.txt is missing"),
@@ -187,24 +187,24 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("scannetpp", f"{IPHONE}/colmap/images.txt", "1 1 0 0 0 0 0 0 1 frame_000007.jpg\n", "frame_000007.jpg is missing"),
     ("scannetpp", f"{MESHES}/segments.json", {"segIndices": [1, 2]}, "has 2 vertices, mesh_aligned_0.05.ply has 861"),
     ("scannetpp", f"{MESHES}/segments_anno.json", {"segGroups": [{"segments": [1]}]}, "segGroups.0.label: Field requ"),
-    ("scannetpp", f"{MESHES}/mesh_aligned_0.05_mask.txt", "861\n", "'861' is no vertex of mesh_aligned_0.05.ply"),
+    ("scannetpp", f"{MESHES}/mesh_aligned_0.05_mask.txt", "861\n", "'861' is not a vertex of mesh_aligned_0.05.ply"),
     ("scannetpp", f"{pp.LISTS}/top100.txt", "wall\nwall\n", "top100.txt: has 'wall' twice"),
-    ("scannetpp", f"{pp.LISTS}/top100_instance.txt", "piano\n", "has 'piano', which top100.txt has not"),
+    ("scannetpp", f"{pp.LISTS}/top100_instance.txt", "piano\n", "has 'piano', which is missing in top100.txt"),
     ("scannetpp", f"{pp.LISTS}/map_benchmark.csv", f"{pp.MAP}sofa\n", "row 7: has 1 cells of 4"),
     ("scannetpp tracking", TRACKING, pp.tracking(aligned_pose=(2 * np.eye(4)).tolist()), "'aligned_pose' is not"),
     ("hm3dsem", f"{WALK}/scene_info.json", {}, "levels: Field required"),
-    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("regions", 0, floor_id=3), "a 'floor_id' names no level"),
+    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("regions", 0, floor_id=3), "a 'floor_id' does not match a level"),
     ("hm3dsem", f"{WALK}/scene_info.json", walk_info("objects", 1, id=3), "an object is listed twice"),
     ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", None, "pose/..._000001.txt is missing"),
-    ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", " ".join(["2"] * 16), "is no rigid pose"),
+    ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", " ".join(["2"] * 16), "not a rigid transform"),
     ("hm3dsem", f"{WALK}/depth/notes.txt", "x", "belongs to no frame"),
     ("hm3dsem", f"{WALK}/objects/7.ply", b"ply", "objects/7.ply"),
     ("hm3dsem", ANNOTATION, "HM3D Semantic Annotations\n3,0A0B0C,chair\n", ":2: is '3,0A0B0C,chair'"),
     ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"a",5\n3,0A,"b",5\n', ":3: object 3 is listed twice"),
-    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"sofa, old",5\n', "object 3 is not that of the scene's"),
+    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"sofa, old",5\n', "object 3 differs from the scene's"),
     ("arkitscenes", ark.TRUTH, "version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS, not the file"),
-    ("arkitscenes", ark.TRUTH, "0\n1\n", "has 2 lines, the mesh has 8 vertices; both must be of one scene"),
-    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query, the video of eight"),
+    ("arkitscenes", ark.TRUTH, "0\n1\n", "has 2 lines, the mesh has 8 vertices; both must belong to one scene"),
+    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query with an eight"),
     ("arkitscenes", ark.QUERIES, f"{QUERIES}{ark.SCENE},2,a\n{ark.SCENE},2,b\n", f"scene {ark.SCENE} has two queries"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "1 2 3\n", "lowres_wide.traj line 1: has 3 values; expected time"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "900 0 0 0 0 0 0\n", "3 images have no pose nearer than 0.3 s"),
@@ -225,7 +225,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
 
 
 @pytest.mark.parametrize(("name", "file", "content", "message"), FAULTS)
-def test_each_fault_of_a_file_is_one_line(tmp_path: Path, name: str, file: str, content: Content, message: str) -> None:
+def test_each_file_fault_is_one_line(tmp_path: Path, name: str, file: str, content: Content, message: str) -> None:
     scene, make = MAKERS[name]
     make(tmp_path)
     if name == "rgbd":
@@ -239,7 +239,7 @@ def test_each_fault_of_a_file_is_one_line(tmp_path: Path, name: str, file: str, 
 
 
 @pytest.mark.parametrize("name", [name for name in MAKERS if " " not in name])
-def test_without_data_it_is_said_how_to_get_it_and_an_unknown_scene_suggests_another(tmp_path: Path, name: str) -> None:
+def test_missing_data_hints_how_to_get_it_and_unknown_scene_suggests_another(tmp_path: Path, name: str) -> None:
     with pytest.raises(ScenesMissing, match=rf"^{name}: no scene in "):
         opened(tmp_path, name).scenes()
     scene, make = MAKERS[name]
@@ -276,7 +276,7 @@ def test_without_data_it_is_said_how_to_get_it_and_an_unknown_scene_suggests_ano
         ("tum", f"{SEQUENCE}/groundtruth.txt", "100 0 0 0 0 0 0 1\n100.1 9 0 0 0 0 0 1\n"),
     ],
 )
-def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path, name: str, file: str, content: Content) -> None:
+def test_digest_changes_with_every_file_that_is_read(tmp_path: Path, name: str, file: str, content: Content) -> None:
     scene, make = MAKERS[name]
     make(tmp_path)
     before = opened(tmp_path, name).digest(scene)

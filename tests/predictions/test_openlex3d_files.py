@@ -127,7 +127,7 @@ def edited(**changes: Any) -> str:
 
 
 FAULTS = (
-    (release.read_prompts, " \n \n", "has no prompt; expected one a line"),
+    (release.read_prompts, " \n \n", "has no prompts; expected one per line"),
     (release.read_categories, "[]", "expected an object; found []"),
     (release.read_categories, '{"dataset": {}}', "dataset.samples: Field required"),
     (
@@ -160,5 +160,5 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
 @pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])
 def test_a_name_that_leaves_its_folder_is_refused(tmp_path: Path, name: str) -> None:
     for dataset, scene in ((name, "room0"), ("replica", name)):
-        with pytest.raises(DataError, match="is no name of a dataset or scene"):
+        with pytest.raises(DataError, match="is not a dataset or scene name"):
             release.OpenLexFiles(tmp_path, dataset, scene)

@@ -181,7 +181,7 @@ def test_without_a_cloud_of_visible_points_all_points_count_but_for_replica(tmp_
         ("[]", "expected an object"),
         ('{"objects": []}', "objects: List should have at least 1 item"),
         ('{"objects": [{"id": "7"}]}', "objects.0.id: Input should be a valid integer"),
-        ('{"objects": [{"id": 1}, {"id": 1}]}', "an object stands there twice"),
+        ('{"objects": [{"id": 1}, {"id": 1}]}', "an object is listed twice"),
     ],
 )
 def test_a_damaged_list_of_objects_is_one_line(info: str, message: str, tmp_path: Path) -> None:
