@@ -180,7 +180,7 @@ def _read_text(path: Path, where: str) -> str:
 
 
 def _missing(path: Path, where: str) -> GroundTruthMissing:
-    return GroundTruthMissing(f"{where}: missing; expected {printable(str(path), 200)}")
+    return GroundTruthMissing(f"{where}: is missing; expected {printable(str(path), 200)}")
 
 
 SAMPLED_DATASET = "scannetpp"
@@ -303,7 +303,7 @@ def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
     for one in ids:
         path, beside = folder / OBJECTS_FOLDER / f"{one}.ply", f"{where}: {OBJECTS_FOLDER}/{one}.ply"
         if not path.is_file():
-            raise DataError(f"{beside}: missing, but {SCENE_INFO} lists object {one}; {advice}")
+            raise DataError(f"{beside}: is missing, but {SCENE_INFO} lists object {one}; {advice}")
         clouds.append(vertex_positions(read_ply(path, beside), beside))
         n_points += len(clouds[-1])
         if n_points > MOST_POINTS:

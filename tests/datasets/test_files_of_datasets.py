@@ -204,7 +204,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"sofa, old",5\n', "object 3 differs from the scene's"),
     ("arkitscenes", ark.TRUTH, "version https://git-lfs.github.com/spec/v1\n", "is a pointer of Git LFS, not the file"),
     ("arkitscenes", ark.TRUTH, "0\n1\n", "has 2 lines, the mesh has 8 vertices; both must belong to one scene"),
-    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query with an eight"),
+    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query, with an"),
     ("arkitscenes", ark.QUERIES, f"{QUERIES}{ark.SCENE},2,a\n{ark.SCENE},2,b\n", f"scene {ark.SCENE} has two queries"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "1 2 3\n", "lowres_wide.traj line 1: has 3 values; expected time"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "900 0 0 0 0 0 0\n", "3 images have no pose nearer than 0.3 s"),

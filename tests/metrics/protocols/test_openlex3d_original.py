@@ -171,7 +171,7 @@ def test_without_a_cloud_of_visible_points_all_points_count_but_for_replica(tmp_
     assert truth.source.startswith("all points, gt_categories.json")
     labelled = LabelledPoints(truth.points, truth.object_of_point, "made")
     shutil.copytree(tmp_path / "lex/hm3d", tmp_path / "lex/replica")
-    with pytest.raises(GroundTruthMissing, match=r"replica/00824: gt_visible_cloud\.pcd: is not there"):
+    with pytest.raises(GroundTruthMissing, match=r"replica/00824: gt_visible_cloud\.pcd: is missing"):
         categories_truth(OpenLexFiles(tmp_path / "lex", "replica", "00824"), labelled)
 
 
