@@ -1,4 +1,4 @@
-"""Damage for the readers of the table of targets; ``python benchmarks fuzz`` is the long mode of the same."""
+"""Damaged input for all readers in the table of targets; ``python benchmarks fuzz`` is the long version."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from su3d_bench.core.files.atomic import DAMAGE, read_arrays, read_json
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.store.predictions import read_prediction
 
-N_INPUTS = 10  # of each reader, beside a pipe and the like; python benchmarks fuzz draws many more
+N_INPUTS = 10  # per reader, besides pipes and the like; python benchmarks fuzz uses many more
 USUAL = (
     *("prediction scannet-text", "prediction openmask3d", "prediction conceptgraphs", "prediction hovsg"),
     *("prediction su3d-bench", "file ascii.ply", "file binary_compressed.pcd", "file a.png", "file a.npz"),
     *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.xlsx", "archive a.tar.gz"),
 )
-N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of words behind each verb
-# A verb whose work could begin with nothing more than its name ends with words that keep it from that.
+N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of random arguments per verb
+# A verb that could start work with its name only gets arguments that prevent this.
 HELD_BACK = {"run": ["--scenes", "replica/none", "--dry-run"], "ablate": ["--scenes", "replica/none", "--dry-run"]}
 HELD_BACK |= {"questions": ["--scenes", "replica/none"], "make": ["--scenes", "none/none", "--out", "folder/out"]}
 
@@ -45,10 +45,8 @@ def _own_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.proof) for name in TARGETS]
 )
-def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_memory(
-    name: str, tmp_path: Path
-) -> None:
-    """So it does where a pipe or a device stands in place of the file."""
+def test_reader_meets_damage_only_with_typed_errors_quickly_in_little_memory(name: str, tmp_path: Path) -> None:
+    """This also applies to a pipe or device in place of the file."""
     sample = Sample(TARGETS[name], tmp_path / "sample")
     with bounded_addresses(MOST_ADDRESSES_BYTES):
         sample.read()  # the sample itself is fine
@@ -59,7 +57,7 @@ def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_
 
 
 @pytest.mark.parametrize("words", [words for words, _ in verbs()], ids=" ".join)
-def test_any_words_behind_a_verb_are_done_or_declined_in_one_line(words: tuple[str, ...]) -> None:
+def test_random_arguments_never_give_a_traceback(words: tuple[str, ...]) -> None:
     for name, text in (("a.toml", "[method.opensu3d]\ntop_m = 3\n"), ("a.json", json.dumps({"a": 1}))):
         Path(name).write_text(text)
     Path("a.csv").write_text("a,b\n1,2\n")
@@ -80,7 +78,7 @@ NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a 
 
 
 def npz(folder: Path, header: str, body: bytes = b"") -> Path:
-    """An archive of one array, which says of itself what ``header`` says."""
+    """An archive of one array described by ``header``."""
     text = header.encode().ljust(117) + b"\n"
     member = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
     with zipfile.ZipFile(folder / "a.npz", "w") as archive:
