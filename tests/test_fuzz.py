@@ -97,7 +97,7 @@ def npz(folder: Path, header: str, body: bytes = b"") -> Path:
         ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", b"\x80\x04N."),
     ],
 )
-def test_no_header_of_an_array_is_believed(tmp_path: Path, header: str, body: bytes) -> None:
+def test_array_headers_are_never_trusted(tmp_path: Path, header: str, body: bytes) -> None:
     path = npz(tmp_path, header, body)
     with pytest.raises(DAMAGE):
         read_arrays(path)
@@ -106,7 +106,7 @@ def test_no_header_of_an_array_is_believed(tmp_path: Path, header: str, body: by
 
 
 @pytest.mark.parametrize("text", [DEEP, '{"a":' * 50_000, f'{{"a": {LONG}}}'])
-def test_a_record_nested_or_numbered_beyond_reason_is_refused(tmp_path: Path, text: str) -> None:
+def test_record_nested_or_numbered_excessively_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(StoreError, match=r"run\.json: not readable as JSON"):
         read_json(tmp_path / "run.json")
@@ -121,7 +121,7 @@ def test_a_record_nested_or_numbered_beyond_reason_is_refused(tmp_path: Path, te
         ("scores", np.zeros(1, np.complex64)),
     ],
 )
-def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+def test_prediction_with_a_field_of_another_kind_is_rejected(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
     file = tmp_path / "prediction.npz"
     arrays = {"kind": np.array("Instances"), "points": np.zeros((3, 3), np.float32), name: array}
     np.savez(file, **arrays)  # type: ignore[arg-type]
@@ -139,7 +139,7 @@ def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, na
         ("score", np.full(30, np.nan)),
     ],
 )
-def test_counts_of_another_kind_shape_or_range_are_damaged(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+def test_counts_of_another_kind_shape_or_range_are_rejected(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
     file = copied_run(tmp_path) / "scenes" / "painted.a" / "collector" / "counts.npz"
     arrays = read_arrays(file) | {f"rooms-instance/{name}": array}
     np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ class LocalServer:
             protocol_version = "HTTP/1.1"
 
             def handle(self) -> None:
-                """Clients that give up may close the connection at any moment, even while the next request is awaited."""
+                """Clients may close the connection at any moment, also while the next request is awaited."""
                 with suppress(ConnectionError):
                     super().handle()
 
@@ -75,7 +75,7 @@ def send(handler: BaseHTTPRequestHandler, status: int, headers: Mapping[str, str
 
 @dataclass
 class Served:
-    """A file and how it is served: ``breaks_after`` lists byte counts after which an answer is cut off, one per answer."""
+    """A file and how it is served: ``breaks_after`` lists byte counts at which answers are cut, one per answer."""
 
     content: bytes
     etag: str | None = None

@@ -67,7 +67,7 @@ class Thing(NamedTuple):
 def mask_image(masks: Array, border_px: int, shape: str) -> Array:
     """M': "masks M are updated to M' with these IDs as per-pixel labels, including a border of px pixels around each".
 
-    Largest first, so that the smaller of overlapping masks is on top; a ring belongs to no instance, even on other masks.
+    Largest first, so that the smaller of overlapping masks is on top; a ring has no instance, even on other masks.
     """
     image = np.full(masks.shape[1:], NONE)
     for k in sorted(range(len(masks)), key=lambda k: -np.count_nonzero(masks[k])):

@@ -1,7 +1,7 @@
 """Synthetic problems of labelled points in segments of things and stuff, for both panopticapi and this program.
 
 A problem is a list of scenes. A scene has the ``truth`` of every point, its ``instance`` (0 for none), its ``owner``
-among the predicted masks (-1 for none) and the class ``called`` of each mask. 0 to 2 are things, 3 and 4 stuff, 5 is a class
+among the predicted masks (-1 for none) and the class ``called`` of each mask. 0-2 are things, 3-4 stuff, 5 is a class
 that is not scored, -1 no label, -2 a point excluded by evaluations if the dataset has such points.
 """
 

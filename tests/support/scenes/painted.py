@@ -228,7 +228,7 @@ class SlashCollector(Collector):
 
 
 class WordEncoder:
-    """Maps texts to pseudo-random features, equal for equal last words; images to the feature of their colour's class."""
+    """Maps texts to pseudo-random features by their last word; images to the feature of their colour's class."""
 
     name = "words"
     digest = "words-1"

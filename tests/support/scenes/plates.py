@@ -31,7 +31,7 @@ def at_cosine(cosine: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Plate:
-    """A rectangle facing the camera, with bounds in x and y and a depth in metres."""
+    """A rectangle facing the camera, bent towards it by ``bend_m``, with bounds in x and y and a depth (m)."""
 
     x: tuple[float, float]
     y: tuple[float, float] = (-0.3, 0.3)
