@@ -99,7 +99,7 @@ def installed(folder: Path) -> Place:
     subprocess.run([sys.executable, *words], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
     bring_kernels(packages / "su3d_bench")
-    # Folders in .pth files are searched, but .pth files inside them (such as that of the project's sources) are not read.
+    # Folders in .pth files are searched, but .pth files inside them (such as the one of the sources) are not read.
     (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for name in ("home", "elsewhere"):
         (folder / name).mkdir()

@@ -271,7 +271,7 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     names = sorted(table, key=lambda name: name.endswith("difference"))
     yield from aligned(
         [
-            ["per cent of intervals that contain the true value", *(f"{n} scenes" for n in sizes)],
+            ["coverage of 95 % intervals, per cent", *(f"{n} scenes" for n in sizes)],
             *([name, *(_marked(table[name][n].per_cent(JACKKNIFE)) for n in sizes)] for name in names),
         ]
     )
@@ -316,9 +316,9 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     """The table of intervals over items: Wilson's, computed exactly; those of changes and agreement, simulated."""
     rng = np.random.default_rng([seed, 1])
     rows = [[f"share of {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
-    for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 people", agreement)):
+    for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
-    yield from aligned([["per cent of intervals that contain the true value", *(f"{n} items" for n in ITEMS)], *rows])
+    yield from aligned([["coverage of 95 % intervals, per cent", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
         "\nShares miss the target, in italics, because counts are integers: coverage oscillates with rate and "

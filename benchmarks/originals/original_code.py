@@ -35,7 +35,7 @@ DROPPED = {"float": float, "int": int, "bool": bool, "in1d": lambda a, b: np.isi
 class Original:
     """An evaluator: the ``protocols`` that it covers and its ``file`` in a checkout.
 
-    ``start(rules, checkout, folder)`` returns a function to query it, using the folder; ``drawn(seed, index)`` a problem,
+    ``start(rules, checkout, folder)`` returns a function to query it; ``drawn(seed, index)`` a problem,
     ``ours(rules, problem)`` this program's answer, ``keep(rules, ask, seed, n)`` stores ``n`` answers in the cases.
     """
 
