@@ -93,7 +93,7 @@ def main() -> int:
         rows.append([f"the method {SLOWER:g} times slower", str(arguments.repeats), str(n_caught), "-"])
         notes = [f"The first {TAUGHT} runs created the reference; costs up to {COST_LIMIT:g} times its own pass."]
         write_measured(
-            arguments.json, "The gate and repeats of one run", "python benchmarks gate_repeats",
+            arguments.json, "Regression check on repeats of one run", "python benchmarks gate_repeats",
             ["runs", "number", "failed", "cost of the updates, times the reference's"], rows, notes,
         )  # fmt: skip
     return int(bool(failed) or n_caught < arguments.repeats)

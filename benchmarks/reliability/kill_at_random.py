@@ -62,7 +62,7 @@ VICTIMS = {"inline": ("group", "driver"), "processes": ("group", "driver", "work
 SHARES = dict.fromkeys(VERBS, 2) | {"inline": 8, "processes": 3, "ray": 2, "program": 4, "programs": 2}
 COLUMNS = (
     "kills", "of a group", "of a driver", "of a worker", "SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "power cuts",
-    "files spoilt", "compared",
+    "files corrupted", "compared",
 )  # fmt: skip
 COUNTED = ("faults", "orphans", "leftovers")
 NOTE = (

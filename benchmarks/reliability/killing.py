@@ -54,7 +54,7 @@ class Tally:
         self.done[sent.name] += 1
         if spoilt is not None:
             self.done["power cuts"] += 1
-            self.done["files spoilt"] += spoilt
+            self.done["files corrupted"] += spoilt
         if self.done["kills"] % 10 == 0:
             print(f"{self.name}: {dict(self.done)}", flush=True)
 

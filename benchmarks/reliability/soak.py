@@ -34,7 +34,7 @@ METHODS = ("opensu3d", "sam3d", "conceptgraphs")
 SCENES = ("rooms/living0", "rooms/office0")
 RUN = ("run", "--methods", *METHODS, "--protocols", "rooms-semantic", "rooms-instance", "--limit", "3", "--quiet")
 FRESH_CACHE_EVERY, PAGE_EVERY, WORKERS_EVERY, COMMAND_EVERY = 4, 6, 8, 10
-COLUMNS = ("quantity", "median", "range", "slope an hour with 95 % interval", "verdict")
+COLUMNS = ("quantity", "median", "range", "slope per hour with 95 % interval", "verdict")
 N_SPANS = 12
 T_95 = 2.228  # Student's t, 97.5 %, for the 10 degrees of freedom of a line through 12 spans
 # Growth over the whole time also requires this, besides an interval above zero: a share of the level, or a count.

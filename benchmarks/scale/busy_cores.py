@@ -210,7 +210,7 @@ def main() -> None:
             "time of the whole process tree over cores times wall time. Idle: nothing of the run waited for the core. "
             "The targets: 85 % while jobs wait, and work that starts in 2 s.",
         )
-        write_measured(arguments.json, "A run keeps the cores busy", command, ("what", "value"), rows, notes)
+        write_measured(arguments.json, "Core utilization of a run", command, ("what", "value"), rows, notes)
 
 
 if __name__ == "__main__":

@@ -67,7 +67,12 @@ def main() -> None:
             "for the package, 400 ms for lists.",
         )
         write_measured(
-            arguments.json, "The command line answers", command, ("command", "wall ms", "processor ms"), rows, notes
+            arguments.json,
+            "Response time of the command line",
+            command,
+            ("command", "wall ms", "processor ms"),
+            rows,
+            notes,
         )
 
 

@@ -146,7 +146,7 @@ def main() -> None:
         units = "; ".join(f"{what} {value}" for what, value in unit_rows(costs))
         write_measured(
             arguments.json,
-            "All of ScanNet, and 100,000 scenes, on paper",
+            "All of ScanNet, and 100,000 scenes, estimated",
             "python benchmarks unit_costs --json build/measured/unit_costs.json",
             ["what", "machine hours (2 cores)", "hours", "storage: data + results + cache (TB)", "bottleneck"],
             plan_rows(costs),

@@ -140,7 +140,7 @@ def test_from_binary_masks(benchmark: Any, scenes: Sequence[Scene]) -> None:
 
 
 @pytest.mark.benchmark(group=MEMORY)
-def test_one_bincount_a_mask(benchmark: Any, scenes: Sequence[Scene]) -> None:
+def test_one_bincount_per_mask(benchmark: Any, scenes: Sequence[Scene]) -> None:
     found = benchmark(one_bincount_a_mask, scenes)
     assert found.ap == ours(scenes, [sparse(scene) for scene in scenes]).ap
 

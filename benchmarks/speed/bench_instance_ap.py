@@ -49,7 +49,7 @@ def test_one_bincount(benchmark: Any) -> None:
 
 
 @pytest.mark.benchmark(group="instance AP, counts of one scene: 200 000 points, 150 predictions")
-def test_one_comparison_a_pair(benchmark: Any) -> None:
+def test_one_comparison_per_pair(benchmark: Any) -> None:
     truth, masks, labels, _ = scene()
     full = np.zeros((len(masks), len(truth)), bool)
     for row, mask in zip(full, masks, strict=True):

@@ -97,7 +97,7 @@ def test_by_pairs_of_object_and_instance(benchmark: Any, n_points: int) -> None:
 
 
 @pytest.mark.benchmark(group="OpenLex3D, top 5 labels of each point of a scene: 200 objects, 3407 prompts")
-def test_a_walk_over_the_points(benchmark: Any) -> None:
+def test_loop_over_the_points(benchmark: Any) -> None:
     truth, prediction = scene(SMALL)
     values = benchmark.pedantic(walk_over_points, (truth, prediction), rounds=1)
     assert sum(values.values()) == pytest.approx(1.0)

@@ -58,7 +58,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, frames: list[Frame]) -> Repl
 
 
 def note_rate(benchmark: BenchmarkFixture) -> None:
-    benchmark.extra_info["frames_a_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
+    benchmark.extra_info["frames_per_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
     benchmark.extra_info["at_best"] = round(N_FRAMES / benchmark.stats["min"], 2)
 
 

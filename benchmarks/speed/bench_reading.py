@@ -95,7 +95,7 @@ def test_replica_frames(benchmark: BenchmarkFixture, folder: Path, replica: Repl
         "ours, 2 threads ahead": lambda: read_ahead(replica, 2),
     }
     benchmark.pedantic(work[how], rounds=7, warmup_rounds=1)
-    benchmark.extra_info["ms_a_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
+    benchmark.extra_info["ms_per_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
     benchmark.extra_info["best_ms"] = round(benchmark.stats["min"] / N_REPLICA * 1e3, 2)
 
 

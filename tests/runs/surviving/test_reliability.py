@@ -84,7 +84,7 @@ def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undi
         assert (row["faults"], row["orphans"], row["leftovers"]) == ("0", "0", "0")
         assert int(row["compared"]) > 0
     assert sum(int(row["kills"]) for row in rows) >= 10
-    assert sum(int(row["files spoilt"]) for row in rows) > 0
+    assert sum(int(row["files corrupted"]) for row in rows) > 0
 
 
 def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
