@@ -1,7 +1,7 @@
-"""The shape of the code base: its folders, the layers they stand on, and who imports whom.
+"""The structure of the code base: its folders, their layers, and the imports between them.
 
-``python tools/docs/house.py`` writes what of docs/architecture.md is drawn from the code; ``--check`` says whether
-it still holds.
+``python tools/docs/house.py`` writes the generated parts of docs/architecture.md; ``--check`` checks that they
+are up to date.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from made_documents import ROOT, write_or_check
 
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")  # root folders, reached through links in the package
-USERS = ("benchmarks", ".ci")  # folders beside the package that import it
+USERS = ("benchmarks", ".ci")  # folders outside the package that import it
 PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
-    "core": "types that every folder knows, interfaces, the registry, settings, errors, whole files, locks, devices",
+    "core": "shared types, interfaces, the registry, settings, errors, atomic files, locks, devices",
     "numerics": "statistics, clusters, spatial relations, Open3D's core",
-    "store": "run folders, their records and predictions, what the cache holds",
-    "formats": "files of others read as plain data: images, PLY, HDF5, npz, torch archives, pickles; tables, CSV",
-    "metrics": "protocols and their rules, matching, and every number: counts per scene, ratios over scenes",
+    "store": "run folders, their records and predictions, the cache",
+    "formats": "external files read as plain data: images, PLY, HDF5, npz, torch archives, pickles; tables, CSV",
+    "metrics": "protocols and their rules, matching, all metrics: counts per scene, ratios over scenes",
     "opensu3d": "the reference pipeline: association, fusion, tracking, post-processing",
-    "datasets": "one folder per dataset: frames, ground truth, checks, and rooms that the program makes itself",
+    "datasets": "one folder per dataset: frames, ground truth, checks; procedurally generated rooms",
     "perception": "images to detections: one folder per profile, foundation models, language models, the cache",
-    "reports": "tables, pictures, the page of runs, the page of sheets: what people see",
-    "fetching": "published weights and data downloaded: what from where, downloads, archives",
-    "predictions": "one file per format: predictions of other programs to ours, and back",
+    "reports": "output: tables, pictures, the page of runs, the page of sheets",
+    "fetching": "downloads of published weights and data: sources, transfers, archives",
+    "predictions": "one file per format: conversion of other programs' predictions to ours, and back",
     "questions": "queries and questions with known answers, and reasoning over a map",
-    "baselines": "one folder per method: re-implemented systems, other people's programs, the oracle",
-    "runs": "a request to jobs, jobs to scenes, frames to methods; resumed, in processes or on clusters",
-    "evaluation": "predictions made elsewhere to numbers",
-    "sheets": "what people judge: made, answered, scored",
-    "analysis": "finished runs compared, gated, ranked, taken apart",
-    "reproducing": "a paper's experiments as recipes: needs, runs, reported beside measured, archives; registries",
-    "api": "what a program or a notebook calls: runs and predictions to tables of pandas",
+    "baselines": "one folder per method: re-implemented systems, user programs, the oracle",
+    "runs": "from a request to jobs, scenes and frames; resuming, in processes or on clusters",
+    "evaluation": "scoring of predictions created elsewhere",
+    "sheets": "annotation sheets: created, answered, scored",
+    "analysis": "comparison of finished runs, regression check, ranking, attribution",
+    "reproducing": "a paper's experiments as recipes: requirements, runs, reported values, archives; registries",
+    "api": "Python API: runs and predictions as pandas tables",
     "cli": "one thin module per verb",
 }
 
 
 @cache
 def code_files() -> dict[str, Path]:
-    """Every Python file of the package, of benchmarks and of .ci by its module's name, at its real place."""
+    """Every Python file of the package, of benchmarks and of .ci by module name, at its real path."""
     files = {}
     for top in (PACKAGE, *(ROOT / name for name in (*LINKED, *USERS))):
         for path in sorted(top.rglob("*.py")):
@@ -59,7 +59,7 @@ def code_files() -> dict[str, Path]:
 
 
 def folder_of(module: str) -> str:
-    """The folder that a module stands in; the package's own modules stand for themselves."""
+    """The folder of a module; the package's own modules stand for themselves."""
     parts = module.removeprefix(".").split(".")
     if parts[0] != "su3d_bench":
         return ".ci" if module.startswith(".") else parts[0]
@@ -67,7 +67,7 @@ def folder_of(module: str) -> str:
 
 
 def imported(module: str, source: str) -> set[str]:
-    """The modules of the package that ``source`` imports, in functions and for type checkers too."""
+    """The modules of the package imported by ``source``, including in functions and for type checkers."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -84,13 +84,13 @@ def imported(module: str, source: str) -> set[str]:
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """Who imports whom, file by file."""
+    """Imports between files."""
     return {module: imported(module, path.read_text(encoding="utf-8")) for module, path in code_files().items()}
 
 
 @cache
 def folder_imports() -> dict[str, set[str]]:
-    """Who imports whom, folder by folder."""
+    """Imports between folders."""
     graph: dict[str, set[str]] = {}
     for module, others in imports().items():
         folder = folder_of(module)
@@ -99,12 +99,12 @@ def folder_imports() -> dict[str, set[str]]:
 
 
 def layers(graph: Mapping[str, set[str]]) -> list[set[str]]:
-    """The nodes in layers, the lowest first, each as low as what it imports lets it; ``ValueError`` for a cycle."""
+    """The nodes in layers, lowest first, each as low as its imports allow; ``ValueError`` for a cycle."""
     left, found = dict(graph), list[set[str]]()
     while left:
         free = {node for node, others in left.items() if not others & left.keys()}
         if not free:
-            while free := left.keys() - set().union(*left.values()):  # what stands above the cycle
+            while free := left.keys() - set().union(*left.values()):  # nodes above the cycle
                 left = {node: others & left.keys() - free for node, others in left.items() if node not in free}
             raise ValueError(f"a cycle of imports among {', '.join(sorted(left))}")
         found.append(free)
@@ -113,10 +113,10 @@ def layers(graph: Mapping[str, set[str]]) -> list[set[str]]:
 
 
 def drawn() -> dict[str, str]:
-    """The parts of the page that are drawn from the code, by the word in their marks."""
+    """The generated parts of the page, by the name in their markers."""
     graph = folder_imports()
     below = layers(graph)
-    rows, arrows = ["| layer | folder | what it holds |", "|---|---|---|"], ["```text"]
+    rows, arrows = ["| layer | folder | content |", "|---|---|---|"], ["```text"]
     for number, folders in reversed(list(enumerate(below, 1))):
         for folder in sorted(folders & PURPOSE.keys()):
             place = folder if folder in LINKED else f"su3d_bench/{folder}"
@@ -128,7 +128,7 @@ def drawn() -> dict[str, str]:
 
 
 def page_with(parts: dict[str, str], page: str) -> str:
-    """``page`` with each part between its marks."""
+    """``page`` with each generated part between its markers."""
     for word, text in parts.items():
         begin, end = f"<!-- {word}: drawn from the code -->", f"<!-- end of {word} -->"
         page = re.sub(rf"{begin}.*?{end}", lambda _, t=f"{begin}\n{text}\n{end}": t, page, flags=re.DOTALL)  # type: ignore[misc]
@@ -136,7 +136,7 @@ def page_with(parts: dict[str, str], page: str) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the page, or with ``--check`` say whether it still holds."""
+    """Write the page, or with ``--check`` check that it is up to date."""
     return write_or_check(PAGE, page_with(drawn(), PAGE.read_text(encoding="utf-8")), arguments)
 
 
