@@ -34,7 +34,7 @@ def built_wheel(folder: Path) -> Path:
     return wheel
 
 
-def bring_kernels(installed: Path) -> None:
+def copy_kernels(installed: Path) -> None:
     """Reuse Numba's compiled kernels for unchanged sources: compiling them again takes a minute.
 
     Numba identifies a source by its size and time.

@@ -130,7 +130,13 @@ def faults_in_browser(site: Path) -> Iterator[str]:
     """One line per fault seen when opening the start page from disk: missing content or bad layout."""
     from chromium import Chromium
 
-    opened = ["index.html", "verbs.html", "reference/methods/opensu3d.html", f"{FOUND}.html", "reference/api.html"]
+    opened = [
+        "index.html",
+        "reference/commands/run.html",
+        "reference/methods/opensu3d.html",
+        f"{FOUND}.html",
+        "reference/api.html",
+    ]
     for device, width in WIDTHS.items():
         for colours in ("light", "dark"):
             who = f"Chromium, {device}, {colours}"

@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # a test runs this by path
 
-from check_wheel import bring_kernels, built_wheel
+from check_wheel import built_wheel, copy_kernels
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {page.stem: page for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))}
@@ -68,7 +68,7 @@ def install(place: Path) -> dict[str, str]:
     wheel = built_wheel(place / "wheel")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", str(place / "installed"), str(wheel)], check=True)
-    bring_kernels(place / "installed" / "su3d_bench")
+    copy_kernels(place / "installed" / "su3d_bench")
     path = os.pathsep.join([str(place / "installed/bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = os.environ | {"PYTHONPATH": str(place / "installed"), "PATH": path}
     where = [sys.executable, "-c", "import su3d_bench; print(su3d_bench.__file__)"]

@@ -24,7 +24,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "support" / "files"))
 
-from check_wheel import bring_kernels, built_wheel  # noqa: E402
+from check_wheel import built_wheel, copy_kernels  # noqa: E402
 from file_server import (  # noqa: E402
     FileServer,
     Served,
@@ -48,7 +48,7 @@ LARGEST = "grounding-dino"
 SAM, RAM = "sam_vit_h_4b8939.pth", "ram_plus_swin_large_14m.pth"
 REPLICA = "Replica.zip"
 TABLES = ("II", "III")
-LESS_THAN_SAM = 100_000  # maximum file size in bytes for the full disk test
+MAX_SMALL_FILE = 100_000  # maximum file size in bytes for the full disk test
 
 
 @dataclass(frozen=True)
@@ -66,22 +66,22 @@ class Place:
     def data(self) -> Path:
         return self.folder / "data"
 
-    def run(self, *words: object, cwd: Path | None = None, most_bytes: int | None = None) -> tuple[int, str, str]:
+    def run(self, *words: object, cwd: Path | None = None, max_bytes: int | None = None) -> tuple[int, str, str]:
         """``su3d-bench`` with ``words``: exit code, stdout and stderr."""
         program = self.python.parent / "su3d-bench"
-        return self._run([program, *words], cwd, most_bytes)
+        return self._run([program, *words], cwd, max_bytes)
 
     def python_says(self, code: str, *words: object) -> str:
         rc, out, err = self._run([self.python, "-c", code, *words], None, None)
         assert rc == 0, err
         return out.strip()
 
-    def _run(self, words: list[Any], cwd: Path | None, most_bytes: int | None) -> tuple[int, str, str]:
+    def _run(self, words: list[Any], cwd: Path | None, max_bytes: int | None) -> tuple[int, str, str]:
         variables = {"HOME": str(self.folder / "home"), "PATH": "/usr/bin:/bin", "SU3D_DATA": str(self.data)}
 
         def limited() -> None:
-            if most_bytes is not None:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+            if max_bytes is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
 
         where = cwd or self.folder
         done = subprocess.run(
@@ -98,7 +98,7 @@ def installed(folder: Path) -> Place:
     words = ["-m", "pip", "--python", str(python), "--quiet", "install", "--no-deps", "--no-index", str(wheel)]
     subprocess.run([sys.executable, *words], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
-    bring_kernels(packages / "su3d_bench")
+    copy_kernels(packages / "su3d_bench")
     # Folders in .pth files are searched, but .pth files inside them (such as the one of the sources) are not read.
     (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for name in ("home", "elsewhere"):
@@ -165,7 +165,7 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     expect("redirect to another host", fetch("models", LARGEST, *once), 2, "is not named for it")
     server.files[store] = whole
     sam = server.files[f"/sam/{SAM}"]
-    expect("full disk", fetch("models", "sam-vit-h", *once, most_bytes=LESS_THAN_SAM), 2, SAM)
+    expect("full disk", fetch("models", "sam-vit-h", *once, max_bytes=MAX_SMALL_FILE), 2, SAM)
     server.files[f"/sam/{SAM}"] = Served(sam.content, breaks_after=[50_000])
     expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "the same command goes on from there")
     assert not here(place), "a damaged file was accepted as complete"
@@ -228,9 +228,9 @@ def main() -> int:
         mirror = ("--mirror", f"sam-vit-h={server.url}/sam/")
         beside: Mapping[str, tuple[object, ...]] = {"models": mirror, "replica": ()}
 
-        def fetch(what: str, *words: object, most_bytes: int | None = None) -> tuple[int, str, str]:
+        def fetch(what: str, *words: object, max_bytes: int | None = None) -> tuple[int, str, str]:
             verb = ("models", "fetch") if what == "models" else ("datasets", "fetch", what)
-            return place.run(*verb, *words, "--sources", table, *beside[what], most_bytes=most_bytes)
+            return place.run(*verb, *words, "--sources", table, *beside[what], max_bytes=max_bytes)
 
         words = ("reproduce", "opensu3d", "--table", *TABLES, "--dry-run")
         rc, out, err = place.run(*words)

@@ -38,7 +38,7 @@ class Oracle:
         """Nothing: frames are not used."""
         return PerceptionNeeds(frames=False)
 
-    def receive_truth(self, truth: GroundTruth) -> None:
+    def receive_ground_truth(self, truth: GroundTruth) -> None:
         """Take the ground truth; only the runner calls this, and only for this method."""
         self._truth = truth
 

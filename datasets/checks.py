@@ -27,10 +27,10 @@ from su3d_bench.core.errors import (
     error_line,
     printable,
 )
-from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
+from su3d_bench.core.interfaces import Dataset, ProvidesUpAxis, ReportsProblems
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Frame, GroundTruth, WorldUp
-from su3d_bench.datasets.checks_of_frames import (
+from su3d_bench.datasets.frame_checks import (
     Finding,
     FrameFacts,
     Meeting,
@@ -44,7 +44,7 @@ from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 
 SAMPLED_FRAMES = 20
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".pgm"}
-FRAME_OF_A_FILE = re.compile(r"\bframe \d")
+FILE_FRAME = re.compile(r"\bframe \d")
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
@@ -121,15 +121,15 @@ def inspect(
         if frames is not None:
             positions = _positions(len(frames), is_quick or is_made_on_demand)
             facts = _read_frames(frames, positions, findings, 1 if is_made_on_demand else n_threads, progress)
-        _look_at_files(files, findings, decode=frames is None)
+        _check_files(files, findings, decode=frames is None)
         findings.add(*check_frames(facts))
         up = None
         if frames is not None and facts:
             is_whole = len(facts) == len(positions)
             if is_whole and not is_made_on_demand:
-                _look_at_convention(dataset, scene, frames, findings)
-            up = _look_at_up(dataset, scene, facts, frames if is_whole else (), findings)
-        truth, known = _look_at_truth(dataset, scene, findings)
+                _check_convention(dataset, scene, frames, findings)
+            up = _check_up_axis(dataset, scene, facts, frames if is_whole else (), findings)
+        truth, known = _check_ground_truth(dataset, scene, findings)
         meeting = None
         if known is not None and facts:
             meeting, meeting_findings = check_truth(facts, known.points, known.boxes)
@@ -176,7 +176,7 @@ class _Findings:
         text = str(error) if isinstance(error, OSError) else error_line(error)
         text = printable(text.removeprefix(f"{self.scene}: "))
         first = text.partition(" ")[0].rstrip(":")
-        is_of_a_file = "." in first and not FRAME_OF_A_FILE.search(text)  # in a recording, other frames may be broken
+        is_of_a_file = "." in first and not FILE_FRAME.search(text)  # in a recording, other frames may be broken
         if not (is_of_a_file and self.mentions(Path(first))):
             self.add(Finding("error", check, where, text))
 
@@ -277,14 +277,14 @@ def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
     """Add the faults that the dataset itself reports; return how many."""
 
     def ask() -> None:
-        for line in dataset.problems(scene) if isinstance(dataset, HasProblems) else ():
+        for line in dataset.problems(scene) if isinstance(dataset, ReportsProblems) else ():
             findings.add(Finding("error", "file", "", line))
 
     findings.attempt("file", ask)
     return findings.n
 
 
-def _look_at_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], findings: _Findings) -> None:
+def _check_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], findings: _Findings) -> None:
     """Check whether depth and poses agree between frames, if each is usable by itself."""
     if findings.has_error(("pose", "intrinsics", "size")):
         return
@@ -293,20 +293,20 @@ def _look_at_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], f
         findings.add(Finding("error" if verdict.is_wrong else "warning", "convention", "", verdict.line))
 
 
-def _look_at_up(
+def _check_up_axis(
     dataset: Dataset, scene: str, facts: Sequence[FrameFacts], frames: Sequence[Frame], findings: _Findings
 ) -> WorldUp | None:
     """Which axis points up; a warning if z is assumed but the frames show another axis."""
     poses = np.array([frame.camera_to_world for frame in facts])
     up: WorldUp | None = findings.attempt(
-        "up", lambda: dataset.up(scene) if isinstance(dataset, SaysUp) else guess_up(poses, frames)
+        "up", lambda: dataset.up(scene) if isinstance(dataset, ProvidesUpAxis) else guess_up(poses, frames)
     )
     if up is not None and up.doubt is not None:
         findings.add(Finding("warning", "up", "", up.doubt))
     return up
 
 
-def _look_at_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:
+def _check_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:
     """Report every file that is missing, empty or unreadable and, with ``decode``, every damaged image."""
     for path in files:
         name = f"{path.parent.name}/{path.name}"
@@ -332,7 +332,7 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
         return str(error)
 
 
-def _look_at_truth(
+def _check_ground_truth(
     dataset: Dataset, scene: str, findings: _Findings
 ) -> tuple[tuple[TruthVariant, ...], GroundTruth | None]:
     """Counts of every ground-truth variant, and the first one available."""

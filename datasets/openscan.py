@@ -31,12 +31,12 @@ KEYS = {
     "openscan-element": "element",
     "openscan-material": "material",
 }
-FURTHER_TRUTHS: Mapping[str, str] = {name: name for name in KEYS}  # label space -> ground truth
+EXTRA_GROUND_TRUTHS: Mapping[str, str] = {name: name for name in KEYS}  # label space -> ground truth
 RAW_NAME = "openscan_val_raw.json"
 PAGE = "https://github.com/YoujunZhao/OpenScan"
-MOST_RECORDS = 1_000_000  # the validation set has 10,388
-MOST_CHARACTERS = 200
-SPELT_TWICE = {"\u00a0hang clothes": "hang clothes (34)"}  # the lists use a different kind of space
+MAX_RECORDS = 1_000_000  # the validation set has 10,388
+MAX_CHARACTERS = 200
+SPELLING_VARIANTS = {"\u00a0hang clothes": "hang clothes (34)"}  # the lists use a different kind of space
 WITHOUT = frozenset(("", "none", "other"))  # values for "no attribute"
 
 Attributes = Mapping[int, Mapping[str, str]]  # object id -> aspect's key -> word
@@ -59,7 +59,7 @@ def attribute_id(variant: str, words: str) -> int | None:
     (4, 22)
     """
     words = words.replace("_", " ")
-    words = SPELT_TWICE.get(words, words)
+    words = SPELLING_VARIANTS.get(words, words)
     found = [
         (len(name), class_id)
         for class_id, name in zip(label_set(variant).ids, label_set(variant).names, strict=True)
@@ -68,7 +68,7 @@ def attribute_id(variant: str, words: str) -> int | None:
     return min(found)[1] if found else None
 
 
-Words = Annotated[str, Field(max_length=MOST_CHARACTERS)]
+Words = Annotated[str, Field(max_length=MAX_CHARACTERS)]
 
 
 class Record(FileModel):
@@ -86,7 +86,7 @@ class Record(FileModel):
     material: Words | None = None
 
 
-Records = Annotated[list[Record], Field(min_length=1, max_length=MOST_RECORDS), FailFast()]
+Records = Annotated[list[Record], Field(min_length=1, max_length=MAX_RECORDS), FailFast()]
 
 
 def read_attributes(path: Path) -> Mapping[str, Attributes]:

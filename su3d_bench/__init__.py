@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from su3d_bench.api.lists import list_datasets as list_datasets
     from su3d_bench.api.lists import list_methods as list_methods
     from su3d_bench.api.lists import list_protocols as list_protocols
-    from su3d_bench.api.making import evaluate as evaluate
-    from su3d_bench.api.making import run as run
-    from su3d_bench.api.results import Comparison as Comparison
-    from su3d_bench.api.results import Run as Run
-    from su3d_bench.api.results import Scores as Scores
-    from su3d_bench.api.results import load_run as load_run
+    from su3d_bench.api.run import evaluate as evaluate
+    from su3d_bench.api.run import run as run
+    from su3d_bench.api.tables import Comparison as Comparison
+    from su3d_bench.api.tables import Run as Run
+    from su3d_bench.api.tables import Scores as Scores
+    from su3d_bench.api.tables import load_run as load_run
     from su3d_bench.core.errors import Su3dError as Su3dError
     from su3d_bench.core.geometry import back_project as back_project
     from su3d_bench.core.maps import DenseFeatures as DenseFeatures
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 # The public names, by the module in which each is.
 _MODULES = {
     "api.lists": ("list_datasets", "list_methods", "list_protocols"),
-    "api.making": ("evaluate", "run"),
-    "api.results": ("Comparison", "Run", "Scores", "load_run"),
+    "api.run": ("evaluate", "run"),
+    "api.tables": ("Comparison", "Run", "Scores", "load_run"),
     "core.errors": ("Su3dError",),
     "core.geometry": ("back_project",),
     "core.maps": ("DenseFeatures", "Instances", "Masks", "Partition"),

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, settings
 
 TESTS = Path(__file__).resolve().parent
 MEMORY = Path("/dev/shm")
-MOST_KEPT_BYTES = 4 << 30
+MAX_KEPT_BYTES = 4 << 30
 
 # The table of readers to damage uses samples from the tests of those readers.
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
@@ -26,7 +26,7 @@ from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
 os.environ.pop("COLUMNS", None)
 
 # Every file of a run is flushed to disk before it counts; thousands of small runs would wait only for this.
-if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MOST_KEPT_BYTES:
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MAX_KEPT_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 # Hundreds of processes start, each of which would compile the package again.

@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
-from house import (
+from architecture import (
     LINKED,
     PACKAGE,
     PAGE,

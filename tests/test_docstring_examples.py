@@ -8,7 +8,7 @@ import importlib
 import pytest
 from places import ROOT
 
-OF_A_RUN = {"su3d_bench.analysis.comparison"}  # their examples use a user's run
+RUN_OPTIONS = {"su3d_bench.analysis.comparison"}  # their examples use a user's run
 PACKAGES = ("analysis", "evaluation", "metrics", "reports")
 
 
@@ -16,6 +16,6 @@ PACKAGES = ("analysis", "evaluation", "metrics", "reports")
 def test_examples_in_docstrings_are_correct(package: str) -> None:
     files = sorted((ROOT / "su3d_bench" / package).rglob("*.py"))
     with_examples = [file for file in files if ">>> " in file.read_text(encoding="utf-8")]
-    names = {".".join(file.relative_to(ROOT).with_suffix("").parts) for file in with_examples} - OF_A_RUN
+    names = {".".join(file.relative_to(ROOT).with_suffix("").parts) for file in with_examples} - RUN_OPTIONS
     found = {name: doctest.testmod(importlib.import_module(name)) for name in names}
     assert names and all(one.attempted and not one.failed for one in found.values()), found

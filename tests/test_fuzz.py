@@ -15,7 +15,7 @@ from cli_calls import Declined, called
 from damage import bounded_addresses
 from fuzz_targets import TARGETS, copied_run
 from fuzz_words import ODD, drawn_words, verbs
-from fuzzing import ENDLESS, MOST_ADDRESSES_BYTES, Input, Sample, alarm
+from fuzzing import ENDLESS, MAX_ADDRESSES_BYTES, Input, Sample, alarm
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError
@@ -48,7 +48,7 @@ def _own_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_reader_meets_damage_only_with_typed_errors_quickly_in_little_memory(name: str, tmp_path: Path) -> None:
     """This also applies to a pipe or device in place of the file."""
     sample = Sample(TARGETS[name], tmp_path / "sample")
-    with bounded_addresses(MOST_ADDRESSES_BYTES):
+    with bounded_addresses(MAX_ADDRESSES_BYTES):
         sample.read()  # the sample itself is fine
         inputs = [sample.input(0, index) for index in range(N_INPUTS)]
         inputs += [Input(0, file, None, shape) for file, shape in zip(sorted(sample.whole), ENDLESS, strict=False)]

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import CheckFailed, ConfigError, StoreError, Su3dError, printable, shown
 from su3d_bench.core.files.atomic import is_file, make_folder, read_json, read_npz, write_json, write_npz, write_text
-from su3d_bench.core.files.locks import bring_to_disk, unfinished_folder
+from su3d_bench.core.files.locks import sync_to_disk, unfinished_folder
 from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
@@ -135,7 +135,7 @@ def settle(draft: Path, path: Path) -> list[Path]:
     size = sum(file.stat().st_size for file in draft.parent.iterdir())
     try:
         if size < LARGEST_SINGLE_FILE:
-            bring_to_disk(draft)
+            sync_to_disk(draft)
             os.replace(draft, path)
             data.unlink(missing_ok=True)
             return [path]
@@ -146,7 +146,7 @@ def settle(draft: Path, path: Path) -> list[Path]:
             model, str(settled / path.name), save_as_external_data=True, location=data.name, size_threshold=1024
         )
         for file in (settled / data.name, settled / path.name):
-            bring_to_disk(file)
+            sync_to_disk(file)
         os.replace(settled / data.name, data)
         os.replace(settled / path.name, path)
     except OSError as error:

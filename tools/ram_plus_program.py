@@ -29,20 +29,20 @@ IMAGE_PX = 384
 VIT = "swin_l"
 BERT_WORDS = 30_522 + 2  # bert-base-uncased, and the two added by init_tokenizer of ram/models/utils.py
 # Computed by the network from its window size; the authors' loader drops them too.
-MADE_BY_ITSELF = ("relative_position_index", "attn_mask")
+RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
 
 
 def build_network(checkout: Path) -> Any:
     """The authors' network as built by their package, in evaluation mode, with random weights."""
     for name in ("modeling_utils", "modeling_outputs", "models.bert.configuration_bert"):
         importlib.import_module(f"transformers.{name}")  # checks installed packages: before stand-ins are added
-    _stand_in_for_what_is_not_needed(checkout)
+    _replace_unused_imports(checkout)
     module: Any = importlib.import_module("ram.models.ram_plus")
     module.init_tokenizer = lambda *_: range(BERT_WORDS)
     return module.ram_plus(pretrained="", image_size=IMAGE_PX, vit=VIT).eval()
 
 
-def _stand_in_for_what_is_not_needed(checkout: Path) -> None:
+def _replace_unused_imports(checkout: Path) -> None:
     import torch
 
     class DropPath(torch.nn.Module):
@@ -92,13 +92,13 @@ def fill(model: Any, tensors: Mapping[str, Any]) -> None:
     kept = {
         name.replace("vision_multi", "tagging_head"): tensor
         for name, tensor in tensors.items()
-        if not any(part in name for part in MADE_BY_ITSELF)
+        if not any(part in name for part in RECOMPUTED_BUFFERS)
     }
     try:
         missing = model.load_state_dict(kept, strict=False).missing_keys
     except RuntimeError as error:
         raise ValueError(f"does not fit RAM++ ({' '.join(str(error).split())})") from error
-    missing = [name for name in missing if not any(part in name for part in MADE_BY_ITSELF)]
+    missing = [name for name in missing if not any(part in name for part in RECOMPUTED_BUFFERS)]
     if missing:
         raise ValueError(f"lacks {len(missing)} tensors, such as {missing[0][:80]}")
 

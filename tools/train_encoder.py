@@ -32,7 +32,7 @@ from training_crops import (
 
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.printing import doors
+from su3d_bench.core.safe_output import doors
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array

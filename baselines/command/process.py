@@ -17,15 +17,15 @@ from threading import Thread
 from typing import IO, Any
 
 from su3d_bench.baselines.command import supervisor
-from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, STOP
+from su3d_bench.baselines.command.supervisor import DONE, KILL_WAIT_S, STOP
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.files import file_text
 
 SUPERVISOR = Path(supervisor.__file__)
-ENDING_S = supervisor.ENDING_S + AFTERWARDS_S + 5.0  # for the supervisor to end the program, and a container
+ENDING_S = supervisor.ENDING_S + KILL_WAIT_S + 5.0  # for the supervisor to end the program, and a container
 KEPT_CHARACTERS = 100_000  # of each stream, from its end: still readable
 GRACE_S = 5.0  # between asking a program to stop and killing it
-MOST_WAIT_S = 0.2  # between two polls of a program; the first polls are faster
+MAX_WAIT_S = 0.2  # between two polls of a program; the first polls are faster
 CGROUPS = Path("/sys/fs/cgroup")
 # Where docker's drivers (systemd, cgroupfs) store a container's peak, for both cgroup versions.
 PEAK_FILES = (
@@ -52,7 +52,7 @@ class Finished:
     stderr: str
 
 
-class Watch:
+class MemoryMonitor:
     """The peak memory of a program; ``look`` is called repeatedly while it runs.
 
     That of a process and all its descendants, where shared pages count once for each; or, if docker
@@ -71,7 +71,7 @@ class Watch:
     def look(self) -> None:
         """Record the current memory."""
         if self._id_file is not None:
-            self._look_at_container(self._id_file)
+            self._check_container(self._id_file)
             return
         import psutil
 
@@ -85,7 +85,7 @@ class Watch:
                     peak = max(peak, _own_peak_bytes(process.pid))
             self.peak_bytes = max(peak, together) or None
 
-    def _look_at_container(self, id_file: Path) -> None:
+    def _check_container(self, id_file: Path) -> None:
         identity = file_text(id_file).strip() if id_file.is_file() else ""
         for pattern in PEAK_FILES if identity.isalnum() else ():
             with suppress(OSError, ValueError):
@@ -243,7 +243,7 @@ def run_program(
         tails = [_Tail(stream) for stream in program.streams]
         for tail in tails:
             tail.start()
-        watch = Watch(program.pid, id_file)
+        watch = MemoryMonitor(program.pid, id_file)
         is_timed_out = False
         try:
             is_timed_out = not _ends_within(program, watch, start, timeout_s)
@@ -259,12 +259,12 @@ def run_program(
     return Finished(exit_code, is_timed_out, wall_s, watch.peak_bytes, watch.source, stdout, stderr)
 
 
-def _ends_within(program: _Supervised, watch: Watch, start: float, limit_s: float) -> bool:
+def _ends_within(program: _Supervised, watch: MemoryMonitor, start: float, limit_s: float) -> bool:
     wait_s = 0.0
     while not program.has_ended(wait_s):
         watch.look()
         elapsed_s = time.perf_counter() - start
         if elapsed_s >= limit_s:
             return False
-        wait_s = min(0.01 + elapsed_s / 20, MOST_WAIT_S, limit_s - elapsed_s)
+        wait_s = min(0.01 + elapsed_s / 20, MAX_WAIT_S, limit_s - elapsed_s)
     return True

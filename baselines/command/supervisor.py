@@ -26,7 +26,7 @@ from typing import Any
 
 STOP, DONE = b"S", b"D"  # ask the program to stop; kill it, the parent process removes its folders
 ENDING_S = 5.0  # for killed processes to disappear; those blocked on a dead disk stay
-AFTERWARDS_S = 60.0  # for `docker kill`
+KILL_WAIT_S = 60.0  # for `docker kill`
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 
 
@@ -170,7 +170,7 @@ def _run_afterwards(order: dict[str, Any]) -> None:
                 env=order["environment"],
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
-                timeout=AFTERWARDS_S,
+                timeout=KILL_WAIT_S,
                 check=False,
             )
 

@@ -20,7 +20,7 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, 
 
 Place = Literal["memory", "disk"]
 HalfArray = NDArray[np.float16]
-MOST_LENGTH = 1e30  # minimal confidences are rounded up by a fifth at every image: prevents overflow
+MAX_LENGTH = 1e30  # minimal confidences are rounded up by a fifth at every image: prevents overflow
 BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 
 
@@ -111,7 +111,7 @@ class FeatureTable:
         source = np.full(self._n, -1, np.int64)
         source[point] = row
         if not is_first:
-            lengths = np.minimum(lengths * np.where(source < 0, rounded / held, 1.0), MOST_LENGTH)
+            lengths = np.minimum(lengths * np.where(source < 0, rounded / held, 1.0), MAX_LENGTH)
         changed = np.arange(self._n) if is_first else np.sort(point)
         for start in range(0, len(changed), BLOCK_ROWS):
             chosen = changed[start : start + BLOCK_ROWS]
@@ -167,7 +167,7 @@ def with_room(array: NDArray[Any], used: int, needed: int) -> NDArray[Any]:
     return larger
 
 
-LEAST_ALPHA, MOST_ALPHA = 1e-7, 1.01  # get_alpha
+MIN_ALPHA, MAX_ALPHA = 1e-7, 1.01  # get_alpha
 ABSENT = -1
 
 
@@ -197,7 +197,7 @@ def alpha(points_camera: Float64Array, sigma: float) -> Float64Array:
     [1.0, 0.6065307, 1e-07]
     """
     squared = (points_camera**2).sum(axis=-1)
-    clamped: Float64Array = np.clip(np.exp(-squared / (2 * sigma**2)), LEAST_ALPHA, MOST_ALPHA)
+    clamped: Float64Array = np.clip(np.exp(-squared / (2 * sigma**2)), MIN_ALPHA, MAX_ALPHA)
     return clamped
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.clusters import ABSENT, slot_of
 
-MOST_CORNERS = 16  # a rectangle cut by six planes has at most ten
+MAX_CORNERS = 16  # a rectangle cut by six planes has at most ten
 COINCIDENT_M = 1e-9
 
 
@@ -48,7 +48,7 @@ def _flux(centre, rotation, half, other_half, origin, skip_coincident):  # type:
     have the same normal, which would otherwise count for both boxes.
     """
     total = 0.0
-    polygon, result = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
+    polygon, result = np.empty((MAX_CORNERS, 3)), np.empty((MAX_CORNERS, 3))
     for face in range(6):
         axis, side = face // 2, 2 * (face % 2) - 1
         normal = rotation[:, axis] * side

@@ -17,8 +17,8 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances, Masks, starts_of
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Frame, Int64Array
 
-LEAST_SIDE_M = 0.02  # thinner boxes are extended to it before intersection
-LEAST_IOU = 1e-6
+MIN_SIDE_M = 0.02  # thinner boxes are extended to it before intersection
+MIN_IOU = 1e-6
 NEW_OBJECT = -1
 
 
@@ -28,8 +28,8 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
     If PyTorch3D rejects a box of the frame or the map as not planar enough, the IoU of axis-aligned extents
     is used for all pairs, as in the original after PyTorch3D's error.
     """
-    of_detections = steps.grown([item.box for item in detections], LEAST_SIDE_M)
-    of_objects = steps.grown([item.box for item in objects], LEAST_SIDE_M)
+    of_detections = steps.grown([item.box for item in detections], MIN_SIDE_M)
+    of_objects = steps.grown([item.box for item in objects], MIN_SIDE_M)
     if steps.are_coplanar([*of_detections, *of_objects]):
         return steps.oriented_iou(of_detections, of_objects)
     return steps.axis_aligned_iou(
@@ -41,7 +41,7 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
 def overlap_similarity(detections: Sequence[MapObject], objects: Sequence[MapObject], voxel_m: float) -> Float64Array:
     """The share (M, N) of each detection's points nearer than ``voxel_m`` to the object; 0 for disjoint boxes."""
     similarity = np.zeros((len(detections), len(objects)))
-    for i, j in np.argwhere(box_iou(detections, objects) >= LEAST_IOU):
+    for i, j in np.argwhere(box_iou(detections, objects) >= MIN_IOU):
         similarity[i, j] = objects[j].share_near(detections[i].points, voxel_m)
     return similarity
 

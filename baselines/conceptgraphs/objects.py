@@ -84,8 +84,8 @@ class MappingConfig(BaseModel):
         return f"the original has no scores: each object's {what[self.instance_score]}"
 
 
-LEAST_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud is kept
-LEAST_FOR_ORIENTED_BOX = 4  # points that span a volume
+MIN_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud is kept
+MIN_FOR_ORIENTED_BOX = 4  # points that span a volume
 
 
 def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
@@ -116,7 +116,7 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
     """
     labels = density_clusters(points, eps_m, min_points)
     distinct, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
-    if not len(distinct) or sizes.max() < LEAST_CLUSTER:
+    if not len(distinct) or sizes.max() < MIN_CLUSTER:
         return points
     largest = np.flatnonzero(sizes == sizes.max())
     is_inside: BoolArray = labels == distinct[largest[np.argmin(first[largest])]]
@@ -125,7 +125,7 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
 
 def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
     """The box around ``points``: along the principal axes of their convex hull, otherwise along the world's axes."""
-    if oriented and len(points) >= LEAST_FOR_ORIENTED_BOX:
+    if oriented and len(points) >= MIN_FOR_ORIENTED_BOX:
         import open3d as o3d
 
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -231,11 +231,11 @@ def _arrays(boxes: Sequence[OrientedBox]) -> tuple[Float64Array, Float64Array, F
     return centres, halves, rotations
 
 
-LEAST_MASK_AREA = 10  # pixels, regardless of the configuration
-LEAST_POINTS = 5  # likewise
-LEAST_VOLUME = 1e-6  # m^3 of the box of a detection
-MOST_OF_CONTAINER = 0.7  # th2: a box covering more of the other is not part of it
-LEAST_OF_CONTAINED = 0.8  # th1
+MIN_MASK_AREA = 10  # pixels, regardless of the configuration
+MIN_POINTS = 5  # likewise
+MIN_VOLUME = 1e-6  # m^3 of the box of a detection
+MAX_CONTAINER_SHARE = 0.7  # th2: a box covering more of the other is not part of it
+MIN_CONTAINED_SHARE = 0.8  # th1
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def kept_regions(detections: Detections, is_background: BoolArray, config: Mappi
     box_areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     is_published = detections.score_scale == "published"
     least_score = np.float32(config.mask_conf_threshold if is_published else config.own_scale_conf_threshold)
-    is_kept = detections.masks.sum(axis=(1, 2)) >= max(config.mask_area_threshold, LEAST_MASK_AREA)
+    is_kept = detections.masks.sum(axis=(1, 2)) >= max(config.mask_area_threshold, MIN_MASK_AREA)
     is_kept &= is_background | (box_areas <= config.max_bbox_area_ratio * image_area)
     is_kept &= detections.scores >= least_score
     return np.flatnonzero(is_kept)
@@ -276,7 +276,7 @@ def subtract_contained(boxes: Float32Array, masks: BoolArray) -> BoolArray:
     with np.errstate(invalid="ignore", divide="ignore"):  # a box without area neither contains nor is contained
         share = shared / areas[:, None]
     result = masks.copy()
-    for i, j in np.argwhere((share < MOST_OF_CONTAINER) & (share.T > LEAST_OF_CONTAINED)):
+    for i, j in np.argwhere((share < MAX_CONTAINER_SHARE) & (share.T > MIN_CONTAINED_SHARE)):
         result[i] &= ~result[j]
     return result
 
@@ -294,13 +294,13 @@ def lift(
     to_world = frame.camera_to_world[:3, :3]
     for detection, mask in zip(rows, masks, strict=True):
         cloud = points[row_of_pixel[np.flatnonzero(mask & has_depth)]]
-        if len(cloud) < max(config.min_points_threshold, LEAST_POINTS):
+        if len(cloud) < max(config.min_points_threshold, MIN_POINTS):
             continue
         if config.noise_m > 0:
             cloud = cloud + noise.normal(0.0, config.noise_m, cloud.shape) @ to_world.T
         cloud = cleaned(cloud, config)
         box = box_of(cloud, config)
-        if box.sizes.prod() >= LEAST_VOLUME:
+        if box.sizes.prod() >= MIN_VOLUME:
             yield LiftedRegion(int(detection), cloud, box)
 
 
@@ -317,7 +317,7 @@ def box_of(points: Float64Array, config: MappingConfig) -> OrientedBox:
     return bounding_box(points, oriented=config.spatial_sim_type == "overlap")
 
 
-LEAST_AFTER_DENOISING = 4  # points; with fewer the object is unchanged
+MIN_AFTER_DENOISING = 4  # points; with fewer the object is unchanged
 
 
 @dataclass(frozen=True)
@@ -400,7 +400,7 @@ def merged(into: MapObject, other: MapObject, config: MappingConfig, *, with_dbs
 def denoised(item: MapObject, config: MappingConfig) -> MapObject:
     """``item`` averaged by voxel and reduced to its largest cluster."""
     points = cleaned(item.points, config)
-    if len(points) < LEAST_AFTER_DENOISING:
+    if len(points) < MIN_AFTER_DENOISING:
         return item
     return replace(item, points=points, box=box_of(points, config))
 

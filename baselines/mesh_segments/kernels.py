@@ -191,16 +191,16 @@ def _heap_sort(weights, edges, first, last):  # type: ignore[no-untyped-def]
     n = last - first
     for parent in range((n - 2) // 2, -1, -1):
         at = first + parent
-        _sift(weights, edges, first, parent, n, weights[at], edges[at, 0], edges[at, 1])
+        _sift_down(weights, edges, first, parent, n, weights[at], edges[at, 0], edges[at, 1])
     for end in range(n - 1, 0, -1):
         at = first + end
         weight, a, b = weights[at], edges[at, 0], edges[at, 1]
         weights[at], edges[at, 0], edges[at, 1] = weights[first], edges[first, 0], edges[first, 1]
-        _sift(weights, edges, first, 0, end, weight, a, b)
+        _sift_down(weights, edges, first, 0, end, weight, a, b)
 
 
 @njit(cache=True)
-def _sift(weights, edges, first, hole, n, weight, a, b):  # type: ignore[no-untyped-def]
+def _sift_down(weights, edges, first, hole, n, weight, a, b):  # type: ignore[no-untyped-def]
     """Moves the hole to a leaf along the larger children, then sifts its new content up, as GNU's __adjust_heap."""
     top, child = hole, hole
     while child < (n - 1) // 2:

@@ -269,7 +269,7 @@ class OpenMask3D:
             frame = self._frame_again(position)
             pixels = self._visible(frame)
             for mask in np.flatnonzero((self._views.positions == position).any(axis=1)).tolist():
-                features = self._look(mask, frame, pixels)
+                features = self._view_features(mask, frame, pixels)
                 sums[mask] += features.astype(np.float64).sum(axis=0)
                 n_crops[mask] += len(features)
                 n_views += len(features) > 0
@@ -295,7 +295,7 @@ class OpenMask3D:
             )
         return frame
 
-    def _look(self, mask: int, frame: Frame, visible: np.ndarray) -> Float32Array:
+    def _view_features(self, mask: int, frame: Frame, visible: np.ndarray) -> Float32Array:
         """The features of the crops of one view of ``mask``; none if its prompts find nothing."""
         config, regions = self.config, self._tools.regions
         pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
@@ -331,10 +331,10 @@ class OpenMask3DSegment3DConfig(OpenMask3DConfig):
 
     part_eps_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05  # general.dbscan_eps
     part_min_points: int = Field(default=5, ge=1)  # general.dbscan_min_points
-    part_most_dropped: int = Field(default=15, ge=0)
+    part_max_dropped: int = Field(default=15, ge=0)
     part_kept_share: Annotated[float, Field(gt=0, le=1)] = 0.8  # general.topk_per_image
-    surface_most: int = Field(default=400, ge=1, le=100_000)  # queries of the evaluation script
-    surface_min_points: int = Field(default=16, ge=1)  # more than part_most_dropped
+    surface_max: int = Field(default=400, ge=1, le=100_000)  # queries of the evaluation script
+    surface_min_points: int = Field(default=16, ge=1)  # more than part_max_dropped
     # SAM splits objects into parts and parts of parts; so more nested proposals are kept.
     surface_same_iou: Annotated[float, Field(gt=0, le=1)] = 0.8
 

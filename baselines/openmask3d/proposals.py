@@ -167,7 +167,7 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
 # Surface area (square metres) above which size no longer counts for a part. Chosen on rooms/living0 and rooms/office0.
 FULL_AREA_M2 = 0.5
-LEAST_BORDER = 0.2  # added to the relative border length, which is 0 for an isolated part
+MIN_BORDER = 0.2  # added to the relative border length, which is 0 for an isolated part
 LONE_BEND = 0.3  # border bend of an isolated part
 
 
@@ -202,14 +202,14 @@ def contrast(tree: SegmentTree) -> Float64Array:
     mean_bend = np.where(tree.n_contacts > 0, tree.bend / np.maximum(tree.n_contacts, 1), LONE_BEND)
     border = tree.n_contacts / np.sqrt(tree.n_patches)
     size = np.minimum(1.0, np.sqrt(tree.n_patches * tree.patch_m**2 / FULL_AREA_M2))
-    result: Float64Array = mean_bend * size / (border + LEAST_BORDER)
+    result: Float64Array = mean_bend * size / (border + MIN_BORDER)
     return result
 
 
 def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, config: ProposalConfig) -> Int64Array:
     """The nodes that become masks, best first, ties in order; ``n_points`` (S,) of the segments.
 
-    At most ``surface_most``, of ``surface_min_points`` vertices up to ``surface_max_share`` of all; of two nested ones
+    At most ``surface_max``, of ``surface_min_points`` vertices up to ``surface_max_share`` of all; of two nested ones
     whose IoU exceeds ``surface_same_iou`` only the better one is kept.
     """
     before = np.concatenate([[0], np.cumsum(n_points[tree.leaves])])
@@ -217,7 +217,7 @@ def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, 
     fits = (n_of_node >= config.surface_min_points) & (n_of_node <= config.surface_max_share * before[-1])
     taken = np.zeros(0, np.int64)
     for node in np.argsort(-scores, kind="stable"):
-        if len(taken) == config.surface_most:
+        if len(taken) == config.surface_max:
             break
         smaller, larger = np.minimum(n_of_node[taken], n_of_node[node]), np.maximum(n_of_node[taken], n_of_node[node])
         is_same = is_within(tree, taken, int(node)) & (smaller > config.surface_same_iou * larger)
@@ -248,11 +248,11 @@ class ProposalConfig(BaseModel):
     split_parts: Literal["surface", "always", "never"] = "surface"
     part_eps_m: Metres = 0.95  # general.dbscan_eps
     part_min_points: int = Field(default=1, ge=1)  # general.dbscan_min_points
-    part_most_dropped: int = Field(default=0, ge=0)
+    part_max_dropped: int = Field(default=0, ge=0)
     part_kept_share: Share = 1.0
     segment_vote: bool = True  # data.test.segments: off in the original's single-scene run
     # Ours, for proposals from the surface: as many as Mask3D has queries; at least what the evaluator counts.
-    surface_most: int = Field(default=150, ge=1, le=100_000)
+    surface_max: int = Field(default=150, ge=1, le=100_000)
     surface_min_points: int = Field(default=100, ge=1)
     surface_max_share: Share = 0.25
     surface_same_iou: Share = 0.5
@@ -295,7 +295,7 @@ def _segments(surface: Surface, config: ProposalConfig) -> Int64Array:
 
 def _in_parts(proposals: Proposals, segments: Int64Array, config: ProposalConfig) -> Proposals:
     parts = split_into_parts(
-        proposals, config.part_eps_m, config.part_min_points, config.part_most_dropped, config.part_kept_share
+        proposals, config.part_eps_m, config.part_min_points, config.part_max_dropped, config.part_kept_share
     )
     return voted_by_segments(parts, segments) if config.segment_vote else parts
 

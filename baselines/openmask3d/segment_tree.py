@@ -15,11 +15,11 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
-LEAST_PATCH_M = 0.02  # side of the cubes, unless the mesh's edges are longer
+MIN_PATCH_M = 0.02  # side of the cubes, unless the mesh's edges are longer
 FLAT_BEND = 0.01  # bend of a flat contact, so that flat borders still count by their length
 CONVEX_SHARE = 0.5  # convex edges are more often inside an object than at its border: their bend is squared and halved
 # Added to the mean bend and subtracted from the share, so that no factor of a cost is 0.
-LEAST_BEND, LEAST_OPEN = 0.02, 0.01
+MIN_BEND, MIN_OPEN = 0.02, 0.01
 NO_PARENT = -1
 Border = dict[int, tuple[int, float]]  # region -> number of contacts with it, and their summed bend
 
@@ -92,9 +92,9 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
 def _patch_size_m(vertices: Float32Array, triangles: Int32Array) -> float:
     """The median edge length, so that neighbours are in touching cubes; decimated scans have at least 3 cm."""
     if not len(triangles):
-        return LEAST_PATCH_M
+        return MIN_PATCH_M
     edges = vertices[triangles].astype(np.float64)
-    return max(LEAST_PATCH_M, float(np.median(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))))
+    return max(MIN_PATCH_M, float(np.median(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))))
 
 
 def _cells(vertices: Float32Array, n_segments: int, patch_m: float) -> tuple[Int64Array, tuple[int, int, int]]:
@@ -144,7 +144,7 @@ def merge_cost(bend: float, n: int, n_smaller_border: int, n_patches: int) -> fl
     >>> round(merge_cost(bend=5.0, n=10, n_smaller_border=40, n_patches=100), 4)  # (0.5 + 0.02) * (1.01 - 0.25) * 10
     3.952
     """
-    return float((bend / n + LEAST_BEND) * (1 + LEAST_OPEN - n / n_smaller_border) * n_patches**0.5)
+    return float((bend / n + MIN_BEND) * (1 + MIN_OPEN - n / n_smaller_border) * n_patches**0.5)
 
 
 def merge_tree(contacts: Contacts) -> SegmentTree:

@@ -37,25 +37,25 @@ from su3d_bench.runs.finished import read_run, read_update_times
 PAGE, NOTES = ROOT / "docs/running/performance.md", BENCHMARKS / "measured.md"
 PICTURE = ROOT / "docs/pictures/update-cost.png"
 MACHINE = """Written by `make bench` on one machine: {hardware}.
-Times are medians; only the ratios within a table apply to other machines. No check fails because a machine was slow.
+Times are medians; between machines, compare only ratios within a table. No check fails because a machine is slow.
 """
 PAGE_HEAD = f"# Performance\n\n{MACHINE}"
 NOTES_HEAD = f"""# What was measured
 
-{MACHINE}[The results](../docs/running/performance.md) are based on these tables.
+{MACHINE}Summary: [Performance](../docs/running/performance.md).
 """
 MARKS_TITLE = "## Marks"
 MISSED_TITLE = "## What misses its mark, and why"
 ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
-`make bench-methods`: cameras moving along corridors of the given lengths, perfect masks, every frame an update. The map
-of OpenMask3D is the scan, complete from the first frame: it runs on the first metres of several corridors. Milliseconds
-are medians, without reading and perception, of the tenth of the updates with the smallest maps and of the tenth with
-the largest. The exponent is a log-log fit against the points of the method's map, with its 95 % interval; the same
-applies to the stages that grow and take at least a twentieth of that time.
+`make bench-methods`: corridors of the given lengths, perfect masks, one update per frame. OpenMask3D's map is the
+complete scan from the first frame on, so it uses the first metres of several corridors. Milliseconds are medians
+without reading and perception, over the tenth of the updates with the smallest maps and the tenth with the largest.
+Exponents, with 95 % intervals, are those of log-log fits against the points of the method's map: of the total, and of
+stages that grow and take at least 1/20 of that time.
 """
-LEAST_SHARE = 0.05  # minimum share of the time (without reading and perception) to list a stage
+MIN_SHARE = 0.05  # minimum share of the time (without reading and perception) to list a stage
 
 
 def benchmark_sections(benchmarks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -116,7 +116,7 @@ def program_of(section: str) -> str | None:
 
 def rooms_section(run: Path) -> str:
     """Run time and memory of every method on a run's scenes."""
-    rows = [["method", "updates", "ms an update", "map update", "finish, s", "whole scene, s", "peak memory, MiB"]]
+    rows = [["method", "updates", "ms per update", "map update", "finish, s", "whole scene, s", "peak memory, MiB"]]
     for times in _times(run):
         summary = summarise(times)
         total_s = [one.ms(TOTAL).sum() / 1e3 + one.maps[-1].finish_ms / 1e3 for one in times]
@@ -132,7 +132,7 @@ def rooms_section(run: Path) -> str:
         )
     scenes = ", ".join(read_run(run).scenes)
     text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes side by side. "
-    text += "Medians over updates; the slowest `finish`; memory is that of the process."
+    text += "Medians over updates, slowest `finish`, memory of the process."
     return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
 
 
@@ -178,7 +178,7 @@ def _growth(growth: Growth | None) -> tuple[str, str]:
 
 
 def _growing_stages(summary: MethodSummary) -> str:
-    least = LEAST_SHARE * _stage(summary, MAP).share
+    least = MIN_SHARE * _stage(summary, MAP).share
     mine = [one for one in summary.stages if one.name not in (*NOT_MAP, MAP, TOTAL) and one.share >= least]
     grown = [(one.name, one.against_points) for one in mine if one.against_points is not None]
     return ", ".join(f"{name} {growth.exponent:.2f}" for name, growth in grown if growth.words == "grows")

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
+from su3d_bench.human_eval.answers import krippendorff_alphas
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts, resampled_ap
 from su3d_bench.metrics.questions import score as asking
@@ -29,7 +30,7 @@ from su3d_bench.metrics.questions.score import ShareCounts, share_counts
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, resampled_semantic
 from su3d_bench.numerics.statistics import (
     DIFFERENCE,
-    LEAST_ITEMS,
+    MIN_ITEMS,
     SHARE,
     jackknife_interval,
     leave_one_out,
@@ -39,11 +40,10 @@ from su3d_bench.numerics.statistics import (
     t_quantile,
 )
 from su3d_bench.reports.tables.formats import aligned
-from su3d_bench.sheets.answers import krippendorff_alphas
 
 BEGIN, END = "<!-- coverage: written by benchmarks/numbers/coverage_of_intervals.py -->", "<!-- end of coverage -->"
-LOW, HIGH, LEAST = 93.0, 97.0, 90.0  # per cent: target range, and the minimum to show an interval
-N_BOOTSTRAP, N_RESAMPLES, MOST_BOOTSTRAP = 500, 400, 20  # simulations, resamples, and maximum scenes for the bootstrap
+LOW, HIGH, MIN_COVERAGE = 93.0, 97.0, 90.0  # per cent: target range, and the minimum to show an interval
+N_BOOTSTRAP, N_RESAMPLES, MAX_BOOTSTRAP = 500, 400, 20  # simulations, resamples, and maximum scenes for the bootstrap
 N_TRUTH = 20_000  # scenes that represent the population
 THRESHOLDS = (0.5, 0.75, 0.25)
 QUALITY = np.array([0.5, -0.6, 1.3])  # added to an instance's quality, which decides at each threshold
@@ -247,7 +247,7 @@ def simulate(world: Any, truth: Mapping[str, float], n_scenes: int, n_simulation
         methods = world.draw(rng, n_scenes)
         values = [world.values(counts, weights) for counts in methods]
         resampled: list[Values] = []
-        if simulation < N_BOOTSTRAP and n_scenes <= MOST_BOOTSTRAP:
+        if simulation < N_BOOTSTRAP and n_scenes <= MAX_BOOTSTRAP:
             drawn = rng.multinomial(n_scenes, np.full(n_scenes, 1.0 / n_scenes), size=N_RESAMPLES)
             resampled = [world.values(counts, drawn) for counts in methods]
         for name in world.names:
@@ -271,26 +271,26 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     names = sorted(table, key=lambda name: name.endswith("difference"))
     yield from aligned(
         [
-            ["coverage of 95 % intervals, per cent", *(f"{n} scenes" for n in sizes)],
+            ["coverage, %", *(f"{n} scenes" for n in sizes)],
             *([name, *(_marked(table[name][n].per_cent(JACKKNIFE)) for n in sizes)] for name in names),
         ]
     )
-    yield f"\n{n_simulations} simulations per cell (a standard error of {100 * (0.0475 / n_simulations) ** 0.5:.1f})."
+    yield f"\n{n_simulations} simulations per cell (standard error {100 * (0.0475 / n_simulations) ** 0.5:.1f})."
     missed = {name: [n for n in sizes if _is_missed(table[name][n].per_cent(JACKKNIFE))] for name in names}
     yield "In italics: outside 93 to 97." if any(missed.values()) else "All are within 93 to 97."
     for name, of_sizes in missed.items():
         if of_sizes:
             reason = REASONS[name.removesuffix(", difference")]
             yield f"\n- {name} at {', '.join(map(str, of_sizes))} scenes: {reason}."
-    refused = [(n, n_) for n, of in table.items() for n_ in sizes if (of[n_].per_cent(JACKKNIFE) or 0) < LEAST]
+    refused = [(n, n_) for n, of in table.items() for n_ in sizes if (of[n_].per_cent(JACKKNIFE) or 0) < MIN_COVERAGE]
     where = ", ".join(f"{name} at {n} scenes" for name, n in refused)
     yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90: an interval is shown from 2 scenes on.\n")
     yield "The same benchmarks with the two rejected intervals:\n"
-    few = [n for n in sizes if n <= MOST_BOOTSTRAP]
+    few = [n for n in sizes if n <= MAX_BOOTSTRAP]
     yield from aligned(
         [
-            ["", *(f"{kind}, {n}" for kind in (BOOTSTRAP, PSEUDO) for n in few)],
-            *([name, *(_cell(table[name][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few)] for name in names),
+            ["", *(f"{kind}, {n}" for kind in (BOOTSTRAP, PSEUDO) for n in few[2::2])],  # 4 and 20 of the default sizes
+            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in names),
         ]
     )
     yield f"\nThe bootstrap: {N_RESAMPLES} resamples, {min(N_BOOTSTRAP, n_simulations)} simulations per cell.\n"
@@ -318,12 +318,12 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     rows = [[f"share of {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
     for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
-    yield from aligned([["coverage of 95 % intervals, per cent", *(f"{n} items" for n in ITEMS)], *rows])
+    yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
         "\nShares miss the target, in italics, because counts are integers: coverage oscillates with rate and "
         "number (Brown, Cai and DasGupta); changes and agreement because few items are skewed. With fewer than "
-        f"{LEAST_ITEMS} items these two have no interval: at 5 coverage is {few[0]} and {few[1]} per cent."
+        f"{MIN_ITEMS} items these two have no interval: at 5 coverage is {few[0]} and {few[1]} per cent."
     )
 
 

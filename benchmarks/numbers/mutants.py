@@ -1,13 +1,13 @@
 """Mutation testing of metrics, statistics, comparison and regression check: do the module's tests notice a fault?
 
     python benchmarks mutants --mutants 600
-    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate.py
+    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/regression_check.py
 
 Every place in a module where one operator, constant, condition or statement can be replaced is a mutant; a sample of
 them is drawn by ``--seed``. Each is written into a copy of the files tracked by git, and the module's tests are run
 there until one fails. A mutant that passes all tests survives. ``mutants.toml`` next to this file explains
 survivors that no test can or need kill; the exit status is 1 if a survivor has no explanation, or if more than
-``MOST_SURVIVE`` survive. Uncommitted changes of tracked files count.
+``MAX_SURVIVE`` survive. Uncommitted changes of tracked files count.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from planted_faults import Mutant, mutants_of, planted
 
 REASONS = Path(__file__).with_suffix(".toml")
 PACKAGE = "su3d_bench"
-MOST_SURVIVE = 0.05
+MAX_SURVIVE = 0.05
 LONGEST = 10.0  # times the normal duration of the module's tests: longer is an infinite loop, which is noticed
-LEAST_S = 60.0
+MIN_S = 60.0
 
 _EVERY = ("test_every_protocol", "test_counts")
 _CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
@@ -49,7 +49,7 @@ _QUESTIONS = (
 )  # fmt: skip
 _PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
 _COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_pairs", ""))
-_GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("", "_costs"))
+_GATE = tuple(f"analysis/regression_check/test_regression_check{name}" for name in ("", "_costs"))
 # For each module, or all in a folder, the tests that must notice: the fast ones first. Names without a folder are
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
@@ -59,7 +59,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points", *_EVERY),
     "metrics/semantic/top_k.py": ("test_metrics_scannetpp", *_EVERY),
     "metrics/relations.py": ("test_relation_protocol", *_EVERY),
-    "metrics/matching/nearest.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
+    "metrics/matching/nearest.py": ("analysis/test_rule_attribution", "analysis/test_rule_attribution_pairs"),
     "metrics/protocols/loading.py": ("test_originals",),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg", "opensu3d/test_device_results"),
@@ -69,7 +69,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/questions/": _QUESTIONS,
     "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
     "metrics/costs.py": ("reports/test_timing_report",),
-    "metrics/fitness.py": (*_PROTOCOLS, "evaluation/test_labels_counted"),
+    "metrics/compatibility.py": (*_PROTOCOLS, "evaluation/test_labels_counted"),
     "metrics/protocols/": _PROTOCOLS,
     "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
     "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
@@ -78,8 +78,8 @@ GUARDS: dict[str, tuple[str, ...]] = {
     ),
     "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
-    "analysis/gate.py": _GATE,
-    "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
+    "analysis/regression_check.py": _GATE,
+    "runs/verify.py": ("analysis/regression_check/test_regression_check", "analysis/test_leaderboard"),
 }  # fmt: skip
 
 
@@ -183,7 +183,7 @@ def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Itera
         begin = time.monotonic()
         if not first.passes(tests, 3600.0):
             raise RuntimeError(f"these fail without a fault: {' '.join(tests)}")
-        limits[tests] = max(LEAST_S, LONGEST * (time.monotonic() - begin))
+        limits[tests] = max(MIN_S, LONGEST * (time.monotonic() - begin))
     copies.put(first)
 
     def judge(mutant: Mutant) -> Verdict:
@@ -250,7 +250,7 @@ def report(verdicts: Sequence[Verdict], arguments: argparse.Namespace) -> int:
     survivors = [verdict.mutant for verdict in verdicts if verdict.outcome == "survived"]
     unexplained = [mutant for mutant in survivors if mutant.key not in reasons]
     share = len(survivors) / max(1, len(verdicts))
-    print(f"\n{len(survivors)} of {len(verdicts)} survived ({100 * share:.1f} %; {100 * MOST_SURVIVE:g} % may)")
+    print(f"\n{len(survivors)} of {len(verdicts)} survived ({100 * share:.1f} %; {100 * MAX_SURVIVE:g} % may)")
     for mutant in survivors:
         print(f"  {mutant}\n      {reasons.get(mutant.key, 'NO REASON in benchmarks/numbers/mutants.toml')}")
     if arguments.json:
@@ -267,7 +267,7 @@ def report(verdicts: Sequence[Verdict], arguments: argparse.Namespace) -> int:
         ]
         columns = ("module", "mutants", "killed", "timed out", "survived")
         write_measured(arguments.json, "Planted faults", command, columns, rows, notes)
-    return int(bool(unexplained) or share > MOST_SURVIVE)
+    return int(bool(unexplained) or share > MAX_SURVIVE)
 
 
 if __name__ == "__main__":

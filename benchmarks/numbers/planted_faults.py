@@ -23,7 +23,7 @@ _NO_NUMBER = frozenset(
 )
 # Sizes of portions, or choices between equivalent algorithms: assignments with them are skipped.
 _PORTIONS = frozenset({
-    "AT_ONCE", "MANY_ROWS", "MOST_SHARED", "ROWS_AT_ONCE", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
+    "AT_ONCE", "MANY_ROWS", "MAX_SHARED", "ROWS_AT_ONCE", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
     "_MAX_NEIGHBOURS",
 })  # fmt: skip
 _LEFT_ALONE = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.Lambda)

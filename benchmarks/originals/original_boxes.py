@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_boxes import SLOTS, Problem, Scene, names_of, scored
 from original_code import STOPS, Ask, Original, load, silence
 from places import CASES
+from synthetic_boxes import SLOTS, Problem, Scene, names_of, scored
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance.boxes import PLACES, THRESHOLDS

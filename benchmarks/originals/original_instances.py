@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_instances import LEFT_OUT, SCORED, VOID, Problem, Scene, classes_of, columns_of, members, scored
 from original_code import STOPS, Ask, Original, load, of_python_3, recorded, silence, without_gpu
 from places import CASES
+from synthetic_instances import LEFT_OUT, SCORED, VOID, Problem, Scene, classes_of, columns_of, members, scored
 
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision
@@ -21,7 +21,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 
 SCANNET = "BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py"
 SHORT = (",", ":")
-MOST = 200  # classes in a list
+MAX_CLASSES = 200  # classes in a list
 Answer = Float64Array  # AP, AP50, AP25, then the AP of each slot at each threshold
 
 
@@ -169,7 +169,10 @@ def maskclustering(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if is_plain else ["--no_class"])]
     module = load(checkout / "evaluation/evaluate.py", [checkout], words)
     # for ScanNet++ it is quadratic in 1,554 classes, seconds per problem; classes in no problem are undefined
-    module.CLASS_LABELS, module.VALID_CLASS_IDS = module.CLASS_LABELS[:MOST], module.VALID_CLASS_IDS[:MOST]
+    module.CLASS_LABELS, module.VALID_CLASS_IDS = (
+        module.CLASS_LABELS[:MAX_CLASSES],
+        module.VALID_CLASS_IDS[:MAX_CLASSES],
+    )
     known = list(module.VALID_CLASS_IDS)
     ids = {VOID: 0, LEFT_OUT: 2, **{k: known[7 * k + 3] for k in SCORED}}  # 2 is not one of its classes
     rows = [known.index(ids[one]) for one in SCORED] if is_plain else [0]

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_objects import GROUPS, N_SLOTS, NONE, OVERALL, Problem, our_means, slots_of
 from original_code import STOPS, Ask, Original, load, silence, without_gpu
 from original_instances import emptied
 from original_points import SHORT, rewritten
+from synthetic_objects import GROUPS, N_SLOTS, NONE, OVERALL, Problem, our_means, slots_of
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules

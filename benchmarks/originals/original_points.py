@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_points import OTHER, VOID, Problem, classes_of, scored
 from original_code import STOPS, Ask, Original, load, of_python_3, recorded, silence, without_gpu
 from places import CASES
+from synthetic_points import OTHER, VOID, Problem, classes_of, scored
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-from made_queries import Problem, objects_of, scored
 from original_code import Ask, Original, load, of_python_3, recorded, silence
 from original_instances import SCANNET, emptied
 from places import CASES
+from synthetic_queries import Problem, objects_of, scored
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules

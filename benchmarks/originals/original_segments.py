@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_segments import (
+from original_code import STOPS, Ask, Original, load, silence
+from places import CASES
+from synthetic_segments import (
     LEFT_OUT,
     N_SCORED,
     N_THINGS,
@@ -20,8 +22,6 @@ from made_segments import (
     has_left_out,
     our_qualities,
 )
-from original_code import STOPS, Ask, Original, load, silence
-from places import CASES
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules

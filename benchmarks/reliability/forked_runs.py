@@ -45,12 +45,12 @@ EXECUTORS = {
     "processes": ("--jobs", "2"),
     "ray": ("--executor", "ray", "--jobs", "2"),
 }
-OF_A_PROGRAM = ("info: program: ", "info: the program took ")
+PROGRAM_FIELDS = ("info: program: ", "info: the program took ")
 TIMES = ("_ms", "rss_bytes")
 COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
 
-class Forked:
+class ForkedProcess:
     """The command line ``words``, executed in the folder ``at`` by a separate process group."""
 
     def __init__(self, words: Sequence[str], log: Path, at: Path | None = None) -> None:
@@ -58,9 +58,9 @@ class Forked:
         self.started = time.monotonic()
         self.pid = os.fork()
         if self.pid == 0:
-            self._be_the_command(list(words), at)
+            self._become_command(list(words), at)
 
-    def _be_the_command(self, words: list[str], at: Path | None) -> None:
+    def _become_command(self, words: list[str], at: Path | None) -> None:
         code = 4
         try:
             os.setsid()
@@ -89,11 +89,11 @@ class Forked:
         """Whether it has ended; its exit code remains available."""
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self._log.read_text(errors="replace")[-2000:]
 
 
-class Run(Forked):
+class Run(ForkedProcess):
     """A run into ``folder``, executed next to it."""
 
     def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
@@ -116,7 +116,7 @@ def program_of(ready: Path) -> str:
 def _timeless(path: Path) -> Any:
     content = path.read_bytes()
     if path.name == "log.txt":
-        return [line for line in content.decode().splitlines() if not line.startswith(OF_A_PROGRAM)]
+        return [line for line in content.decode().splitlines() if not line.startswith(PROGRAM_FIELDS)]
     if path.name == "updates.csv":
         rows = list(csv.DictReader(io.StringIO(content.decode())))
         return [{name: value for name, value in row.items() if not name.endswith(TIMES)} for row in rows]
@@ -141,8 +141,8 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
 
     wrong = []
     for done in folder.rglob("done.json"):
-        for seal in JobFolder(done.parent).seals().values():
-            files = {done.parent / name: sha for name, sha in seal.files.items()}
+        for mark_complete in JobFolder(done.parent).completion_records().values():
+            files = {done.parent / name: sha for name, sha in mark_complete.files.items()}
             if all(path.is_file() and digest_file(path) == sha for path, sha in files.items()):
                 names = [path.relative_to(folder).as_posix() for path in files]
                 wrong += [name for name in names if _timeless(folder / name) != expected.get(name)]

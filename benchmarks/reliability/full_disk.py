@@ -62,7 +62,7 @@ class Trials:
         os.environ["SU3D_CACHE"] = str(scratch / "whole-cache")
         whole = Run(scratch / "whole", REQUEST)
         if whole.finish() != COMPLETE:
-            raise SystemExit(f"the undisturbed run failed: {whole.said()}")
+            raise SystemExit(f"the undisturbed run failed: {whole.output()}")
         self._whole_s = time.monotonic() - whole.started
         self._expected = outcome(scratch / "whole")
         self._needs_kib = {"run": used_kib(scratch / "whole"), "cache": used_kib(scratch / "whole-cache")}
@@ -87,21 +87,21 @@ class Trials:
             remount(at, f"rw,{ENOUGH}")
             if code == COMPLETE:
                 return False, []
-            wrong = self._wrong_end(kind, folder, code, run.said())
+            wrong = self._wrong_end(kind, folder, code, run.output())
             again = Run(folder, REQUEST, self._scratch / f"log{number}")
             if again.finish() != COMPLETE:
-                return True, [*wrong, f"does not resume: {again.said()}"]
+                return True, [*wrong, f"does not resume: {again.output()}"]
             found = outcome(folder)
             names = [
                 name for name in found.keys() | self._expected.keys() if found.get(name) != self._expected.get(name)
             ]
             return True, [*wrong, *(f"{name} differs" for name in names)]
 
-    def _wrong_end(self, kind: str, folder: Path, code: int, said: str) -> list[str]:
+    def _wrong_end(self, kind: str, folder: Path, code: int, output: str) -> list[str]:
         wrong = [f"{name} is complete" for name in false_seals(folder, self._expected)] if folder.is_dir() else []
-        lines = [line for line in said.splitlines() if line.startswith("su3d-bench: ")]
-        if code != WRONG_INPUT or len(lines) != 1 or KINDS[kind] not in lines[0] or "Traceback" in said:
-            wrong.append(f"ended with {code}: {said}")
+        lines = [line for line in output.splitlines() if line.startswith("su3d-bench: ")]
+        if code != WRONG_INPUT or len(lines) != 1 or KINDS[kind] not in lines[0] or "Traceback" in output:
+            wrong.append(f"ended with {code}: {output}")
         return wrong
 
 

@@ -28,7 +28,7 @@ from typing import Any
 from folders import BENCHMARKS
 from measured import write_measured
 
-HANGS_S = 120.0  # silence of a process: far beyond the alarm of one input
+HANG_S = 120.0  # silence of a process: far beyond the alarm of one input
 STARTS_S = 300.0  # until the first output: imports and the sample
 
 
@@ -42,7 +42,7 @@ class Tally:
     faults: list[dict[str, Any]] = field(default_factory=list)
     slowest_s: float = 0.0
     slowest_index: int = -1
-    most_grown_bytes: int = 0
+    max_grown_bytes: int = 0
 
     @property
     def n_inputs(self) -> int:
@@ -57,16 +57,16 @@ class Tally:
             self.n_refused += 1
         if told["seconds"] > self.slowest_s:
             self.slowest_s, self.slowest_index = told["seconds"], told["index"]
-        self.most_grown_bytes = max(self.most_grown_bytes, told["grown_bytes"])
+        self.max_grown_bytes = max(self.max_grown_bytes, told["grown_bytes"])
 
 
 def work() -> None:
     """For each order on stdin, run a reader on damaged input and print one JSON line per input."""
     from damage import bounded_addresses
     from fuzz_targets import TARGETS
-    from fuzzing import MOST_ADDRESSES_BYTES, Sample
+    from fuzzing import MAX_ADDRESSES_BYTES, Sample
 
-    said, null = os.fdopen(os.dup(1), "w"), os.open(os.devnull, os.O_WRONLY)
+    output, null = os.fdopen(os.dup(1), "w"), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     sys.stderr = os.fdopen(os.dup(2), "w")
     os.dup2(null, 2)  # native libraries print errors there, one line per input
@@ -76,12 +76,12 @@ def work() -> None:
             os.chdir(folder)  # a reader that writes to the working folder does no harm
             os.environ["SU3D_DATA"] = folder
             sample = Sample(TARGETS[order["name"]], Path(folder, "sample").resolve())
-            with bounded_addresses(MOST_ADDRESSES_BYTES):
+            with bounded_addresses(MAX_ADDRESSES_BYTES):
                 sample.read()
                 for index in range(order["first"], order["end"]):
                     one = sample.input(order["seed"], index)
                     told = {"index": index, "file": one.file, **vars(sample.meet(one))}
-                    print(json.dumps(told), file=said, flush=True)
+                    print(json.dumps(told), file=output, flush=True)
             os.chdir("/")
 
 
@@ -111,7 +111,7 @@ class Worker:
         )
         for index in range(first, end):
             try:
-                line = self._lines.get(timeout=STARTS_S if index == first else HANGS_S)
+                line = self._lines.get(timeout=STARTS_S if index == first else HANG_S)
             except queue.Empty:
                 return
             if line is None:
@@ -126,9 +126,9 @@ class Worker:
             self._process.kill()
         code = self._process.wait()
         self._errors.seek(0)
-        said = self._errors.read()
+        output = self._errors.read()
         self._errors.close()
-        return code, said
+        return code, output
 
 
 class Crew:
@@ -158,10 +158,10 @@ class Crew:
 
     def _bury(self, tally: Tally, seed: int, index: int, save: Path, *, is_over: bool) -> None:
         assert self._worker is not None
-        code, said = self._worker.end()
+        code, output = self._worker.end()
         self._worker = None
         if not is_over:
-            reason = f"harness: {said[-500:]}" if "Traceback" in said else f"process died or hung, exit code {code}"
+            reason = f"harness: {output[-500:]}" if "Traceback" in output else f"process died or hung, exit code {code}"
             tally.faults.append({"index": index, "file": "", "fault": reason})
 
     def go_home(self) -> None:
@@ -213,7 +213,7 @@ def main() -> int:
         tallies.append(one := crew.meet(name, arguments.seed, arguments.first, end, arguments.save, ends))
         print(
             f"{name:34} {one.n_inputs:6} inputs, {one.n_read:6} read, {len(one.faults):3} faults, slowest "
-            f"{one.slowest_s * 1000:7.0f} ms, memory +{one.most_grown_bytes >> 20:4} MiB, "
+            f"{one.slowest_s * 1000:7.0f} ms, memory +{one.max_grown_bytes >> 20:4} MiB, "
             f"{time.monotonic() - before:6.1f} s",
             flush=True,
         )
@@ -226,12 +226,12 @@ def main() -> int:
 def _summed_up(tallies: list[Tally], arguments: argparse.Namespace, elapsed_s: float) -> int:
     n, n_faults = sum(one.n_inputs for one in tallies), sum(len(one.faults) for one in tallies)
     slowest = max(tallies, key=lambda one: one.slowest_s)
-    largest = max(tallies, key=lambda one: one.most_grown_bytes)
+    largest = max(tallies, key=lambda one: one.max_grown_bytes)
     summary = (
         f"{n} inputs for {len(tallies)} readers with seed {arguments.seed} in {elapsed_s / 60:.1f} min: "
         f"{sum(one.n_read for one in tallies)} read, {sum(one.n_refused for one in tallies)} refused, "
         f"{n_faults} faults; slowest {slowest.slowest_s:.2f} s ({slowest.name} {slowest.slowest_index}), "
-        f"largest memory growth +{largest.most_grown_bytes >> 20} MiB ({largest.name})"
+        f"largest memory growth +{largest.max_grown_bytes >> 20} MiB ({largest.name})"
     )
     print(summary)
     if arguments.json is not None:
@@ -239,7 +239,7 @@ def _summed_up(tallies: list[Tally], arguments: argparse.Namespace, elapsed_s: f
         rows = [
             (
                 *(one.name, str(one.n_inputs), str(one.n_read), str(one.n_refused), str(len(one.faults))),
-                *(f"{one.slowest_s:.2f} s", f"+{one.most_grown_bytes >> 20} MiB"),
+                *(f"{one.slowest_s:.2f} s", f"+{one.max_grown_bytes >> 20} MiB"),
             )
             for one in tallies
         ]

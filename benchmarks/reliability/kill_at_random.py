@@ -45,7 +45,7 @@ from forked_runs import (
     outcome,
     program_of,
 )
-from killed_verbs import VERBS, load_verbs, try_verbs
+from killed_commands import VERBS, load_verbs, try_verbs
 from killing import SIGNALS, Tally, check_end, clear_leftovers, cut_power, end_of, end_orphans, kill, workers_below
 from measured import write_measured
 
@@ -86,8 +86,8 @@ class Cluster:
         words = [sys.executable, "-c", self.CODE]
         self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
-        said = iter(self._process.stdout.readline, "")
-        self.address = next(line.strip() for line in said if line.startswith("127.") or line[:1].isdigit())
+        output = iter(self._process.stdout.readline, "")
+        self.address = next(line.strip() for line in output if line.startswith("127.") or line[:1].isdigit())
         self.pid = self._process.pid
 
     def processes(self) -> list[int]:
@@ -119,7 +119,7 @@ class Trial:
         whole = scratch / "whole"
         run = Run(whole, self._request)
         if run.finish() != COMPLETE:
-            raise SystemExit(f"the undisturbed run failed: {run.said()}")
+            raise SystemExit(f"the undisturbed run failed: {run.output()}")
         shutil.rmtree(self._cache, ignore_errors=True)
         run = Run(scratch / "timed", self._request)
         run.finish()
@@ -134,7 +134,7 @@ class Trial:
         """A map for the program to write."""
         run = Run(self._scratch / "light", (*SUBJECTS["light"], *EXECUTORS["inline"]))
         if run.finish() != COMPLETE:
-            raise SystemExit(f"the run before those of a program failed: {run.said()}")
+            raise SystemExit(f"the run before those of a program failed: {run.output()}")
         return self._scratch / "light/scenes/painted.a/collector/prediction.npz"
 
     def kills(self, n: int) -> None:
@@ -148,7 +148,7 @@ class Trial:
             while of_episode == 0 or (struck < n and self._moments.random() < 0.5):
                 of_episode += 1
                 struck += self._kill_one(folder)
-            self._take_up(folder)
+            self._resume(folder)
 
     def _kill_one(self, folder: Path) -> bool:
         victim, sent = self._moments.choice(VICTIMS[self._executor]), self._moments.choice(SIGNALS)
@@ -160,7 +160,7 @@ class Trial:
         if not was_hit:
             self._tally.done["nobody there"] += 1
             if code != COMPLETE:
-                self._tally.fault(f"a run that was not killed ended with {code}: {run.said()}")
+                self._tally.fault(f"a run that was not killed ended with {code}: {run.output()}")
             return False
         if victim == "worker" or sent != signal.SIGKILL:
             check_end(run, code, sent, (COMPLETE, INCOMPLETE), self._tally)
@@ -192,13 +192,13 @@ class Trial:
         except StoreError as error:
             self._tally.fault(f"a lock remained: {error}")
 
-    def _take_up(self, folder: Path) -> None:
+    def _resume(self, folder: Path) -> None:
         run = Run(folder, self._request)
         code = run.finish()
         self._tally.done["compared"] += 1
         self._end_orphans()
         if code != COMPLETE:
-            self._tally.fault(f"after resuming it ended with {code}: {run.said()}")
+            self._tally.fault(f"after resuming it ended with {code}: {run.output()}")
             return
         found = outcome(folder)
         for name in sorted(found.keys() | self.expected.keys()):

@@ -13,13 +13,13 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from forked_runs import Forked
+from forked_runs import ForkedProcess
 
 # The signal that cannot be handled, and those of a terminal, a scheduler and a user.
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-A_WORKER = ("spawn_main", "ray::_on_node")  # in the command lines of workers
+WORKER_COMMANDS = ("spawn_main", "ray::_on_node")  # in the command lines of workers
 GRACE_S = 5.0  # until the children of a killed process must have ended
-MOST_S = 120.0  # until a process that received a signal it can handle must have ended
+MAX_S = 120.0  # until a process that received a signal it can handle must have ended
 LAST_SECOND_NS = 1_000_000_000
 PAGE = 4096
 
@@ -68,11 +68,11 @@ def workers_below(pid: int) -> list[int]:
 
     with contextlib.suppress(psutil.NoSuchProcess):
         children = psutil.Process(pid).children(recursive=True)
-        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in A_WORKER)]
+        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in WORKER_COMMANDS)]
     return []
 
 
-def kill(run: Forked, victim: str, sent: signal.Signals, workers: Sequence[int], moments: random.Random) -> bool:
+def kill(run: ForkedProcess, victim: str, sent: signal.Signals, workers: Sequence[int], moments: random.Random) -> bool:
     """Send a signal to ``victim`` of ``run``; return whether it existed."""
     if run.has_ended():
         return False
@@ -88,24 +88,24 @@ def kill(run: Forked, victim: str, sent: signal.Signals, workers: Sequence[int],
     return True
 
 
-def end_of(run: Forked, tally: Tally) -> int:
+def end_of(run: ForkedProcess, tally: Tally) -> int:
     """The exit code after a signal; a process that does not end is a fault, and is killed."""
-    limit = time.monotonic() + MOST_S
+    limit = time.monotonic() + MAX_S
     while not run.has_ended():
         if time.monotonic() > limit:
-            tally.fault(f"still runs {MOST_S:.0f} s after the signal: {run.said()}")
+            tally.fault(f"still runs {MAX_S:.0f} s after the signal: {run.output()}")
             os.killpg(run.pid, signal.SIGKILL)
             break
         time.sleep(0.01)
     return run.finish()
 
 
-def check_end(run: Forked, code: int, sent: signal.Signals, usual: Collection[int], tally: Tally) -> None:
+def check_end(run: ForkedProcess, code: int, sent: signal.Signals, usual: Collection[int], tally: Tally) -> None:
     """Check that the process ended by ``sent`` or as usual (``usual``), without a traceback."""
     if code not in (-sent, 128 + sent, *usual):
-        tally.fault(f"ended with {code} after {sent.name}: {run.said()}")
-    if "Traceback" in run.said():
-        tally.fault(f"showed a traceback after {sent.name}: {run.said()}")
+        tally.fault(f"ended with {code} after {sent.name}: {run.output()}")
+    if "Traceback" in run.output():
+        tally.fault(f"showed a traceback after {sent.name}: {run.output()}")
 
 
 def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None:

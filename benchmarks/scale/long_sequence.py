@@ -33,7 +33,7 @@ N_FRAMES = 5578
 LENGTH_M, STEP_M = 20, 0.25
 N_PLACES = round(LENGTH_M / STEP_M)
 N_THINGS = 300  # more than the corridor has
-MOST_MASKS, LEAST_PIXELS = 24, 40
+MAX_MASKS, MIN_PIXELS = 24, 40
 SAMPLE_EVERY, SHOW_EVERY = 100, 500
 
 
@@ -50,7 +50,7 @@ def seen_from(walk: Walk, number: int) -> Place:
     frame: Frame = walk[number]
     owner = walk._cast(number)[1]
     pixels = np.bincount(owner.ravel(), minlength=N_THINGS)
-    largest = [int(k) for k in np.argsort(-pixels, kind="stable")[:MOST_MASKS] if pixels[k] >= LEAST_PIXELS]
+    largest = [int(k) for k in np.argsort(-pixels, kind="stable")[:MAX_MASKS] if pixels[k] >= MIN_PIXELS]
     masks = np.array([(owner == k) & (frame.depth_m > 0) for k in largest])
     return Place(frame, masks, tuple(largest))
 
@@ -100,7 +100,7 @@ class Faultless:
         )
 
 
-def bytes_a_frame(frames: Sequence[int], rss_bytes: Sequence[int]) -> float:
+def bytes_per_frame(frames: Sequence[int], rss_bytes: Sequence[int]) -> float:
     """Slope of a straight line through memory at ``frames``."""
     return float(np.polyfit(frames, rss_bytes, 1)[0])
 
@@ -135,12 +135,12 @@ def main() -> None:
         for n, mib in scratch_mib.items()
     ]
     settled = range(len(updates) // 2, len(updates), SAMPLE_EVERY)
-    slope = bytes_a_frame(settled, [int(updates[k]["rss_bytes"]) for k in settled])
+    slope = bytes_per_frame(settled, [int(updates[k]["rss_bytes"]) for k in settled])
     start = time.perf_counter()
     instances = method.finish()
     notes = [
         f"In the second half memory grows by {slope:,.0f} bytes per frame (a straight line through every "
-        f"{SAMPLE_EVERY}th): its row of the update table and at most {MOST_MASKS} views of objects.",
+        f"{SAMPLE_EVERY}th): its row of the update table and at most {MAX_MASKS} views of objects.",
         f"The map at the end: {len(instances.ids):,} instances after {time.perf_counter() - start:.1f} s.",
     ]
     method.close()

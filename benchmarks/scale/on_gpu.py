@@ -158,11 +158,11 @@ def runs(folder: Path) -> Iterator[Comparison]:
         words += ["--device", name, "--set", "perception.cache=false", "--quiet"]
 
         def work() -> Arrays:
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said), tempfile.TemporaryDirectory(dir=folder) as out:
+            output = io.StringIO()
+            with contextlib.redirect_stdout(output), tempfile.TemporaryDirectory(dir=folder) as out:
                 if command_line([*words, "--out", f"{out}/run"]) != 0:
                     raise SystemExit(f"su3d-bench {' '.join(words)}: failed")
-            return (np.array(list(numbers(json.loads(said.getvalue())))),)
+            return (np.array(list(numbers(json.loads(output.getvalue())))),)
 
         return work
 

@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 
-from su3d_bench.analysis.page.contents import Wishes, page_contents, scored_maps
+from su3d_bench.analysis.page.contents import PageOptions, page_contents, scored_maps
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.runs.executors import limit_threads
 from su3d_bench.runs.finished import read_run
 
 N_SCENES, N_METHODS = 20, 8
-MOST_BYTES, MOST_MS = 30_000_000, 3000.0
-MOST_USABLE_MS = 1000.0  # of an existing page of one run
+MAX_BYTES, MAX_MS = 30_000_000, 3000.0
+MAX_USABLE_MS = 1000.0  # of an existing page of one run
 METHODS = [f"method{k}" for k in range(N_METHODS)]
 SCENES = [f"rooms/room{k}" for k in range(N_SCENES)]
 NOTE = (
@@ -51,7 +51,7 @@ FIRST_MAP = "document.querySelector('#maps .say').hidden && document.querySelect
 def simulated_page(run: Path) -> str:
     """The page of a run as if it had ``N_SCENES`` scenes and ``N_METHODS`` methods."""
     n_maps = len(scored_maps([read_run(run)]))
-    page = page_contents([run], Wishes(most_bytes=MOST_BYTES * n_maps // (N_SCENES * N_METHODS)))
+    page = page_contents([run], PageOptions(max_bytes=MAX_BYTES * n_maps // (N_SCENES * N_METHODS)))
     made, numbers = page.scenes, dict(page.numbers)
     numbers["runs"][0] |= {"scenes": SCENES, "methods": METHODS}
     for key in ("results", "confusions", "errors", "timing"):
@@ -156,9 +156,9 @@ def main() -> int:
         ]
         write_measured(arguments.json, title, command, ["from the start", "median", "worst"], table, notes)
     if arguments.page is not None:
-        return int(float(np.median([row["usable"] for row in rows])) >= MOST_USABLE_MS)
+        return int(float(np.median([row["usable"] for row in rows])) >= MAX_USABLE_MS)
     worst = max(max(row["loaded"], row["whole"]) for row in rows)
-    return int(n_bytes >= MOST_BYTES or worst >= MOST_MS)
+    return int(n_bytes >= MAX_BYTES or worst >= MAX_MS)
 
 
 if __name__ == "__main__":

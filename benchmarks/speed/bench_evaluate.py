@@ -90,7 +90,7 @@ def ours(scenes: Sequence[Scene], masks: Sequence[tuple[NDArray[np.int64], NDArr
     return combine(counts)
 
 
-def one_bincount_a_mask(scenes: Sequence[Scene]) -> InstanceAP:
+def one_bincount_per_mask(scenes: Sequence[Scene]) -> InstanceAP:
     """Overlaps by one bincount per mask over its points, from full masks; curves as in the other version."""
     counts = []
     for scene in scenes:
@@ -141,7 +141,7 @@ def test_from_binary_masks(benchmark: Any, scenes: Sequence[Scene]) -> None:
 
 @pytest.mark.benchmark(group=MEMORY)
 def test_one_bincount_per_mask(benchmark: Any, scenes: Sequence[Scene]) -> None:
-    found = benchmark(one_bincount_a_mask, scenes)
+    found = benchmark(one_bincount_per_mask, scenes)
     assert found.ap == ours(scenes, [sparse(scene) for scene in scenes]).ap
 
 
@@ -162,7 +162,7 @@ def line_by_line(folder: Path) -> InstanceAP:
         masks = np.array([numbers(folder / "pred" / file) != 0 for file, _, _ in lines])
         labels = np.array([int(label) for _, label, _ in lines])
         read.append(Scene(numbers(folder / f"gt/{name}.txt"), masks, labels, np.array([float(x) for *_, x in lines])))
-    return one_bincount_a_mask(read)
+    return one_bincount_per_mask(read)
 
 
 def numbers(file: Path) -> NDArray[np.int64]:

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from su3d_bench.analysis.page.contents import Contents, Wishes, page_contents
-from su3d_bench.analysis.page.kept import FOLDER
+from su3d_bench.analysis.page.contents import Contents, PageOptions, page_contents
+from su3d_bench.analysis.page.page_cache import FOLDER
 from su3d_bench.cli.main import main
 
 GROUP = "page of two small rooms"
 SMALL = ("rooms.n_frames=40", "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.05")
-WISHES = Wishes(jobs=1)
+WISHES = PageOptions(jobs=1)
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ DEVELOPMENT_SCENES = ("42445173", "42445677", "42445935", "42446478", "42446588"
 VARIANT = "query-vertices"
 LABEL_SPACE = "opensun3d"
 OBJECT = LabelSet(LABEL_SPACE, (1,), ("object",))  # eval_script_inst.py has the one class 'object'
-MOST_CHARACTERS = 1000  # of a query
+MAX_CHARACTERS = 1000  # of a query
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Challenge:
         found: dict[str, str] = {}
         for path in self._lists("queries"):
             for at, scene, text in read_list(path, QUERIES_COLUMNS):
-                if not text.strip() or len(text) > MOST_CHARACTERS or not text.isprintable():
+                if not text.strip() or len(text) > MAX_CHARACTERS or not text.isprintable():
                     raise DataError(f"{at}: '{printable(text, 40)}' is not a query; expected the words to search for")
                 if found.setdefault(scene, text) != text:
                     raise DataError(f"{at}: scene {scene} has two queries; the challenge has one per scene")

@@ -39,7 +39,7 @@ def mesh_name(scene: str) -> str:
 
 class ArkitScenesOptions(BaseModel):
     """``images``: those of 256x192 at up to 60 per second, as in the challenge's loader, or the ``wide`` camera's
-    with the laser scanner's depth if available. ``width``: maximum columns of a frame. ``least_confidence``:
+    with the laser scanner's depth if available. ``width``: maximum columns of a frame. ``min_confidence``:
     depth of lower confidence (0 to 2) is dropped. ``challenge``: a clone of the challenge's repository,
     if it is not next to the scenes."""
 
@@ -47,9 +47,7 @@ class ArkitScenesOptions(BaseModel):
 
     images: frames.Images = "lowres"
     width: int = Field(default=640, ge=16, le=4096)  # ScanNet's depth camera; images of low resolution have 256
-    least_confidence: int = Field(
-        default=0, ge=0, le=frames.MOST_CONFIDENCE
-    )  # the challenge's loader reads no confidence
+    min_confidence: int = Field(default=0, ge=0, le=frames.MAX_CONFIDENCE)  # the challenge's loader reads no confidence
     challenge: Path | None = None
 
 
@@ -107,7 +105,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         """Every ``stride``-th frame that has all its files and a pose, in temporal order."""
-        return frames.PhoneFrames(self.recording(scene), stride, self.options.width, self.options.least_confidence)
+        return frames.PhoneFrames(self.recording(scene), stride, self.options.width, self.options.min_confidence)
 
     def recording_files(self, scene: str) -> Sequence[Path]:
         return self.recording(scene).files()
@@ -162,4 +160,4 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         deeper = self.folder(scene) / f"{scene}_frames"
         folder = deeper if deeper.is_dir() else self.folder(scene)
         options = self.options
-        return frames.open_recording(folder, scene, options.images, options.least_confidence, self.where(scene))
+        return frames.open_recording(folder, scene, options.images, options.min_confidence, self.where(scene))

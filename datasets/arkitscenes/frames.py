@@ -18,10 +18,10 @@ from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
 
 N_COLUMNS = 7  # time, rotation axis times angle, translation: DATA.md of apple/ARKitScenes at 7283761
-MOST_ROTATION = 1e3  # rad; writers need at most half a turn
+MAX_ROTATION = 1e3  # rad; writers need at most half a turn
 # FrameReaderDataLoaderLowRes of opensun3d_challenge_utils.py, OpenSun3D/cvpr24-challenge at 59db30f: an image with no
 # pose nearer than this is dropped, and pose times are rounded to milliseconds.
-MOST_DIFFERENCE_S = 0.3
+MAX_DIFFERENCE_S = 0.3
 MILLISECONDS = 3
 
 
@@ -32,7 +32,7 @@ class Trajectory:
     times_s: Float64Array
     poses: Float64Array
 
-    def nearest(self, times_s: Float64Array, most_s: float = MOST_DIFFERENCE_S) -> Int64Array:
+    def nearest(self, times_s: Float64Array, most_s: float = MAX_DIFFERENCE_S) -> Int64Array:
         """The row of the pose nearest to each time, the later of two equally near; -1 if none is within ``most_s``."""
         after = np.clip(np.searchsorted(self.times_s, times_s), 0, len(self.times_s) - 1)
         before = np.maximum(after - 1, 0)
@@ -52,7 +52,7 @@ def read_trajectory(path: Path, where: str) -> Trajectory:
         if len(words) != N_COLUMNS:
             raise DataError(f"{at}: has {len(words)} values; expected time, axis-angle and translation, {N_COLUMNS}")
         time_s, *rest = recorded_frames.numbers(words, at)
-        is_usual = 0 <= time_s < 1e12 and max(map(abs, rest[:3])) < MOST_ROTATION and max(map(abs, rest[3:])) < 1e6
+        is_usual = 0 <= time_s < 1e12 and max(map(abs, rest[:3])) < MAX_ROTATION and max(map(abs, rest[3:])) < 1e6
         if not is_usual:  # also false for non-finite values
             shown = " ".join(f"{value:g}" for value in (time_s, *rest))
             raise DataError(f"{at}: is {shown}; expected seconds, radians and metres; copy the file again")
@@ -80,10 +80,10 @@ LOWRES, WIDE, DEPTH, FINE_DEPTH, CONFIDENCE = "lowres_wide", "wide", "lowres_dep
 COLOUR_FOLDER: Mapping[Images, str] = {"lowres": LOWRES, "wide": WIDE}
 UNITS_PER_METRE = 1000.0  # DATA.md of apple/ARKitScenes at 7283761: millimetres
 DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
-MOST_CONFIDENCE = 2
+MAX_CONFIDENCE = 2
 # Apple's and the challenge's readers look for a camera file at the exact time, then 1 ms before and after.
 NEIGHBOURS_MS = (0, -1, 1)
-MOST_DEPTH_AWAY_MS = 5  # depth of a wide image has its own time stamp: half of a sixtieth of a second
+MAX_DEPTH_AWAY_MS = 5  # depth of a wide image has its own time stamp: half of a sixtieth of a second
 LARGEST_SIDE = 16384
 ADVICE = "download the scene again"
 
@@ -137,7 +137,7 @@ def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
     return {round(float(match[1]) * 1000): name for name, match in matches.items() if match is not None}
 
 
-def open_recording(folder: Path, scene: str, images: Images, least_confidence: int, where: str) -> PhoneRecording:
+def open_recording(folder: Path, scene: str, images: Images, min_confidence: int, where: str) -> PhoneRecording:
     """The recording of a scene; ``FramesMissing`` if it has no images, ``DataError`` if none can be used."""
     colour_folder = COLOUR_FOLDER[images]
     with recorded_frames.reading(where):
@@ -145,12 +145,12 @@ def open_recording(folder: Path, scene: str, images: Images, least_confidence: i
         depths = times_in(folder / DEPTH, scene, ".png")
         fine = times_in(folder / FINE_DEPTH, scene, ".png") if images == "wide" else {}
         cameras = times_in(folder / camera_folder(colour_folder), scene, ".pincam")
-        sure = times_in(folder / CONFIDENCE, scene, ".png") if least_confidence else {}
+        sure = times_in(folder / CONFIDENCE, scene, ".png") if min_confidence else {}
     if not colours and not depths:
         raise FramesMissing(f"{where}: no images in {folder / colour_folder} and none in {DEPTH}; {ADVICE}")
-    if least_confidence and not sure:
+    if min_confidence and not sure:
         raise DataError(
-            f"{where}: option least_confidence needs {CONFIDENCE}/, which is missing; the challenge does not download "
+            f"{where}: option min_confidence needs {CONFIDENCE}/, which is missing; the challenge does not download "
             "it; leave the option at 0 or download it"
         )
     trajectory = read_trajectory(folder / TRAJECTORY_NAME, f"{where}: {TRAJECTORY_NAME}")
@@ -161,7 +161,7 @@ def open_recording(folder: Path, scene: str, images: Images, least_confidence: i
         named = f"{scene}_{time_ms / 1000:.3f}"
         depth = _depth_of(time_ms, images, depths, fine)
         camera = next((cameras[time_ms + ms] for ms in NEIGHBOURS_MS if time_ms + ms in cameras), None)
-        of_confidence = sure.get(time_ms) if least_confidence else ""
+        of_confidence = sure.get(time_ms) if min_confidence else ""
         if time_ms not in colours or depth is None or camera is None or of_confidence is None:
             lacking.append(named)
         elif row < 0:
@@ -184,7 +184,7 @@ def _depth_of(time_ms: int, images: Images, depths: Mapping[int, str], fine: Map
     """The depth image of a time: the laser scanner's for the wide camera, otherwise the phone's nearest."""
     if time_ms in fine:
         return f"{FINE_DEPTH}/{fine[time_ms]}"
-    reach = 0 if images == "lowres" else MOST_DEPTH_AWAY_MS
+    reach = 0 if images == "lowres" else MAX_DEPTH_AWAY_MS
     near = sorted(range(-reach, reach + 1), key=abs)
     return next((f"{DEPTH}/{depths[time_ms + ms]}" for ms in near if time_ms + ms in depths), None)
 
@@ -206,9 +206,9 @@ class PhoneFrames(Sequence[Frame]):
     Frames have at most ``width`` columns: colour is averaged, depth and confidence are taken from the nearest pixel.
     """
 
-    def __init__(self, recording: PhoneRecording, stride: int, width: int, least_confidence: int) -> None:
+    def __init__(self, recording: PhoneRecording, stride: int, width: int, min_confidence: int) -> None:
         self._recording, self._stride = recording, stride
-        self._width, self._least = width, least_confidence
+        self._width, self._least = width, min_confidence
         self._depth = recorded_frames.StoredDepth(recording.where, DEPTH_M_OF_VALUE)
 
     def __len__(self) -> int:
@@ -243,7 +243,7 @@ class PhoneFrames(Sequence[Frame]):
         if image.confidence is not None:
             confidence = decode_colour(self._content(image.confidence), self._at(image.confidence))[..., 0]
             self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
-            if confidence.max(initial=0) > MOST_CONFIDENCE:
+            if confidence.max(initial=0) > MAX_CONFIDENCE:
                 raise DataError(f"{self._at(image.confidence)}: has values up to {confidence.max()}; expected 0 to 2")
             confidence = recorded_frames.nearest_at(confidence, (values.shape[1], values.shape[0]))
             depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))

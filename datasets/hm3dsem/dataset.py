@@ -61,7 +61,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
     )
     label_space = truth.LABEL_SPACE
     variants = (truth.VARIANT,)
-    further_truths = openlex3d.FURTHER_TRUTHS
+    extra_ground_truths = openlex3d.EXTRA_GROUND_TRUTHS
     labels_of = LABELS_OF
     no_mesh = "HM3D stores objects in a texture, which is not read"
     Options = NoOptions

@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from su3d_bench.core.errors import DataError, PredictionError, converted, printable
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float32Array, Floor, GroundTruth, LabelSet, Places, Room
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, read_text
+from su3d_bench.formats.arrays import MAX_POINTS, checked_points, read_text
 from su3d_bench.formats.json_models import FileModel, Lengths, Metres, Point, WholeNumber, read_json
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.protocols.loading import CLASS_TABLES
@@ -89,7 +89,7 @@ def read_truth(folder: Path, where: str) -> GroundTruth:
     info = read_info(folder / INFO_NAME, where)
     clouds = [read_cloud(folder / OBJECTS / f"{one.id}.ply", where) for one in info.objects]
     sizes = [len(cloud) for cloud in clouds]
-    if sum(sizes) > MOST_POINTS:
+    if sum(sizes) > MAX_POINTS:
         raise DataError(f"{where}: {OBJECTS}/ has {sum(sizes)} points; {AGAIN}")
     labels = label_set()
     id_of = dict(zip(labels.names, labels.ids, strict=True))

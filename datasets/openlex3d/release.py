@@ -25,7 +25,7 @@ from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.datasets.scannetpp.truth import BASES as SCANNETPP_BASES
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of, parsed_json, read_text
+from su3d_bench.formats.arrays import MAX_POINTS, checked_points, kind_of, parsed_json, read_text
 from su3d_bench.formats.json_models import FileModel, checked_json, read_json
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
@@ -306,8 +306,8 @@ def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
             raise DataError(f"{beside}: is missing, but {SCENE_INFO} lists object {one}; {advice}")
         clouds.append(vertex_positions(read_ply(path, beside), beside))
         n_points += len(clouds[-1])
-        if n_points > MOST_POINTS:
-            raise DataError(f"{beside}: the scene has more than {MOST_POINTS} points; check for damage")
+        if n_points > MAX_POINTS:
+            raise DataError(f"{beside}: the scene has more than {MAX_POINTS} points; check for damage")
     return LabelledPoints(
         np.concatenate(clouds),
         np.repeat(np.array(ids, np.int64), [len(cloud) for cloud in clouds]),
@@ -319,7 +319,7 @@ DATASETS = ("replica", "scannetpp", "hm3d")  # names in the release, and of the 
 ALL_SEEN = ("scannetpp", "hm3d")  # scenes may lack a cloud of visible points: all base points count
 VISIBLE_RADIUS_M = 0.05  # maximum distance from a visible point to the labelled point that gives its object
 VISIBLE, FACE_CORNERS = "openlex3d-visible", "openlex3d-face-corners"
-FURTHER_TRUTHS: Mapping[str, str] = {LABELS: VISIBLE, QUERIES: FACE_CORNERS}  # label space -> ground truth
+EXTRA_GROUND_TRUTHS: Mapping[str, str] = {LABELS: VISIBLE, QUERIES: FACE_CORNERS}  # label space -> ground truth
 RELEASE_FOLDER = "gt_openlex3d"
 PLACES = (RELEASE_FOLDER, f"openlex3d/{RELEASE_FOLDER}", f"OpenLex3D/{RELEASE_FOLDER}", "openlex3d", "OpenLex3D")
 PAGE = "https://github.com/openlex3d/openlex3d"

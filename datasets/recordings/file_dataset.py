@@ -222,7 +222,7 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         self.folder(scene)
-        if self.labels_of is not None and variant in openlex3d.FURTHER_TRUTHS.values():
+        if self.labels_of is not None and variant in openlex3d.EXTRA_GROUND_TRUTHS.values():
             labelled: GroundTruth = openlex3d.truth_below(self.root, self.labels_of, scene, variant)
             return labelled
         if variant not in self.variants:

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import CorrectsReading, Dataset
+from su3d_bench.core.interfaces import Dataset, HasReadingCorrections
 from su3d_bench.core.types import Float64Array, Frame, UpAxis, WorldUp
 
 N_ANCHORS = 4
@@ -88,15 +88,15 @@ def judge_scene(dataset: Dataset, scene: str, frames: Sequence[Frame] | None = N
 
     ``frames`` are at full rate if available; about twenty of them are read.
     """
-    if isinstance(dataset, CorrectsReading) and not dataset.is_reading_checked(scene):
+    if isinstance(dataset, HasReadingCorrections) and not dataset.is_reading_checked(scene):
         return None
     where = f"{dataset.name}/{scene}"
     shares = _shares(dataset.frames(scene, 1) if frames is None else frames)
     finding = _best_other(shares)
     if finding is None:
-        doubt = _doubt(shares)
+        doubt = _uncertainty(shares)
         return None if doubt is None else Verdict(False, f"{where}: {doubt}")
-    if isinstance(dataset, CorrectsReading):
+    if isinstance(dataset, HasReadingCorrections):
         return Verdict(True, f"{where}: {finding.shares} {dataset.correction_of_reading(scene, finding)}")
     return Verdict(True, f"{where}: {finding.shares} {_in_words(finding)}")
 
@@ -112,7 +112,7 @@ def _in_words(finding: Finding) -> str:
     return f"with {words[finding.motion]}"
 
 
-def _doubt(shares: Float64Array) -> str | None:
+def _uncertainty(shares: Float64Array) -> str | None:
     """Why the frames cannot rule out inverted poses (the usual mistake); None if they can."""
     as_read, inverse = shares[:, 0], shares[:, READINGS.index(("inverse", 1.0))]
     if not len(shares) or max(as_read.max(), inverse.max()) < MIN_SHARE:
@@ -224,7 +224,7 @@ AXES: tuple[UpAxis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
 MAYBE, UPRIGHT = 0.5, 0.8  # mean component of the image's up direction along an axis: 60 and 37 degrees off
 LEVEL = np.cos(np.radians(15))  # cosine of surface normal and up: allows for depth noise over a few centimetres
-LEAST_LEVEL, MORE_LEVEL = 0.05, 2.0  # minimum share of level surfaces, and minimum ratio to the next axis
+MIN_LEVEL, MORE_LEVEL = 0.05, 2.0  # minimum share of level surfaces, and minimum ratio to the next axis
 N_FRAMES = 6
 N_DRAWN_COLUMNS, REACH = 80, 2  # of the pixel grid; normals use neighbours this many columns away
 SMOOTH = 0.1  # of the depth; neighbours farther apart belong to different surfaces
@@ -242,7 +242,7 @@ def guess_up(poses: Float64Array, frames: Sequence[Frame]) -> WorldUp:
     if len(candidates) > 1 or along[candidates[0]] < UPRIGHT:
         level = _shares_level(frames)[candidates]
         best, *others = np.sort(level)[::-1]
-        if best < LEAST_LEVEL or any(best < MORE_LEVEL * other for other in others):
+        if best < MIN_LEVEL or any(best < MORE_LEVEL * other for other in others):
             return WorldUp(None, False, "the cameras were tilted and no axis has clearly more level surfaces")
         return WorldUp(
             AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of the surfaces are perpendicular to it"

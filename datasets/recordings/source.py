@@ -133,7 +133,7 @@ class Registration:
         return self.camera.depth_intrinsics if self.grid == "depth" else self.camera.colour_intrinsics
 
     @cached_property
-    def is_needless(self) -> bool:
+    def is_identity(self) -> bool:
         """Whether both images have the same size and each pixel the same ray."""
         if self.camera.colour_size != self.camera.depth_size:
             return False
@@ -147,7 +147,7 @@ class Registration:
     @cached_property
     def _from_pose(self) -> Float64Array | None:
         """What a pose of the depth camera is multiplied by; None if poses are unchanged."""
-        if self.grid == "depth" or self.is_needless:
+        if self.grid == "depth" or self.is_identity:
             return None
         return np.linalg.inv(self.depth_to_colour).astype(np.float64)
 
@@ -157,7 +157,7 @@ class Registration:
 
     def images(self, colour: UInt8Array, depth_m: Float32Array) -> tuple[UInt8Array, Float32Array]:
         """Colour (H, W, 3) and depth in metres (H, W) on the grid; 0 is no depth."""
-        if self.is_needless:
+        if self.is_identity:
             return colour, depth_m
         if self.grid == "depth":
             return self._colour_at_depth(colour, depth_m), depth_m

@@ -34,8 +34,8 @@ from su3d_bench.formats.poses import poses_of_lines
 
 SLACK_M = 0.05
 SPACING_M = 0.05  # of the points on the sides of boxes
-LEAST_ALONG = 6  # points along an edge: the smallest box then has 216 on its sides, enough to count as an object
-MOST_POINTS = 2_000_000
+MIN_EDGE_POINTS = 6  # points along an edge: the smallest box then has 216 on its sides, enough to count as an object
+MAX_POINTS = 2_000_000
 MAX_OBJECTS = 10_000  # the release has at most a few hundred per scene
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision
 
@@ -91,7 +91,7 @@ def object_boxes_of(path: Path, where: str) -> ObjectBoxes:
 
 def box_truth(known: ObjectBoxes) -> GroundTruth:
     """Points on the sides of the boxes, each with the class and instance of its box."""
-    most_along = max(LEAST_ALONG, int((MOST_POINTS / (6 * max(1, len(known.boxes)))) ** 0.5))
+    most_along = max(MIN_EDGE_POINTS, int((MAX_POINTS / (6 * max(1, len(known.boxes)))) ** 0.5))
     parts = [_on_sides(box, most_along) for box in known.boxes.values()]
     sizes = [len(part) for part in parts]
     classes = np.array([known.class_of_instance[instance] for instance in known.boxes], np.int32)
@@ -108,7 +108,7 @@ def box_truth(known: ObjectBoxes) -> GroundTruth:
 
 def _on_sides(box: OrientedBox, most_along: int) -> Float64Array:
     """A grid (N, 3) on the six sides."""
-    n_along = np.clip(np.ceil(box.sizes / SPACING_M) + 1, LEAST_ALONG, most_along).astype(np.int64)
+    n_along = np.clip(np.ceil(box.sizes / SPACING_M) + 1, MIN_EDGE_POINTS, most_along).astype(np.int64)
     edges = [np.linspace(-0.5, 0.5, int(n)) * size for n, size in zip(n_along, box.sizes, strict=True)]
     parts = []
     for axis in range(3):

@@ -27,7 +27,7 @@ class Replica(FileDataset[NoOptions]):
     variants = (
         "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", scene_graphs.VARIANT
     )  # fmt: skip
-    further_truths = openlex3d.FURTHER_TRUTHS
+    extra_ground_truths = openlex3d.EXTRA_GROUND_TRUTHS
     labels_of = "replica"
     Options = NoOptions
 

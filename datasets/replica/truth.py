@@ -58,7 +58,7 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     ids, face_rows = np.unique(objects, return_inverse=True)
     semantic = np.array([known.get(int(number), 0) for number in ids], np.int32)[face_rows]
     instance = np.array([int(number) + 1 if int(number) in known else 0 for number in ids], np.int32)[face_rows]
-    _say_what_is_void(ids, np.bincount(face_rows, minlength=len(ids)), class_of_object, where)
+    _warn_void_objects(ids, np.bincount(face_rows, minlength=len(ids)), class_of_object, where)
     return AnnotatedMesh(
         vertices, corners, objects, semantic, instance, {number + 1: known[number] for number in sorted(known)}
     )
@@ -105,7 +105,7 @@ def read_info(path: Path, where: str) -> Info:
     return info
 
 
-def _say_what_is_void(ids: Int64Array, n_faces: Int64Array, class_of_object: Mapping[int, int], where: str) -> None:
+def _warn_void_objects(ids: Int64Array, n_faces: Int64Array, class_of_object: Mapping[int, int], where: str) -> None:
     missing = [row for row, object_id in enumerate(ids) if int(object_id) not in class_of_object]
     if missing:
         logger.warning(

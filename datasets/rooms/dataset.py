@@ -33,8 +33,8 @@ from su3d_bench.datasets.rooms.recipes import KINDS, furnish
 from su3d_bench.datasets.rooms.rendering.mesh import Patches, RoomMesh, build_mesh, gather_patches
 from su3d_bench.datasets.rooms.rendering.render import LEVELS, RenderedFrame, Renderer, add_noise, camera_intrinsics
 from su3d_bench.datasets.rooms.scan import RoomScan, kept_arrays, kept_scan, scan_room
+from su3d_bench.datasets.rooms.trajectory import walk
 from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth, attribute_of_object, truth_of
-from su3d_bench.datasets.rooms.walk import walk
 
 SOURCES = ("datasets/rooms", "numerics")  # what affects a room: part of the key of cached data
 GENERATOR_VERSION = 3  # increase it whenever a scene of the same name changes
@@ -148,7 +148,7 @@ class Rooms:
     label_space = "replica"
     renders_frames = True
     variants: tuple[str, ...] = ("mesh-vertices", "face-corners")
-    further_truths = openscan.FURTHER_TRUTHS
+    extra_ground_truths = openscan.EXTRA_GROUND_TRUTHS
     image_domain: ImageDomain = "rendered-rooms"
     Options = RoomOptions
 
@@ -249,7 +249,7 @@ class Rooms:
 
         For the name of an OpenScan aspect: the vertices, with attributes as classes.
         """
-        if variant in self.further_truths:
+        if variant in self.extra_ground_truths:
             return self._attribute_truth(scene, variant)
         if variant not in self.variants:
             raise GroundTruthMissing(

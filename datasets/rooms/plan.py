@@ -31,7 +31,7 @@ class Box:
         """The lowest and the highest corner (2, 3)."""
         return np.stack([self.low, self.high])
 
-    def meets(self, other: Box, gap: float = 0.0) -> bool:
+    def overlaps(self, other: Box, gap: float = 0.0) -> bool:
         """Overlap, with ``gap`` metres of horizontal air around."""
         pad = np.array([gap, gap, 0.0])
         return bool(((self.low - pad < other.high) & (other.low < self.high + pad)).all())
@@ -92,7 +92,7 @@ class Plan:
         candidate = Placed(0, item, yaw, np.array([x, y, 0.0 if z is None else z]))
         room = box_of(candidate)
         if z is None:
-            under = [b for i, b in self.boxes.items() if self._flat(i) and b.meets(room)]
+            under = [b for i, b in self.boxes.items() if self._flat(i) and b.overlaps(room)]
             lift = max([GAP_M, *[float(b.high[2]) + GAP_M / 2 for b in under]])
             raised = np.array([0.0, 0.0, lift])
             room = Box(room.low + raised, room.high + raised)
@@ -100,13 +100,13 @@ class Plan:
         limits = np.array([self.width, self.depth, self.height])
         if (room.low[:2] < GAP_M / 2).any() or (room.high > limits - GAP_M / 2).any():
             return None
-        if mount == "floor" and item.class_name not in FLAT and any(room.meets(free) for free in self.keep_free):
+        if mount == "floor" and item.class_name not in FLAT and any(room.overlaps(free) for free in self.keep_free):
             return None
         flat_itself = item.class_name in FLAT
         for other, taken in self.boxes.items():
             if other in ignore or (self._flat(other) and not flat_itself):
                 continue
-            if room.meets(taken, gap):
+            if room.overlaps(taken, gap):
                 return None
         return self.add(item, x, y, z, yaw, mount)
 

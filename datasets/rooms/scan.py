@@ -18,7 +18,7 @@ from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsi
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm per pixel at 1 m
-TOUR = 40  # frames are visited at this stride first, so that the first few decide most faces
+COARSE_STRIDE = 40  # frames are visited at this stride first, so that the first few decide most faces
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
     n_active, n_pixels = len(active), VIEW_WIDTH * VIEW_HEIGHT
     pixel, is_hit = np.empty(n_active, np.int32), np.empty(n_pixels, np.bool_)
     depth, instance = np.zeros(n_pixels, np.float32), np.zeros(n_pixels, np.int32)
-    for index in (i for start in range(TOUR) for i in range(start, len(poses), TOUR)):
+    for index in (i for start in range(COARSE_STRIDE) for i in range(start, len(poses), COARSE_STRIDE)):
         pose = poses[index].astype(np.float32)
         aim_at_faces(active, n_active, centres, normals, pose, intrinsics[0, 0], intrinsics[0, 2], intrinsics[1, 2],
                      VIEW_WIDTH, VIEW_HEIGHT, pixel, is_hit)  # fmt: skip

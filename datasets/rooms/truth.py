@@ -21,9 +21,9 @@ from su3d_bench.numerics.relations import Relations
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
 OPENINGS = frozenset(("door", "window"))
 # Materials recognizable in a picture: the textures that only they have.
-SHOWN_BY = {"wooden": Texture.WOOD, "wicker": Texture.WICKER}
-OF_WOOD = frozenset(("brown", "beige", "orange"))  # wood of other colours looks painted
-LEAST_SHOWN = 0.6  # of the surface
+TEXTURE_WORDS = {"wooden": Texture.WOOD, "wicker": Texture.WICKER}
+WOOD_COLOURS = frozenset(("brown", "beige", "orange"))  # wood of other colours looks painted
+MIN_SHOWN = 0.6  # of the surface
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ def _object(plan: Plan, placed_id: int) -> RoomObject:
 
 def _shows_material(item: Item) -> bool:
     """Whether most of the surface has a texture unique to this material and, for wood, a wooden colour."""
-    if item.material == "wooden" and item.colour not in OF_WOOD:
+    if item.material == "wooden" and item.colour not in WOOD_COLOURS:
         return False
     area = {True: 0.0, False: 0.0}
     for part in item.parts:
         a, b, _, d = np.moveaxis(part.shape.quads, 1, 0)
         size = float(np.linalg.norm(np.cross(b - a, d - a), axis=1).sum())
-        area[part.material.texture == SHOWN_BY.get(item.material)] += size
-    return area[True] > 0 and area[True] >= LEAST_SHOWN * (area[True] + area[False])
+        area[part.material.texture == TEXTURE_WORDS.get(item.material)] += size
+    return area[True] > 0 and area[True] >= MIN_SHOWN * (area[True] + area[False])
 
 
 def _relations(objects: tuple[RoomObject, ...]) -> tuple[Relation, ...]:

@@ -78,7 +78,7 @@ class ScanNet(FileDataset[ScannetOptions]):
     )
     label_space = "scannet"
     variants = ("nyu40-vertices", "scannet200-vertices")
-    further_truths = openscan.FURTHER_TRUTHS
+    extra_ground_truths = openscan.EXTRA_GROUND_TRUTHS
     Options = ScannetOptions
 
     def find_tree(self) -> SceneTree:
@@ -109,7 +109,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         """The usable ones among every ``stride``-th frame; the number of others is logged once."""
         source, walk = self._open(scene)
         registration = make_registration(source.camera, self.options.grid, self.where(scene))
-        self.warn_once(scene, walk.say_what_is_lost(self.where(scene)))
+        self.warn_once(scene, walk.missing_frames_remark(self.where(scene)))
         return recordings.ScannetFrames(source, registration, walk, walk.every(stride), self._motion(scene))
 
     def recording_files(self, scene: str) -> Sequence[Path]:
@@ -120,7 +120,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return recordings.digest_recording(source, walk.poses)
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        attributes = variant in self.further_truths
+        attributes = variant in self.extra_ground_truths
         return self._attribute_truth(scene, variant) if attributes else super().ground_truth(scene, variant)
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
@@ -193,7 +193,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return recordings.folder_of_recording(self.tree.folders[scene], scene, self.options.source)
 
     @keeps_last
-    def _open(self, scene: str) -> tuple[RgbdSource, recordings.Walk]:
+    def _open(self, scene: str) -> tuple[RgbdSource, recordings.RecordedPoses]:
         """The recording of ``scene`` and its poses."""
         source = recordings.find_source(self.folder(scene), scene, self.where(scene), self.options.source)
         return source, recordings.read_walk(source)

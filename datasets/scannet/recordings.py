@@ -291,7 +291,7 @@ def digest_recording(source: sensors.RgbdSource, poses: Float64Array) -> str:
 
 
 @dataclass(frozen=True)
-class Walk:
+class RecordedPoses:
     """The records of a recording: ``numbers`` (n,) at full rate, ``poses`` (n, 4, 4), which of them are usable (n,)."""
 
     numbers: Int64Array
@@ -304,7 +304,7 @@ class Walk:
         kept: Int64Array = first[self.is_usable[first]]
         return kept
 
-    def say_what_is_lost(self, where: str) -> str | None:
+    def missing_frames_remark(self, where: str) -> str | None:
         """A message with the number of records without a usable pose."""
         if self.is_usable.all():
             return None
@@ -312,7 +312,7 @@ class Walk:
         return f"{where}: frames without a pose, excluded: {n_lost} of {len(self.numbers)} (the first: {first})"
 
 
-def read_walk(source: sensors.RgbdSource) -> Walk:
+def read_walk(source: sensors.RgbdSource) -> RecordedPoses:
     """Determine which records are usable.
 
     A non-finite pose was lost. ScanNet's own reader also treats a first element of 0 as lost, but exact
@@ -327,13 +327,13 @@ def read_walk(source: sensors.RgbdSource) -> Walk:
     return walk
 
 
-def classify_poses(source: sensors.RgbdSource) -> tuple[Walk, BoolArray]:
+def classify_poses(source: sensors.RgbdSource) -> tuple[RecordedPoses, BoolArray]:
     """The records as in ``read_walk``, and which of them (n,) have a pose that is neither lost nor valid."""
     poses = source.poses()
     is_finite = np.isfinite(poses).all(axis=(1, 2))
     is_rigid = np.zeros(len(poses), bool)
     is_rigid[is_finite] = are_rigid(poses[is_finite])
-    return Walk(source.numbers, poses, is_rigid), is_finite & ~is_rigid & (poses[:, 0, 0] != 0)
+    return RecordedPoses(source.numbers, poses, is_rigid), is_finite & ~is_rigid & (poses[:, 0, 0] != 0)
 
 
 def faulty_pose(where: str, number: int) -> str:
@@ -350,7 +350,7 @@ class ScannetFrames(Sequence[Frame]):
         self,
         source: sensors.RgbdSource,
         registration: sensors.Registration,
-        walk: Walk,
+        walk: RecordedPoses,
         records: Int64Array,
         motion: Float64Array | None,
     ) -> None:

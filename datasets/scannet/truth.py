@@ -328,7 +328,7 @@ def nyu40_truth(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> GroundTrut
 
 def scannet200_truth(scan: AnnotatedScan, table: LabelTable) -> GroundTruth:
     """Raw ids of the objects' categories."""
-    _say_what_is_unknown(scan, table)
+    _warn_unknown_categories(scan, table)
     return GroundTruth(
         scan.vertices,
         scan.of_category(table.raw_id_of),
@@ -358,11 +358,11 @@ def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[
             f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "
             f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is beside the scans"
         )
-    _say_what_is_unknown(scan, table)
+    _warn_unknown_categories(scan, table)
     return scan.of_category(table.nyu40_of), f"the NYU40 classes of the objects' categories in {table.name}"
 
 
-def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
+def _warn_unknown_categories(scan: AnnotatedScan, table: LabelTable) -> None:
     """Warn with the number of categories without a row; their vertices are void."""
     unknown = [row for row, entry in enumerate(scan.objects) if entry.category not in table.nyu40_of]
     if unknown:

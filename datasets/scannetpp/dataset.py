@@ -27,7 +27,7 @@ from su3d_bench.formats.arrays import read_text
 SCENE_NAMES = r"[0-9a-f]{10}"
 SPLITS_FOLDER = "splits"
 IPHONE, SCANS = "iphone", "scans"
-MOST_SCENES = 100_000
+MAX_SCENES = 100_000
 LARGE_BYTES, END_BYTES = 64 << 20, 1 << 20  # of larger files (videos, packed recordings) only both ends are digested
 
 
@@ -58,7 +58,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     )
     label_space = truth.LABEL_SPACE
     variants = (truth.VARIANT,)
-    further_truths = openlex3d.FURTHER_TRUTHS
+    extra_ground_truths = openlex3d.EXTRA_GROUND_TRUTHS
     labels_of = "scannetpp"
     Options = ScannetppOptions
 
@@ -102,7 +102,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         """Every ``stride``-th frame with a pose entry, in the order of the video; the number of
         frames without a pose is logged once."""
         recording = self.recording(scene)
-        self.warn_once(scene, recording.say_what_is_lost())
+        self.warn_once(scene, recording.missing_frames_remark())
         return frames.IphoneFrames(recording, recording.every(stride), self.options.width)
 
     def recording_files(self, scene: str) -> Sequence[Path]:
@@ -192,7 +192,7 @@ def read_split(path: Path) -> tuple[str, ...]:
     where = f"scannetpp: {SPLITS_FOLDER}/{path.name}"
     scenes = read_text(path, where).split()
     wrong = next((scene for scene in scenes if not re.fullmatch(SCENE_NAMES, scene)), None)
-    if wrong is not None or len(scenes) > MOST_SCENES:
+    if wrong is not None or len(scenes) > MAX_SCENES:
         raise DataError(f"{where}: {(wrong or '')[:40]!a} is not a scene; expected one per line, such as 036bce3393")
     return tuple(dict.fromkeys(scenes))
 

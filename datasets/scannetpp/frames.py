@@ -74,7 +74,7 @@ class IphoneRecording:
         """Usable rows among every ``stride``-th; one without a pose is not replaced."""
         return [row for row in self.usable if row % stride == 0]
 
-    def say_what_is_lost(self) -> str | None:
+    def missing_frames_remark(self) -> str | None:
         """A message with the number of frames without a pose."""
         n, n_usable = len(self.posed.numbers), len(self.usable)
         return None if n == n_usable else f"{self.where}: frames without a pose, excluded: {n - n_usable} of {n}"

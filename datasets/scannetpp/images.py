@@ -28,7 +28,7 @@ from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, reading
 from su3d_bench.formats.images import MAX_PIXELS, Size, UInt16Array
 
-LEAST_MATCH = 4
+MIN_MATCH = 4
 
 
 class NotLz4(Exception):
@@ -50,7 +50,7 @@ def unpacked_block(content: bytes, n_bytes: int) -> bytes:
                 break
             offset = content[at] | content[at + 1] << 8
             n_match, at = _length(content, token & 15, at + 2)
-            n_match += LEAST_MATCH
+            n_match += MIN_MATCH
             if not 0 < offset <= len(out) or len(out) + n_match > n_bytes:
                 raise NotLz4
             start = len(out) - offset
@@ -125,8 +125,8 @@ N_PIXELS = WIDTH * HEIGHT
 UNITS_PER_METRE = 1000.0
 RAW = -zlib.MAX_WBITS  # no header, no checksum
 LENGTH_BYTES = 4
-MOST_PACKED_BYTES = 1 << 20  # of one image, which unpacked has 196608
-MOST_FRAMES = 1 << 20  # of five hours at 60 a second
+MAX_PACKED_BYTES = 1 << 20  # of one image, which unpacked has 196608
+MAX_FRAMES = 1 << 20  # of five hours at 60 a second
 PIECE_BYTES = 1 << 16
 
 
@@ -215,7 +215,7 @@ def _index(path: Path) -> list[tuple[int, int]] | None:
             stream.seek(at)
             length = int.from_bytes(stream.read(LENGTH_BYTES), "little")
             at += LENGTH_BYTES
-            if not 0 < length <= MOST_PACKED_BYTES or at + length > n_bytes or len(index) == MOST_FRAMES:
+            if not 0 < length <= MAX_PACKED_BYTES or at + length > n_bytes or len(index) == MAX_FRAMES:
                 return None
             index.append((at, length))
             at += length

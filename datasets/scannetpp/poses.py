@@ -45,8 +45,8 @@ MODELS = {
     "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7)),
 }
 N_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-MOST_DISTORTION = 10.0  # an iPhone has 0.2
-MOST_LINE_BYTES = 16 << 20  # the points of one image, a few thousand
+MAX_DISTORTION = 10.0  # an iPhone has 0.2
+MAX_LINE_BYTES = 16 << 20  # the points of one image, a few thousand
 HEAD_BYTES = 4096
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -97,7 +97,7 @@ def _read_camera(path: Path, where: str) -> tuple[Float64Array, Size, Float64Arr
     values = numbers(words[4:], where)
     (fx, fy, cx, cy), bent = MODELS[model]
     distortion = np.array([*(values[i] for i in bent), *[0.0] * (4 - len(bent))])
-    if not (np.isfinite(distortion).all() and np.abs(distortion).max() < MOST_DISTORTION):
+    if not (np.isfinite(distortion).all() and np.abs(distortion).max() < MAX_DISTORTION):
         raise DataError(f"{where}: the distortion is {' '.join(f'{v:g}' for v in distortion)}; copy the file again")
     return pinhole(values[fx], values[fy], values[cx], values[cy], where), _size(words[2:4], where), distortion
 
@@ -112,12 +112,12 @@ def _size(words: Sequence[str], where: str) -> Size:
 def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
     """Camera-to-world pose of each frame. Every second line lists points and may be empty."""
     pose_of: dict[int, Float64Array] = {}
-    is_of_points = False
+    uses_points = False
     for at, line in enumerate(_lines(path, where), 1):
-        if is_of_points or not line.strip() or line.startswith(b"#"):
-            is_of_points = False
+        if uses_points or not line.strip() or line.startswith(b"#"):
+            uses_points = False
             continue
-        is_of_points = True
+        uses_points = True
         words, place = line.decode("ascii", "replace").split(), f"{where} line {at}"
         if len(words) != 10:
             raise DataError(f"{place}: has {len(words)} words; expected 'id qw qx qy qz tx ty tz camera name'")
@@ -133,9 +133,9 @@ def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
 def _lines(path: Path, where: str) -> Iterator[bytes]:
     """The lines of a file that may have hundreds of megabytes, because it lists every point of every image."""
     with reading(where), opened(path) as stream:
-        while line := stream.readline(MOST_LINE_BYTES):
-            if len(line) == MOST_LINE_BYTES:
-                raise DataError(f"{where}: a line has more than {MOST_LINE_BYTES >> 20} MiB; copy the file again")
+        while line := stream.readline(MAX_LINE_BYTES):
+            if len(line) == MAX_LINE_BYTES:
+                raise DataError(f"{where}: a line has more than {MAX_LINE_BYTES >> 20} MiB; copy the file again")
             yield line
 
 

@@ -100,8 +100,8 @@ BENCHMARK_FOLDER = "metadata/semantic_benchmark"
 CLASSES_NAME, INSTANCES_NAME, MAP_NAME = LIST_NAMES = ("top100.txt", "top100_instance.txt", "map_benchmark.csv")
 WORD, COUNT, TARGET = COLUMNS = ("class", "count", "semantic_map_to")
 NO_CLASS = "None"  # in the mapping file: annotated, but not in the benchmark
-MOST_CLASSES = 10_000
-MOST_LETTERS = 200  # of the name of a class
+MAX_CLASSES = 10_000
+MAX_LETTERS = 200  # of the name of a class
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,9 @@ def _read_names(path: Path, where: str) -> tuple[str, ...]:
     while names and not names[-1].strip():  # blank lines at the end are not classes
         names.pop()
     for number, name in enumerate(names, 1):
-        if not name.strip() or not name.isprintable() or len(name) > MOST_LETTERS:
+        if not name.strip() or not name.isprintable() or len(name) > MAX_LETTERS:
             raise DataError(f"{where} line {number}: {name[:40]!a} is not a class name; copy the file again")
-    if not 1 <= len(names) <= MOST_CLASSES:
+    if not 1 <= len(names) <= MAX_CLASSES:
         raise DataError(f"{where}: has {len(names)} lines; expected one per class")
     if len(set(names)) != len(names):
         twice = next(name for row, name in enumerate(names) if name in names[:row])
@@ -177,7 +177,7 @@ def _read_map(path: Path, where: str) -> dict[str, str]:
 
 VARIANT = "scannetpp"
 TRUTH_NAMES = (MESH_NAME, MASK_NAME, SEGMENTS_NAME, OBJECTS_NAME)
-MOST_CLASSES_OF_A_VERTEX = 3  # multilabel_max of the toolkit
+MAX_CLASSES_PER_VERTEX = 3  # multilabel_max of the toolkit
 LEFT_OUT = -1
 # Ground truth is class * 1000 + instance: a larger instance would overflow into the next class.
 MAX_OBJECTS = 1000
@@ -225,12 +225,12 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
             f"at most {MAX_OBJECTS}"
         )
     members = vertices_of_segments(segments)
-    every_class, every_object = (np.zeros((n, MOST_CLASSES_OF_A_VERTEX), np.int32) for _ in range(2))
-    size = np.full((n, MOST_CLASSES_OF_A_VERTEX), np.inf)
+    every_class, every_object = (np.zeros((n, MAX_CLASSES_PER_VERTEX), np.int32) for _ in range(2))
+    size = np.full((n, MAX_CLASSES_PER_VERTEX), np.inf)
     n_laid = np.zeros(n, np.int64)
     for number, class_id in class_of.items():
         vertices = members.of(np.array(objects[number - 1].segments, np.int64))
-        vertices = vertices[n_laid[vertices] < MOST_CLASSES_OF_A_VERTEX]
+        vertices = vertices[n_laid[vertices] < MAX_CLASSES_PER_VERTEX]
         at = vertices, n_laid[vertices]
         every_class[at], every_object[at], size[at] = class_id, number, len(vertices)
         n_laid[vertices] += 1

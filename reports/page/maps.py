@@ -27,11 +27,11 @@ from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.metrics.matching.nearest import Candidates, first_rows
 from su3d_bench.reports.pictures.maps import map_cloud
 
-LEAST_SPACING_M = 0.015  # of drawn points; finer spacing is invisible on a screen
+MIN_SPACING_M = 0.015  # of drawn points; finer spacing is invisible on a screen
 COARSER = 1.15  # ratio between consecutive spacings that are tried
-STEPS_A_SPACING = 2  # a point stands in the middle of one of these, so the grid itself does not show
-MOST_CELLS = 1 << 16  # along an axis, in which a page counts
-NO_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
+STEPS_PER_SPACING = 2  # a point stands in the middle of one of these, so the grid itself does not show
+MAX_CELLS = 1 << 16  # along an axis, in which a page counts
+NO_GROUND_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
 NEAR_M = 0.05  # maximum distance between a map point and its ground truth
 COLOUR_NEAR_M = 0.06  # frames are sampled every few centimetres
 DEFLATE_LEVEL = 7  # level 9 takes five times as long for maps that are a fiftieth smaller
@@ -53,7 +53,7 @@ def thinned(points: Float32Array, most: int) -> Cloud:
     Coarser grids are laid over what the finest has left.
     """
     extent_m = max((float(np.ptp(column)) for column in points.T), default=0.0) if len(points) else 0.0
-    finest_m = max(LEAST_SPACING_M, STEPS_A_SPACING * extent_m / (MOST_CELLS - 2))
+    finest_m = max(MIN_SPACING_M, STEPS_PER_SPACING * extent_m / (MAX_CELLS - 2))
 
     def spacing(n_steps: int) -> float:
         return finest_m * COARSER**n_steps
@@ -72,7 +72,7 @@ def thinned(points: Float32Array, most: int) -> Cloud:
         while not is_above and n_steps > 1 and len(finer := _first_of_cells(left, spacing(n_steps - 1))) <= most:
             n_steps, rows = n_steps - 1, finer
     rows = finest[rows]
-    order = np.argsort(_curve(voxel_coordinates(points[rows], spacing(n_steps) / STEPS_A_SPACING)), kind="stable")
+    order = np.argsort(_curve(voxel_coordinates(points[rows], spacing(n_steps) / STEPS_PER_SPACING)), kind="stable")
     return Cloud(rows[order], points[rows[order]], spacing(n_steps))
 
 
@@ -113,12 +113,12 @@ def nearest_colours(points: Float32Array, seen: Candidates, seen_rgb: UInt8Array
 
 
 def nearest_classes(points: Float32Array, truth: Candidates, classes: Int64Array) -> Int64Array:
-    """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_TRUTH_NEAR``."""
+    """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_GROUND_TRUTH_NEAR``."""
     _, nearest_row = truth.nearest(points, NEAR_M)
     if not len(truth):
-        return np.full(len(points), NO_TRUTH_NEAR)
+        return np.full(len(points), NO_GROUND_TRUTH_NEAR)
     classes = np.where(classes >= 0, classes, NOT_SCORED)
-    return np.where(nearest_row >= 0, classes[nearest_row], NO_TRUTH_NEAR)
+    return np.where(nearest_row >= 0, classes[nearest_row], NO_GROUND_TRUTH_NEAR)
 
 
 def jpeg_text(rgb: UInt8Array, quality: int) -> str:
@@ -128,7 +128,7 @@ def jpeg_text(rgb: UInt8Array, quality: int) -> str:
 
 def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
     """A map in base64. ``planes`` (n,) or (n, 3) uint8 or uint16 go beside the positions; ``about`` is plain values."""
-    step = cloud.spacing_m / STEPS_A_SPACING
+    step = cloud.spacing_m / STEPS_PER_SPACING
     cells = voxel_coordinates(cloud.points, step)
     levels = _tree(_curve(cells))
     low = (cells.min(axis=0) + 0.5) * step if len(cells) else np.zeros(3)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.printing import escaped_json, plain_value
+from su3d_bench.core.safe_output import escaped_json, plain_value
 from su3d_bench.core.system.files import file_text
 from su3d_bench.formats.tables.table import Prose, Table
 from su3d_bench.reports.tables.formats import html_tables
@@ -23,7 +23,7 @@ SCRIPTS = (  # in the order in which they run
 )
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"
-MOST_OF_A_NAME = 80
+MAX_NAME_CHARACTERS = 80
 _ENDS_WITH_DIGITS = re.compile(r"(^|-)[0-9a-f]{8}$")
 PAGE = re.compile(r"[a-z0-9][a-z0-9-]{0,100}\.html")  # of every page of a site
 Kind = Literal["index", "method", "scene"]
@@ -77,7 +77,7 @@ def page_name(name: str) -> str:
     >>> page_name("opensu3d"), page_name("rooms/living0"), page_name("Rooms/living0")
     ('opensu3d', 'rooms-living0-75a7be8c', 'rooms-living0-07d100aa')
     """
-    plain = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:MOST_OF_A_NAME]
+    plain = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:MAX_NAME_CHARACTERS]
     if plain == name and not _ENDS_WITH_DIGITS.search(name):
         return name
     digits = digest_bytes(name.encode("utf-8", "surrogatepass"))[:8]

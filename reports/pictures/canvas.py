@@ -102,7 +102,7 @@ HEAT_STOPS = np.array(
 )
 N_OTHERS = 199  # colours for names that no class table has, a prime so that sums of letters spread
 GRID = np.arange(24, 256, 11)  # of each channel, among which colours are chosen
-LIGHTNESS, LEAST_CHROMA = (0.42, 0.86), 0.16  # as below: neither black nor white, and told from the pale surfaces
+LIGHTNESS, MIN_CHROMA = (0.42, 0.86), 0.16  # as below: neither black nor white, and told from the pale surfaces
 HUE_WEIGHT = 2.0  # against lightness, which shading moves
 TO_CONES = np.array(
     [
@@ -167,7 +167,7 @@ def _palette(n: int) -> tuple[Colour, ...]:
     """``n`` colours: each the farthest in Oklab from all before it and from the pale ones."""
     grid = np.stack(np.meshgrid(GRID, GRID, GRID, indexing="ij"), -1).reshape(-1, 3)
     places = _oklab(grid)
-    is_strong = np.hypot(places[:, 1], places[:, 2]) > LEAST_CHROMA
+    is_strong = np.hypot(places[:, 1], places[:, 2]) > MIN_CHROMA
     is_strong &= (places[:, 0] > LIGHTNESS[0]) & (places[:, 0] < LIGHTNESS[1])
     grid, places = grid[is_strong], places[is_strong]
     pale = _oklab(np.array([*ROOM_SURFACES.values(), NO_INSTANCE]))

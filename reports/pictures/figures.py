@@ -23,7 +23,7 @@ CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
 LEGEND_WIDTH_IN = 2.6
 DPI = 200  # of pictures within the figure
 CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 47, 3  # height of a line, its characters, how many of them
-MOST_ROW_TITLE, MOST_TAGS = 110, 40
+MAX_ROW_TITLE, MAX_TAGS = 110, 40
 FEW_TAGS, AWAY = 6, 0.11  # so few names stand beside what they name, this share of the height away
 INK, SOFT_INK = "#1a1a1a", "#606060"
 
@@ -79,7 +79,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
     for r, row in enumerate(rows):
         top = tops[r]
         room = int(width * 13)
-        title = printable(row.title, min(MOST_ROW_TITLE, room))
+        title = printable(row.title, min(MAX_ROW_TITLE, room))
         page.text(GAP_IN, top + 0.03, title, 8.5, colour=INK, weight="bold")
         if len(title) + len(row.note) < room:
             page.text(width - GAP_IN, top + 0.04, printable(row.note, 60), 7, colour=SOFT_INK, ha="right")
@@ -115,7 +115,7 @@ class _Page(canvas.Canvas):
         height, width = cell.picture.shape[:2]
         taken: list[tuple[float, float, float]] = []
         is_beside = len(cell.tags) <= FEW_TAGS
-        for tag in cell.tags[:MOST_TAGS]:
+        for tag in cell.tags[:MAX_TAGS]:
             text = canvas.drawable(printable(tag.text, 24))
             half = 0.011 * len(text) + 0.01
             row = tag.y + (AWAY if tag.y < 2 * AWAY else -AWAY) if is_beside else tag.y
@@ -145,10 +145,10 @@ class _Page(canvas.Canvas):
 
 
 PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 760, 640, 14
-LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5
+LINE_HEIGHT, CHARACTERS_A_LINE, MAX_LINES = 22, 165, 5
 ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
-MOST_LABELS, LABEL_HEIGHT = 14, 20
-MOST_CHARACTERS = 40  # of a label
+MAX_LABELS, LABEL_HEIGHT = 14, 20
+MAX_CHARACTERS = 40  # of a label
 FEW = 4  # more boxes than these are drawn with thin lines
 PALE = 0.22  # how much of its colour an object keeps that is not spoken of
 # The corners of a box, bit i for axis i, that its twelve edges join.
@@ -156,7 +156,7 @@ EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a
 
 
 @dataclass(frozen=True)
-class SpokenOf:
+class AnswerRows:
     """Rows of the map that are the answer, and rows that it was held against."""
 
     answer: tuple[int, ...]
@@ -171,11 +171,11 @@ class SpokenOf:
 
 
 def draw_reasoning(
-    instances: Instances, spoken_of: SpokenOf, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
+    instances: Instances, spoken_of: AnswerRows, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
 ) -> None:
     """Write the picture of an answer: ``names`` label the instances, ``lines`` stand under the ``question``."""
-    names = [canvas.drawable(printable(name, MOST_CHARACTERS)) for name in names]
-    written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MOST_LINES]
+    names = [canvas.drawable(printable(name, MAX_CHARACTERS)) for name in names]
+    written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MAX_LINES]
     header = 52 + LINE_HEIGHT * len(written)
     width, height = 2 * PANEL_WIDTH + 3 * MARGIN, header + PANEL_HEIGHT + MARGIN
     page = canvas.Canvas(width, height)
@@ -192,7 +192,7 @@ def draw_reasoning(
     page.write(path)
 
 
-def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
+def _palette(names: Sequence[str], spoken_of: AnswerRows) -> UInt8Array:
     """A colour a row: strong for what is spoken of, pale for the rest; the last one is that of no instance."""
     own = np.array([*canvas.instance_colours(names), canvas.NO_INSTANCE], np.float64)
     pale = PALE * own + (1 - PALE) * 235.0
@@ -201,7 +201,7 @@ def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
     return np.rint(pale).astype(np.uint8)
 
 
-def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[canvas.Camera, canvas.View, str]]:
+def _two_views(cloud: Cloud, spoken_of: AnswerRows) -> list[tuple[canvas.Camera, canvas.View, str]]:
     """The view from above, and that from the corner where most of what is spoken of is seen."""
     cameras = canvas.view_cameras(canvas.room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
     above, *corners = [(camera, canvas.render(cloud.points, SQUARE_M, camera)) for camera in cameras]
@@ -211,14 +211,14 @@ def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[canvas.Camera, c
 
 
 def _draw_spoken_of(
-    axes: Any, camera: canvas.Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]
+    axes: Any, camera: canvas.Camera, instances: Instances, spoken_of: AnswerRows, names: Sequence[str]
 ) -> None:
     """Boxes and names of what is spoken of, and a line from each answer to the nearest reference."""
     from matplotlib.patheffects import withStroke
 
     halo = [withStroke(linewidth=3, foreground="white")]
     centres = instances.centroids.astype(np.float64)
-    for row in spoken_of.answer[:MOST_LABELS]:
+    for row in spoken_of.answer[:MAX_LABELS]:
         others = np.array([k for k in spoken_of.reference if k != row and not _touch(instances, k, row)], int)
         if len(others):
             nearest = int(others[np.argmin(np.linalg.norm(centres[others] - centres[row], axis=1))])
@@ -230,7 +230,7 @@ def _draw_spoken_of(
     edges: dict[str, Any] = (
         {"linewidth": 1.4, "path_effects": halo} if len(spoken_of.rows) <= FEW else {"linewidth": 0.9}
     )
-    for row in spoken_of.rows[:MOST_LABELS]:
+    for row in spoken_of.rows[:MAX_LABELS]:
         shade = canvas.hex_of(spoken_of.colour(row))
         low, high = instances.boxes[row].astype(np.float64)
         corners = np.array([[high[i] if k >> i & 1 else low[i] for i in range(3)] for k in range(8)])
@@ -256,7 +256,7 @@ def _free_place(corners: Float64Array, name: str, placed: list[Float64Array]) ->
     seen = corners[np.isfinite(corners).all(axis=1)]
     start = np.array([seen[:, 0].mean(), seen[:, 1].min() - 10.0]) if len(seen) else half
     start = np.clip(start, half, [PANEL_WIDTH - half[0], PANEL_HEIGHT - half[1]])
-    for step in range(4 * MOST_LABELS):
+    for step in range(4 * MAX_LABELS):
         down = LABEL_HEIGHT / 2 * (step // 2) * (-1 if step % 2 else 1)
         place = start + np.array([0.0, down])
         is_inside = half[1] <= place[1] <= PANEL_HEIGHT - half[1]

@@ -22,9 +22,9 @@ from su3d_bench.reports.pictures.canvas import BACKGROUND, drawable
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
 TOP_HEIGHT, LOW_HEIGHT = 420, 320
-TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 4  # two lines each of a question and its answer
+TITLE_SIZE, TITLE_LINE, MAX_TITLE_LINES = 25, 33, 4  # two lines each of a question and its answer
 FIRST_WIDE, REST_WIDE = 60, 88  # characters of a line of the title
-MOST_TAGS, MOST_TAG_TEXT, TAG_LINE = 8, 28, 19
+MAX_TAGS, MAX_TAG_TEXT, TAG_LINE = 8, 28, 19
 OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that no heat scale has, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
 ROOM_COLUMNS, ROOM_GAP = 3, 6  # photographs of the room side by side, pixels between them
@@ -255,14 +255,14 @@ def _place(page: Any, draw: Any, panel: Panel, at: tuple[int, int], size: tuple[
         _draw_ring(shown, panel.ring, panel.eye)
     corner = (at[0] + (size[0] - inner[0]) // 2, at[1] + CAPTION + (size[1] - inner[1]) // 2)
     page.paste(Image.fromarray(shown), corner)
-    draw_tags(draw, panel.tags[:MOST_TAGS], corner, inner)
+    draw_tags(draw, panel.tags[:MAX_TAGS], corner, inner)
 
 
 def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple[int, int]) -> None:
     """Names at their places, moved down where they would cover each other."""
     taken: list[tuple[float, float, float]] = []
     for tag in tags:
-        text = printable(tag.text, MOST_TAG_TEXT)
+        text = printable(tag.text, MAX_TAG_TEXT)
         wide = 8.0 * len(text) + 8
         x = float(np.clip(tag.x * size[0] - wide / 2, 2, max(2.0, size[0] - wide - 2)))
         y = float(np.clip(tag.y * size[1] - 30, 2, size[1] - TAG_LINE - 2))
@@ -284,12 +284,12 @@ def title_lines(title: tuple[str, ...]) -> list[tuple[str, bool]]:
     lines: list[tuple[str, bool]] = []
     for k, text in enumerate(title):
         wide = FIRST_WIDE if k == 0 else REST_WIDE
-        wrapped = textwrap.wrap(printable(text, MOST_TITLE_LINES * wide), wide) or [""]
+        wrapped = textwrap.wrap(printable(text, MAX_TITLE_LINES * wide), wide) or [""]
         lines += [(line, k == 0) for line in wrapped]
-    if len(lines) > MOST_TITLE_LINES:
-        last, is_first = lines[MOST_TITLE_LINES - 1]
+    if len(lines) > MAX_TITLE_LINES:
+        last, is_first = lines[MAX_TITLE_LINES - 1]
         wide = FIRST_WIDE if is_first else REST_WIDE
-        lines = [*lines[: MOST_TITLE_LINES - 1], (last[: wide - 3] + "...", is_first)]
+        lines = [*lines[: MAX_TITLE_LINES - 1], (last[: wide - 3] + "...", is_first)]
     return lines
 
 

@@ -130,10 +130,10 @@ def pale(colours: UInt8Array, share: float) -> UInt8Array:
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn
 SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
-LEGEND_STEP, COLUMN_WIDTH, MOST_COLUMNS = 22, 250, 10  # pixels; of names and their colours
-MOST_NAME = 26  # characters of a legend's name
+LEGEND_STEP, COLUMN_WIDTH, MAX_COLUMNS = 22, 250, 10  # pixels; of names and their colours
+MAX_NAME = 26  # characters of a legend's name
 HEAT_WIDTH, BAR_HEIGHT = 290, 16  # of what stands beside a heat map
-MOST_RANKS = 20  # written at instances; more would hide what they name
+MAX_RANKS = 20  # written at instances; more would hide what they name
 RANK_RADIUS, SMALL_PIXELS = 12, 2500  # a rank hides an instance of fewer pixels
 PALE = "#555555"
 VIEW_TITLES = ("from above", "from one corner", "from the other corner")
@@ -199,7 +199,7 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
     page = canvas.Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
     page.text(14, 16, printable(title, 110), 14, fontweight="bold")
     for axes, owners in zip(_place_views(page, header, "", pictures), seen, strict=True):
-        _write_ranks(axes, owners, order[:MOST_RANKS])
+        _write_ranks(axes, owners, order[:MAX_RANKS])
     _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
     page.write(path)
 
@@ -338,7 +338,7 @@ def _write_picture(
     header = 46
     height = len(rows) * VIEW_HEIGHT + header
     a_column = (height - header) // LEGEND_STEP
-    n_columns = min(MOST_COLUMNS, -(-len(legend) // a_column))
+    n_columns = min(MAX_COLUMNS, -(-len(legend) // a_column))
     page = canvas.Canvas(3 * VIEW_WIDTH + n_columns * COLUMN_WIDTH, height)
     page.text(14, 16, printable(title, 150), 14, fontweight="bold")
     for r, (name, pictures) in enumerate(rows):
@@ -351,7 +351,7 @@ def _write_picture(
         column, row_of = divmod(k, a_column)
         left, middle = 3 * VIEW_WIDTH + column * COLUMN_WIDTH, header + LEGEND_STEP * row_of + 12
         page.text(left + 8, middle, "\u25a0", 15, colour=canvas.hex_of(rgb), va="center")
-        page.text(left + 30, middle, printable(name, MOST_NAME), 10, va="center")
+        page.text(left + 30, middle, printable(name, MAX_NAME), 10, va="center")
     page.write(path)
 
 

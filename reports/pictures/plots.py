@@ -33,14 +33,14 @@ HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++", "ooo", "---")
 MAX_DRAWN = 2000  # points a method; more only make the file large
 N_SIZES = 10  # markers a method along the axis of sizes
 PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
-LETTERS_AN_INCH = 15  # of a legend's type
-TITLE_LETTERS_AN_INCH = 12
+LETTERS_PER_INCH = 15  # of a legend's type
+TITLE_LETTERS_PER_INCH = 12
 DPI = 150
 MIB = 2**20
 TITLE_SIZE = 10
 NARROW = 6  # times from one end of an axis to the other, where 1, 2 and 5 may be too few numbers
 POINTS, UPDATES = "points of the map", "updates so far"
-MOST_TITLE_NAMES = 3  # of methods; more are counted
+MAX_TITLE_NAMES = 3  # of methods; more are counted
 
 
 def draw_timing(
@@ -155,7 +155,7 @@ def cost_sentence(found: Mapping[str, Sequence[str]], against: str) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     """The names as a sentence has them, or how many there are."""
-    if len(names) > MOST_TITLE_NAMES:
+    if len(names) > MAX_TITLE_NAMES:
         return f"{len(names)} methods"
     return " and ".join([*([", ".join(names[:-1])] if len(names) > 1 else []), names[-1]])
 
@@ -163,7 +163,7 @@ def _listed(names: Sequence[str]) -> str:
 def _entitle(figure: Figure, axes: Axes, sentence: str) -> None:
     """Write the sentence above the panel, in as many lines as its width asks for."""
     inches = figure.get_figwidth() * axes.get_position().width
-    lines = textwrap.wrap(sentence, max(30, int(inches * TITLE_LETTERS_AN_INCH)))
+    lines = textwrap.wrap(sentence, max(30, int(inches * TITLE_LETTERS_PER_INCH)))
     axes.set_title("\n".join(lines), loc="left", fontsize=TITLE_SIZE)
 
 
@@ -300,7 +300,7 @@ def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if not named:
         return
-    letters = figure.get_figwidth() * LETTERS_AN_INCH - 10 * LEGEND_COLUMNS
+    letters = figure.get_figwidth() * LETTERS_PER_INCH - 10 * LEGEND_COLUMNS
     ncols = max(1, min(LEGEND_COLUMNS, int(letters / max(map(len, named)))))
     figure.legend([*named.values()], [*named], loc="outside lower center", ncols=ncols, fontsize=8, frameon=False)
 
@@ -431,7 +431,7 @@ def _span(value: float) -> float:
 
 SHIFT_PANEL_WIDTH, SHIFT_ROW_HEIGHT, NAMES_WIDTH, EXTRA = 4.4, 0.42, 3.2, 1.5  # inches
 ENDS, UP, DOWN = "#555555", "#2f6f4f", "#a4432f"  # hatches tell up and down apart without colours
-MOST_OF_A_NAME = 44  # characters
+MAX_NAME_CHARACTERS = 44  # characters
 
 
 def draw_walk(apart: Mapping[str, Any], path: Path) -> None:
@@ -471,7 +471,10 @@ def _draw_shift_panel(axes: Any, apart: Mapping[str, Any], name: str, *, has_nam
     axes.set_xlim(low - 0.1 * span, high + 0.3 * span)
     axes.set_ylim(len(places) + 0.6, -0.6)
     labels = [apart["first"], *(", ".join(step["rules"]) for step in walk["steps"]), apart["second"]]
-    shown = [drawable(text if len(text) <= MOST_OF_A_NAME else text[: MOST_OF_A_NAME - 3] + "...") for text in labels]
+    shown = [
+        drawable(text if len(text) <= MAX_NAME_CHARACTERS else text[: MAX_NAME_CHARACTERS - 3] + "...")
+        for text in labels
+    ]
     axes.set_yticks(range(len(labels)), shown if has_names else [""] * len(labels), fontsize=9, parse_math=False)
     axes.set_title(f"{name}: {end - start:+.1f} points", fontsize=10.5, loc="left", parse_math=False)
     _without_frame(axes, "per cent")

@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, printable
 from su3d_bench.core.geometry import back_project, turn_to_z, valid_depth
-from su3d_bench.core.interfaces import Dataset, SaysUp
+from su3d_bench.core.interfaces import Dataset, ProvidesUpAxis
 from su3d_bench.core.types import (
     BoolArray,
     Float32Array,
@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class SceneLook:
+class SceneView:
     """A scene as a picture needs it.
 
     ``poses`` (n, 4, 4) camera-to-world of the cameras that were read, of ``n_frames`` in the scene; ``seen`` (m, 3) m
@@ -65,7 +65,7 @@ class SceneLook:
 
 def look_at(
     dataset: Dataset, scene: str, stride: int | None = None, progress: Progress = lambda n_done, n: None
-) -> SceneLook:
+) -> SceneView:
     """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its fullest truth.
 
     A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault, nor are frames.
@@ -96,14 +96,14 @@ def look_at(
         depth = frame.depth_m[pixels]
         ranges += list(np.percentile(depth, PERCENTILES)) if len(depth) else []
     progress(len(positions), len(positions))
-    up = dataset.up(scene) if len(frames) and isinstance(dataset, SaysUp) else None
+    up = dataset.up(scene) if len(frames) and isinstance(dataset, ProvidesUpAxis) else None
     turn = np.eye(3) if up is None or up.axis is None or up.is_turned else turn_to_z(up.axis)
     drawn = np.array(poses).reshape(-1, 4, 4)
     drawn[:, :3] = turn @ drawn[:, :3]
     seen = (np.concatenate(points) @ turn.T).astype(np.float32)
     depth_m = (float(min(ranges, default=0.0)), float(max(ranges, default=0.0)))
     about = (f"{dataset.name}/{scene}", n_frames, drawn, seen, np.concatenate(colours), tuple(shown), depth_m)
-    return SceneLook(*about, truth, reason, up)
+    return SceneView(*about, truth, reason, up)
 
 
 def evenly(n: int, most: int) -> Sequence[int]:
@@ -162,24 +162,24 @@ MARGIN, HEADER, CAPTION = 16, 76, 26
 PANEL_WIDTH, PANEL_HEIGHT = (WIDTH - 4 * MARGIN) // 3, 520
 LEGEND_COLUMNS, LEGEND_STEP = 6, 21  # of classes, below the panels
 LEGEND_WIDTH = (WIDTH - 2 * MARGIN) // LEGEND_COLUMNS
-MOST_CLASSES = 600  # in the legend, thrice those of the largest label space
+MAX_CLASSES = 600  # in the legend, thrice those of the largest label space
 REASON_LINES = 6
 FRAME_COLUMNS, SCALE_WIDTH = 6, 74
 FRAME_WIDTH = (WIDTH - 2 * MARGIN - SCALE_WIDTH) // FRAME_COLUMNS
 SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw this near to it
-LEAST_DRAWN_M = 0.012
+MIN_DRAWN_M = 0.012
 UNSEEN = (214, 214, 210)
 SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 WALK_TITLE, NO_WALK_TITLE = "walk, over the ground truth in the frames' colours", "ground truth, without frames"
 WALK, START, END = "#d6246e", "#1a9850", "#111111"
 # Walks outside the truth are drawn where they are, up to this far; farther ones would leave no room for the scene.
-MOST_BEYOND_M = 10.0
+MAX_BEYOND_M = 10.0
 
 
 Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, and the camera of a view from above
 
 
-def draw_scene_picture(look: SceneLook, path: Path) -> None:
+def draw_scene_picture(look: SceneView, path: Path) -> None:
     """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
     frame_height = 0
     if look.shown:
@@ -211,7 +211,7 @@ def draw_scene_picture(look: SceneLook, path: Path) -> None:
     page.write(path)
 
 
-def facts_line(look: SceneLook) -> str:
+def facts_line(look: SceneView) -> str:
     """The counts of the scene in one line."""
     words = ["no frames"]
     if look.shown:
@@ -231,7 +231,7 @@ def facts_line(look: SceneLook) -> str:
     return " \u00b7 ".join(words)
 
 
-def _panels(look: SceneLook) -> tuple[Panel, ...]:
+def _panels(look: SceneView) -> tuple[Panel, ...]:
     if look.truth is None:
         points = look.seen if len(look.seen) else look.poses[:, :3, 3].astype(np.float32)
         colours = look.seen_rgb if len(look.seen) else np.full((len(points), 3), UNSEEN, np.uint8)
@@ -255,14 +255,14 @@ def _panels(look: SceneLook) -> tuple[Panel, ...]:
     )
 
 
-def _camera_above(look: SceneLook, points: Float32Array) -> canvas.Camera:
+def _camera_above(look: SceneView, points: Float32Array) -> canvas.Camera:
     """The view from above that holds the points and the walk, as far as it stays near."""
     bounds = canvas.room_bounds(points)
     if not len(look.poses):
         return canvas.view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
     places = look.poses[:, :2, 3]
-    bounds[0, :2] = np.maximum(np.minimum(bounds[0, :2], places.min(axis=0)), bounds[0, :2] - MOST_BEYOND_M)
-    bounds[1, :2] = np.minimum(np.maximum(bounds[1, :2], places.max(axis=0)), bounds[1, :2] + MOST_BEYOND_M)
+    bounds[0, :2] = np.maximum(np.minimum(bounds[0, :2], places.min(axis=0)), bounds[0, :2] - MAX_BEYOND_M)
+    bounds[1, :2] = np.minimum(np.maximum(bounds[1, :2], places.max(axis=0)), bounds[1, :2] + MAX_BEYOND_M)
     return canvas.view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
 
 
@@ -271,12 +271,12 @@ def _drawn_size(points: Float32Array) -> float:
     from scipy.spatial import KDTree
 
     if len(points) < 2:
-        return LEAST_DRAWN_M
+        return MIN_DRAWN_M
     distance, _ = KDTree(points).query(points[:: max(1, len(points) // 1000)], k=2)
-    return max(LEAST_DRAWN_M, 2.0 * float(np.median(distance[:, 1])))
+    return max(MIN_DRAWN_M, 2.0 * float(np.median(distance[:, 1])))
 
 
-def _seen_colours(look: SceneLook, points: Float32Array) -> UInt8Array:
+def _seen_colours(look: SceneView, points: Float32Array) -> UInt8Array:
     """Of each point the colour that a camera saw at its place; pale where none did."""
     from scipy.spatial import KDTree
 
@@ -320,7 +320,7 @@ def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
 
 
 def _legend_rows(n_classes: int) -> int:
-    return -(-min(n_classes, MOST_CLASSES) // LEGEND_COLUMNS)
+    return -(-min(n_classes, MAX_CLASSES) // LEGEND_COLUMNS)
 
 
 def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
@@ -328,7 +328,7 @@ def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
     classes = _classes(truth)
     n_rows = _legend_rows(len(classes))
     palette: dict[str, canvas.Colour] = canvas.class_colours([name for name, _, _ in classes])
-    for k, (name, n_objects, n_points) in enumerate(classes[:MOST_CLASSES]):
+    for k, (name, n_objects, n_points) in enumerate(classes[:MAX_CLASSES]):
         column, row = divmod(k, n_rows)
         left = MARGIN + column * LEGEND_WIDTH
         objects, points = left + LEGEND_WIDTH - 84, left + LEGEND_WIDTH - 24
@@ -379,7 +379,7 @@ def _draw_scale(axes: Any, camera: canvas.Camera) -> None:
     axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=canvas.DARK, va="bottom", bbox=canvas.paper())
 
 
-def _draw_frames(page: canvas.Canvas, look: SceneLook, top: int, height: int) -> None:
+def _draw_frames(page: canvas.Canvas, look: SceneView, top: int, height: int) -> None:
     """Colour above depth, the scale of depth at the right."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

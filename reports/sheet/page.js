@@ -144,7 +144,7 @@
     return field;
   }
 
-  function tellHow() {
+  function showInstructions() {
     const how = byId("how");
     how.append(...sheet.guide.map((sentence) => element("p", sentence)));
     for (const ask of sheet.asks) {
@@ -216,7 +216,7 @@
   window.addEventListener("beforeunload", (event) => {
     if (!canSave && !isExported) event.preventDefault();
   });
-  tellHow();
+  showInstructions();
   restore();
   show();
 })();

@@ -17,7 +17,7 @@ from su3d_bench.core.system.files import file_text
 from su3d_bench.reports.page.page import embedded_json, rendered
 
 HERE = Path(__file__).parent
-MOST_CHARACTERS = 2000  # of a text in a list
+MAX_CHARACTERS = 2000  # of a text in a list
 
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
@@ -42,7 +42,7 @@ def list_page(title: str, note: str, entries: Sequence[Entry], pictures: str) ->
     from jinja2 import Environment
 
     environment = Environment(autoescape=True)
-    environment.filters["text"] = lambda text: printable(text, MOST_CHARACTERS)
+    environment.filters["text"] = lambda text: printable(text, MAX_CHARACTERS)
     environment.filters["source"] = lambda name: quote(f"{pictures}/{name}")
     template = environment.from_string(file_text(HERE / "list.html.j2"))
     shown = [(entry, [name for name in entry.pictures if is_file_name(name)]) for entry in entries]

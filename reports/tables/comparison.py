@@ -8,7 +8,7 @@ from typing import Any
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
-from su3d_bench.metrics.protocols.mixtures import UNMOVED
+from su3d_bench.metrics.protocols.mixtures import CONSTANT_RULES
 from su3d_bench.reports.tables.model import few_scenes
 
 HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
@@ -147,7 +147,7 @@ def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Ta
     return text_table(protocol, rows, heading=protocol, caption=f": {title}")
 
 
-MOST_OF_A_RULE = 60  # characters
+MAX_RULE_CHARACTERS = 60  # characters
 SUM = "points that a rule adds, the mean over all orders in which rules can be changed; they sum to the difference"
 DRAWN = "points that a rule adds, the mean over {n} orders that were drawn, ± its standard error; the sum is exact"
 
@@ -178,7 +178,7 @@ def _walk_table(apart: Mapping[str, Any]) -> Table:
         f"{SUM if n is None else DRAWN.format(n=n)}; beside it the least and the most that it adds anywhere",
         "rules in one line depend on one another and are changed together",
     ]
-    if any(one["rule"] in UNMOVED for one in apart["differing"]):
+    if any(one["rule"] in CONSTANT_RULES for one in apart["differing"]):
         notes.append("the encoder is the run's own under both")
     title = f"{walk['run']}: {walk['method']}, {counted(len(walk['scenes']), 'scene')}"
     return text_table("walk", rows, heading=title, notes=notes)
@@ -205,12 +205,12 @@ def _alone(mine: Sequence[Any], other: Sequence[Any]) -> str:
     if not own:
         return ""
     rest = f" and {len(own) - 3} more" if len(own) > 3 else ""
-    return f", it alone: {printable(', '.join(own[:3]), MOST_OF_A_RULE)}{rest}"
+    return f", it alone: {printable(', '.join(own[:3]), MAX_RULE_CHARACTERS)}{rest}"
 
 
 def _shown(value: Any) -> str:
     if value is None or value in ([], {}):
         return "none"
     if isinstance(value, Mapping):
-        return printable(", ".join(f"{key} = {_shown(item)}" for key, item in value.items()), MOST_OF_A_RULE)
-    return printable(toml_value(value), MOST_OF_A_RULE)
+        return printable(", ".join(f"{key} = {_shown(item)}" for key, item in value.items()), MAX_RULE_CHARACTERS)
+    return printable(toml_value(value), MAX_RULE_CHARACTERS)

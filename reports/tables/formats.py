@@ -17,7 +17,7 @@ from typing import Any
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.system.files import file_text
-from su3d_bench.formats.tables.table import MOST_OF_A_CELL, Cell, Prose, Table, blocks_of, csv_lines
+from su3d_bench.formats.tables.table import MAX_CELL_CHARACTERS, Cell, Prose, Table, blocks_of, csv_lines
 from su3d_bench.reports.tables.latex import latex
 
 CSV_COLUMNS = (
@@ -32,8 +32,8 @@ _MARKUP = re.compile(
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
 TITLE = "su3d-bench tables"
-MOST_ON_A_LINE = 28  # characters of a cell
-MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
+MAX_CELL_LINE = 28  # characters of a cell
+MAX_NOTE_CHARACTERS = 7_000  # characters: it may name every scene of a data set
 
 
 def markdown(parts: Sequence[Table | Prose]) -> str:
@@ -56,16 +56,16 @@ def _laid_out(parts: Sequence[Table | Prose], shown: Callable[[str, int], str], 
 def _block(part: Table | Prose, shown: Callable[[str, int], str], width: int | None) -> str:
     if isinstance(part, Prose):
         begin = "- " if part.is_list else ""
-        return "\n".join(_folded(shown(line, MOST_OF_A_NOTE), width, begin) for line in part.lines)
-    head = [shown(text, MOST_OF_A_CELL) for text in (part.head, *part.columns)]
-    rows = [[shown(row.title, MOST_OF_A_CELL), *(_marked(cell, shown) for cell in row.cells)] for row in part.rows]
+        return "\n".join(_folded(shown(line, MAX_NOTE_CHARACTERS), width, begin) for line in part.lines)
+    head = [shown(text, MAX_CELL_CHARACTERS) for text in (part.head, *part.columns)]
+    rows = [[shown(row.title, MAX_CELL_CHARACTERS), *(_marked(cell, shown) for cell in row.cells)] for row in part.rows]
     lines = aligned([head, *rows]) if rows else []
     if width is not None and lines and len(lines[0]) > width:
         lines = _on_its_side([head, *rows], width)
-    heading = f"**{shown(part.heading, MOST_OF_A_CELL)}**" if part.heading else ""
+    heading = f"**{shown(part.heading, MAX_CELL_CHARACTERS)}**" if part.heading else ""
     gap = " " if heading and part.caption.startswith(" ") else ""
-    caption = _folded(f"{heading}{gap}{shown(part.caption, MOST_OF_A_CELL)}", width)
-    notes = [_folded(shown(note, MOST_OF_A_NOTE), width, "- ") for note in part.notes]
+    caption = _folded(f"{heading}{gap}{shown(part.caption, MAX_CELL_CHARACTERS)}", width)
+    notes = [_folded(shown(note, MAX_NOTE_CHARACTERS), width, "- ") for note in part.notes]
     return "\n\n".join(block for block in (caption, "\n".join(lines), "\n".join(notes)) if block)
 
 
@@ -110,11 +110,11 @@ def _on_its_side(rows: Sequence[Sequence[str]], width: int) -> list[str]:
 
 def _marked(cell: Cell, shown: Callable[[str, int], str]) -> str:
     if not cell.is_best:
-        return shown(cell.whole, MOST_OF_A_CELL)
-    return f"**{shown(cell.text, MOST_OF_A_CELL)}** {shown(cell.beside, MOST_OF_A_CELL)}".rstrip()
+        return shown(cell.whole, MAX_CELL_CHARACTERS)
+    return f"**{shown(cell.text, MAX_CELL_CHARACTERS)}** {shown(cell.beside, MAX_CELL_CHARACTERS)}".rstrip()
 
 
-def markup_free(text: str, most: int = MOST_OF_A_CELL) -> str:
+def markup_free(text: str, most: int = MAX_CELL_CHARACTERS) -> str:
     r"""``text`` on one line as Markdown shows it letter for letter: no tag, link, emphasis, heading or end of a cell.
 
     >>> markup_free("<b> [a](http://x) | *top_m=5* [1.0, 2.0]"), markup_free("# 1"), markup_free("_a_b")
@@ -191,7 +191,7 @@ def _html(table: Table | Prose) -> str:
 
 def _short(text: str) -> str:
     """What keeps a number with its interval, or a name, on one line: the box scrolls where the screen is narrow."""
-    return ' class="short"' if len(text) <= MOST_ON_A_LINE else ""
+    return ' class="short"' if len(text) <= MAX_CELL_LINE else ""
 
 
 def _list(lines: Sequence[str]) -> str:
@@ -205,7 +205,7 @@ def _strong(cell: Cell) -> str:
 
 def safe(text: str) -> str:
     """``text`` on one line, without what HTML would take for its own."""
-    return html.escape(printable(text, MOST_OF_A_CELL))
+    return html.escape(printable(text, MAX_CELL_CHARACTERS))
 
 
 FORMATS: Mapping[str, Callable[[Sequence[Table | Prose]], str]] = {

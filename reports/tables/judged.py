@@ -8,14 +8,14 @@ from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Table, TableRow, bracketed, percent, signed, text_table
-from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
+from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, remarks_starting
 from su3d_bench.numerics.statistics import ALPHA, holm
 from su3d_bench.reports.tables import paper
-from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
+from su3d_bench.reports.tables.model import ANNOTATED_SUFFIX, Measured
 
 REFINED = "refined label (n')"
 PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning
-WHO_DID = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
+ROLE_LABELS = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def judged_table(
     reported, sources = _reported(paper.figures_of(is_wanted=with_published, table=number), names, shown, parts)
     # people judge the retrieval and labels of the paper, and its reasoning
     judges = [] if all(row.is_by_people for row in rows) else ["judges"]
-    made_by = [who for row in rows for start in WHO_DID.values() for who in said_by(row.warnings, start)]
+    made_by = [who for row in rows for start in ROLE_LABELS.values() for who in remarks_starting(row.warnings, start)]
     models = [] if all(PAPER_MODEL in who for who in made_by) else ["language model"]
     setup = paper.other_setup(rows, is_its_protocol=True, datasets=tuple(paper.PAPER_SCENES), more=(*models, *judges))
     caption = f"{layout.subject} on {', '.join(names)}{setup}."
@@ -93,7 +93,7 @@ def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: paper
     body: list[TableRow] = []
     notes: list[str] = []
     columns: tuple[str, ...] = ()
-    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith(BY_PEOPLE)):
+    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith(ANNOTATED_SUFFIX)):
         rows = [row for row in measured if row.protocol == protocol]
         if not any(row.per_scene for row in rows):
             continue
@@ -173,14 +173,14 @@ def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> T
     """``row`` with who made the labels or answers and its judge, and each cell with the number's own name, by which a
     paper is checked."""
     label = row.label.replace(REFINED, f"{REFINED[:-1]} {_refined_by(part)})" if _refined_by(part) else REFINED)
-    solvers = said_by(part.warnings, ANSWERED_BY)
+    solvers = remarks_starting(part.warnings, ANSWERED_BY)
     label += f", answers by {' and '.join(solvers)}" if solvers else ""
     return replace(row, label=f"{label}, {judge}", group=judge, cells=tuple(_own(c, layout) for c in row.cells))
 
 
 def _refined_by(part: Measured) -> str:
     """What label n' is: a vote, or a model's name."""
-    who = [source.partition(" of ")[0] for source in said_by(part.warnings, REFINED_BY)]
+    who = [source.partition(" of ")[0] for source in remarks_starting(part.warnings, REFINED_BY)]
     said = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
     return " and ".join(dict.fromkeys(printable(one, 100) for one in said))
 
@@ -204,8 +204,8 @@ SUBJECTS = {
     "questions": ("Generated questions", "do they make sense, and are their wording and their answer right?"),
 }
 JUDGES = {"people": "people", "automatic": "ground truth"}
-ABOUT_TRUTH = "The ground truth judges the same items, as far as it knows them"
-ABOUT_QUESTIONS = "A question is as right as the worst of what is said of it; arguable: those that are no worse"
+GROUND_TRUTH_NOTE = "The ground truth judges the same items, as far as it knows them"
+QUESTION_NOTE = "A question is as right as the worst of what is said of it; arguable: those that are no worse"
 SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
 
 
@@ -247,10 +247,14 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
         notes=(
             "Per cent; in brackets Wilson's 95 % interval over items, then the number of items. An item that "
             "several people judged counts once, with the share of them that said so. "
-            + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
+            + (QUESTION_NOTE if scores["kind"] == "questions" else GROUND_TRUTH_NOTE),
             f"set {scores['sheet_id']}{origin}; {judged}",
             *(printable(remark, 300) for remark in scores["remarks"]),
-            *([f"{WHO_DID[scores['kind']]}{printable(scores['answered_by'], 200)}"] if scores["answered_by"] else []),
+            *(
+                [f"{ROLE_LABELS[scores['kind']]}{printable(scores['answered_by'], 200)}"]
+                if scores["answered_by"]
+                else []
+            ),
             *([f"'cannot tell' is left out: at most {counted(unclear, 'judgement')} of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),

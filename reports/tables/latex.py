@@ -39,7 +39,7 @@ _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
 REPORTED = "as reported, not measured here"
 GAP_PT, SMALLEST_GAP_PT = 4, 2
-MOST_LABEL_PT = 150  # of a label in a table that is too wide for a page; a longer one is broken
+MAX_LABEL_PT = 150  # of a label in a table that is too wide for a page; a longer one is broken
 # Widths of one column and of the page in a paper of two columns (IEEEtran: 252 pt and 516 pt), a little narrower.
 FLOATS = (("table", 238), ("table*", 480))
 # Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
@@ -150,7 +150,7 @@ def _place(table: Table) -> _Place:
             if (label + sum(columns)) * letter_pt + 2 * GAP_PT * len(columns) <= width_pt:
                 return _Place(kind, size, GAP_PT, None, (everything,))
     (kind, width_pt), (size, letter_pt) = FLOATS[-1], SIZES[-1]
-    label_pt = min(label * letter_pt, MOST_LABEL_PT)
+    label_pt = min(label * letter_pt, MAX_LABEL_PT)
     parts: list[list[int]] = [[]]
     left_pt = width_pt - label_pt
     for k, n_letters in enumerate(columns):
@@ -160,7 +160,7 @@ def _place(table: Table) -> _Place:
             left_pt = width_pt - label_pt
         parts[-1].append(k)
         left_pt -= needed_pt
-    broken = label_pt if label * letter_pt > MOST_LABEL_PT else None
+    broken = label_pt if label * letter_pt > MAX_LABEL_PT else None
     return _Place(kind, size, SMALLEST_GAP_PT, broken, tuple(map(tuple, parts)))
 
 

@@ -31,7 +31,7 @@ def label_notes(names: Iterable[str]) -> list[str]:
     return [REFINED_LABELS] if any(name.endswith((" n", " n'")) for name in names) else []
 
 
-BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place where people judged
+ANNOTATED_SUFFIX = "-people"  # ends the name of what stands in a protocol's place where people judged
 
 
 def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
@@ -43,7 +43,7 @@ def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
     whose = _rows_by(confidences)
     if len(whose) < 2:
         return [f"confidences: {what}" for what in whose]
-    return [f"MIXED CONFIDENCES: {_told(whose)}: these average precisions do not compare"]
+    return [f"MIXED CONFIDENCES: {_listing(whose)}: these average precisions do not compare"]
 
 
 def _rows_by(said: Mapping[str, str | None]) -> dict[str, list[str]]:
@@ -54,7 +54,7 @@ def _rows_by(said: Mapping[str, str | None]) -> dict[str, list[str]]:
     return whose
 
 
-def _told(whose: Mapping[str, Iterable[str]]) -> str:
+def _listing(whose: Mapping[str, Iterable[str]]) -> str:
     return "; ".join(f"{what} ({', '.join(rows)})" for what, rows in whose.items())
 
 
@@ -70,7 +70,7 @@ def label_count_notes(labels: Mapping[str, str | None]) -> list[str]:
     ['MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare']
     """
     whose = _rows_by(labels)
-    return [f"MIXED LABELS: {_told(whose)}: these numbers do not compare"] if len(whose) > 1 else []
+    return [f"MIXED LABELS: {_listing(whose)}: these numbers do not compare"] if len(whose) > 1 else []
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class Measured:
 
     @property
     def is_by_people(self) -> bool:
-        return self.protocol.endswith(BY_PEOPLE)
+        return self.protocol.endswith(ANNOTATED_SUFFIX)
 
     @property
     def scenes(self) -> frozenset[str]:

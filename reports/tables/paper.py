@@ -27,7 +27,7 @@ from su3d_bench.formats.tables.table import (
     percent,
 )
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.metrics.questions.score import RELATIVE, said_by
+from su3d_bench.metrics.questions.score import RELATIVE, remarks_starting
 from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import Measured, confidence_notes, few_scenes, label_notes
 
@@ -423,7 +423,7 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
             f"unscored on {some(row.unscored, 4)}" if row.unscored else "",
             row.caveat or "",
             f"perception {row.profile}{f', encoder {row.encoder}' if row.encoder else ''}" if row.profile else "",
-            *(f"{RELATIVE}{one}" for one in said_by(row.warnings, RELATIVE)),
+            *(f"{RELATIVE}{one}" for one in remarks_starting(row.warnings, RELATIVE)),
         ]
         for what in filter(None, said):
             notes.setdefault(what, []).append(label)

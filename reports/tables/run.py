@@ -57,7 +57,7 @@ def _in_plural(words: str) -> str:
     return " ".join([_PLURAL.get(first, first), *plural])
 
 
-MOST_NAMES = 8  # of a scene that are shown; the rest is counted
+MAX_NAMES = 8  # of a scene that are shown; the rest is counted
 UNNAMED = "without a name"
 
 
@@ -101,7 +101,7 @@ def found_table(rows: Sequence[Found], run: str = "") -> Table:
     return text_table("found", [[*head, "names"], *body], heading="Found, not scored", caption=of, notes=(note,))
 
 
-def names_text(names: Sequence[tuple[str, int]], most: int = MOST_NAMES) -> str:
+def names_text(names: Sequence[tuple[str, int]], most: int = MAX_NAMES) -> str:
     """The most frequent names with their numbers.
 
     >>> names_text((("chair", 3), ("sofa", 1), ("", 2))), names_text((("lamp", 1), ("bed", 1)), most=1)
@@ -146,7 +146,7 @@ def _kind(reason: UnscoredRecord) -> tuple[str, ...]:
 
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.
-MOST_SCENES = 20  # that a line names
+MAX_SCENES = 20  # that a line names
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}
 
 
@@ -238,7 +238,7 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
     if row["failed"]:
         yield f"INCOMPLETE: {method} failed on {', '.join(row['failed'])}"
     if row["unscored"]:
-        yield f"{method} is unscored on {some(row['unscored'], MOST_SCENES)}"
+        yield f"{method} is unscored on {some(row['unscored'], MAX_SCENES)}"
     if row["caveat"]:
         yield f"{method}: {row['caveat']}"
     warnings = [] if row["result"] is None else [str(line) for line in row["result"]["warnings"]]
@@ -248,7 +248,7 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
 NAMES |= {f"top_{k}_{key}": f"top-{k} {name}" for k in range(1, 10) for key, name in NAMES.items()}
-MOST_NOTES = 12  # warnings that are printed; the file has all
+MAX_NOTES = 12  # warnings that are printed; the file has all
 
 
 def evaluation_tables(document: Mapping[str, Any], *, per_class: bool = False) -> list[Table | Prose]:
@@ -322,9 +322,9 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
         f"{said}, in {len(scenes)} scenes ({some(scenes, 3)})" if len(scenes) > 1 else ": ".join([*scenes, said])
         for said, scenes in summed(scored["warnings"], scored["per_scene"])
     ]
-    yield from (f"WARNING: {printable(line)}" for line in warnings[:MOST_NOTES])
-    if len(warnings) > MOST_NOTES:
-        yield f"and {len(warnings) - MOST_NOTES} more warnings, all in the --json file"
+    yield from (f"WARNING: {printable(line)}" for line in warnings[:MAX_NOTES])
+    if len(warnings) > MAX_NOTES:
+        yield f"and {len(warnings) - MAX_NOTES} more warnings, all in the --json file"
 
 
 def _classes(protocol: str, scored: Mapping[str, Any]) -> list[Table | Prose]:

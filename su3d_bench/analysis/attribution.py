@@ -15,25 +15,25 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.sides import Side, refuse_unlike
+from su3d_bench.analysis.sides import Side, check_comparable
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, counted, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.scoring import with_confidences_of_files
-from su3d_bench.evaluation.text_truth import FilesOfTruth
-from su3d_bench.evaluation.texts import GivenTexts, read_text_features
-from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene, SingleError
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.evaluation.text_ground_truth import GroundTruthFiles
+from su3d_bench.evaluation.texts import GivenTextEncoder, read_text_features
+from su3d_bench.metrics.attribution.arrays import EXPLAINED, CorrectedScene, EvaluatedScene, SingleError
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.job import as_told
+from su3d_bench.runs.job import as_configured
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for
-MendedJob = Mapping[str, MendedScene]  # of a scene under a method, by protocol
+MendedJob = Mapping[str, CorrectedScene]  # of a scene under a method, by protocol
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Matched:
     rules: ProtocolRules
     truth: GroundTruth
     prediction: Prediction
-    looked_at: LookedAt
+    evaluated: EvaluatedScene
 
 
 def matched_instances(
@@ -90,24 +90,26 @@ class Explained:
         for name in self.scored_under(scene):
             rules = self.rules(name)
             truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
-            if (reason := why_not_scorable(rules, prediction)) is not None:
+            if (reason := kind_incompatibility(rules, prediction)) is not None:
                 raise PredictionError(f"{scene}: {reason}")
             look = EXPLAINED[rules.kind][1]
-            looked_at = look(rules, truth, prediction, self._inputs.encoder(rules, prediction, encoder))
-            yield Matched(self, scene, rules, truth, prediction, looked_at)
+            evaluated = look(rules, truth, prediction, self._inputs.encoder(rules, prediction, encoder))
+            yield Matched(self, scene, rules, truth, prediction, evaluated)
 
-    def mended(self, scene: str, looked_at: Mapping[str, LookedAt]) -> MendedJob:
-        """The counts of ``scene``, which must be those of the run, and those with its errors mended."""
-        mended = {name: one.mended() for name, one in looked_at.items()}
-        for name, counts in mended.items():
-            self.refuse_other_counts(name, scene, counts.as_is)
-        return mended
+    def corrected(self, scene: str, evaluated: Mapping[str, EvaluatedScene]) -> MendedJob:
+        """The counts of ``scene``, which must be those of the run, and those with its errors corrected."""
+        corrected = {name: one.corrected() for name, one in evaluated.items()}
+        for name, counts in corrected.items():
+            self.check_same_counts(name, scene, counts.as_is)
+        return corrected
 
-    def errors(self, scene: str, protocol: str, looked_at: LookedAt, most: int) -> tuple[int, Sequence[SingleError]]:
+    def errors(
+        self, scene: str, protocol: str, evaluated: EvaluatedScene, most: int
+    ) -> tuple[int, Sequence[SingleError]]:
         """How many errors ``scene`` has under ``protocol``, and the ``most`` that cost the run most."""
         scores = self._scores[protocol]
         others = [score.counts for name, score in scores.items() if name != scene]
-        return looked_at.errors(self.rules(protocol), scores[scene].counts, others, most)
+        return evaluated.errors(self.rules(protocol), scores[scene].counts, others, most)
 
     def instance_ids(self, scene: str) -> Sequence[int]:
         """How the method numbers its instances; nothing where their places are their numbers."""
@@ -115,7 +117,7 @@ class Explained:
             return ()
         return getattr(self._inputs.of_map(scene), "ids", np.zeros(0, np.int64)).tolist()
 
-    def refuse_other_counts(self, protocol: str, scene: str, formed: Counts) -> None:
+    def check_same_counts(self, protocol: str, scene: str, formed: Counts) -> None:
         """A ``PredictionError`` where what is explained is not what the run's own number is of."""
         stored = self._scores[protocol][scene].counts
         if type(stored) is type(formed) and all(
@@ -170,12 +172,12 @@ class Inputs:
 
     def __init__(self, run: FinishedRun, method: str) -> None:
         self._run, self._method = run, method
-        self._files = FilesOfTruth(run)
+        self._files = GroundTruthFiles(run)
         self.of_map = lru_cache(maxsize=1)(self._read_map)
 
     def rules(self, rules: ProtocolRules) -> ProtocolRules:
         """``rules`` as they count here: of files, their confidences may count where a rule has 1."""
-        elsewhere = self._run.made_elsewhere.get(self._method)
+        elsewhere = self._run.external.get(self._method)
         takes_files = elsewhere is not None and elsewhere.confidences == "file"
         return with_confidences_of_files(rules) if takes_files else rules
 
@@ -185,10 +187,10 @@ class Inputs:
             return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
         truth = truth_of(rules.ground_truth)
         prediction = self.of_map(scene)
-        if (part := self._run.told_truth(self._method)) is None:
+        if (part := self._run.visible_truth(self._method)) is None:
             return truth, prediction
         first: str = self._run.dataset(scene).variants[0]
-        return truth, as_told(part, rules, truth, prediction, lambda: truth_of(first).labels)
+        return truth, as_configured(part, rules, truth, prediction, lambda: truth_of(first).labels)
 
     def _read_map(self, scene: str) -> Prediction:
         return read_prediction(self._run.folder.job(scene, self._method).prediction)
@@ -197,13 +199,13 @@ class Inputs:
         """What named the instances; None where they have names."""
         if getattr(prediction, "labels", None) is not None:
             return None
-        elsewhere = self._run.made_elsewhere.get(self._method)
+        elsewhere = self._run.external.get(self._method)
         if elsewhere is None or elsewhere.texts is None:
             return own()
         path, digest = elsewhere.texts
         given = read_text_features(Path(path))
         assert given is not None
-        texts = GivenTexts(given, rules)
+        texts = GivenTextEncoder(given, rules)
         if texts.digest != digest:
             raise DataError(f"{printable(path, 200)}: is not the file that {self._run.name} was scored with")
         return texts
@@ -215,7 +217,7 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Cause:
-    """``n`` errors of one kind (masks and instances, or points) and the gain in each metric when they are mended."""
+    """``n`` errors of one kind (masks and instances, or points) and the gain in each metric when they are corrected."""
 
     n: int
     gains: Values
@@ -225,7 +227,7 @@ class Cause:
 class ProtocolAttribution:
     """Of one protocol: ``values + sum of gains + overlap + rest = 1`` for each metric.
 
-    ``rest`` is 1 less the value with everything mended, ``overlap`` what that gives beyond the sum of the gains.
+    ``rest`` is 1 less the value with everything corrected, ``overlap`` what that gives beyond the sum of the gains.
     ``stages`` are values with one stage of the pipeline replaced by the truth. ``n_scored`` points where points are
     counted.
     """
@@ -277,16 +279,20 @@ def attribute(
             )
         other.run.check_method(other.method)
     walk = matched_instances(run, [explained], run.scenes)
-    mended = {scene: explained.mended(scene, {one.rules.name: one.looked_at for one in found}) for scene, found in walk}
-    return attribution_of(explained, mended, other)
+    corrected = {
+        scene: explained.corrected(scene, {one.rules.name: one.evaluated for one in found}) for scene, found in walk
+    }
+    return attribution_of(explained, corrected, other)
 
 
-def attribution_of(explained: Explained, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
+def attribution_of(
+    explained: Explained, corrected: Mapping[str, MendedJob], other: Side | None = None
+) -> RunAttribution:
     """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
     side = Side(explained.run, explained.method)
     formed = []
     for name in explained.protocols:
-        rules, of_scenes = explained.rules(name), {scene: one[name] for scene, one in mended.items() if name in one}
+        rules, of_scenes = explained.rules(name), {scene: one[name] for scene, one in corrected.items() if name in one}
         if of_scenes:
             formed.append(_form(rules, of_scenes, _oracle_values(rules, side, other, list(of_scenes))))
     if not formed:
@@ -305,16 +311,16 @@ def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes:
     missing = [scene for scene in scenes if scene not in scores]
     if missing:
         raise ConfigError(f"{other.name}: lacks {printable(missing[0], 100)}; the run must have the same scenes")
-    refuse_unlike(side, other, rules.name, scenes)
+    check_comparable(side, other, rules.name, scenes)
     return _values(rules, [scores[scene].counts for scene in scenes])
 
 
 def _form(
-    rules: ProtocolRules, of_scenes: Mapping[str, MendedScene], with_true_masks: Values | None
+    rules: ProtocolRules, of_scenes: Mapping[str, CorrectedScene], with_true_masks: Values | None
 ) -> ProtocolAttribution:
     """What the errors of the scenes cost under one protocol."""
     every = list(of_scenes.values())
-    values, mended = _values(rules, [one.as_is for one in every]), _values(rules, [one.all for one in every])
+    values, corrected = _values(rules, [one.as_is for one in every]), _values(rules, [one.all for one in every])
     causes = {}
     for kind in EXPLAINED[rules.kind][0]:
         after = _values(rules, [one.alone[kind] for one in every])
@@ -333,8 +339,8 @@ def _form(
         scenes=tuple(of_scenes),
         values=values,
         causes=causes,
-        overlap={name: mended[name] - values[name] - total[name] for name in values},
-        rest={name: 1.0 - mended[name] for name in values},
+        overlap={name: corrected[name] - values[name] - total[name] for name in values},
+        rest={name: 1.0 - corrected[name] for name in values},
         stages=stages,
         n_scored=sum(n_scored) if n_scored else None,
     )

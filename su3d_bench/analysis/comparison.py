@@ -19,7 +19,7 @@ from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.core.types import BoolArray, Float64Array, Interval
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
+from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, remarks_starting
 from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics import statistics
 from su3d_bench.runs.finished import read_run
@@ -231,7 +231,7 @@ def _remarks_of_scenes(
             )
         warnings = () if record is None or record.result is None else record.result.warnings
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
-            lines += [f"{side.name}: {start}{printable(said, 200)}" for said in said_by(warnings, start)]
+            lines += [f"{side.name}: {start}{printable(said, 200)}" for said in remarks_starting(warnings, start)]
     if every[0].run.rules(protocol).digest != every[0].run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines
@@ -356,7 +356,7 @@ def plan(
             f"{first.name}: a difference is of two methods; name them with --methods A B (it has {known})"
         )
     every = [sides.Side(run, method) for run in read for method in pair]
-    sides.refuse_other_requests(read, set(pair))
+    sides.check_same_requests(read, set(pair))
     numbers = sides.SideNumbers()
     plans: dict[str, dict[str, MetricPlan]] = {}
     scenes: dict[str, None] = {}

@@ -20,7 +20,7 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, shown, some
 from su3d_bench.core.files.atomic import is_file
-from su3d_bench.core.files.locks import is_held
+from su3d_bench.core.files.locks import is_locked
 from su3d_bench.core.types import Interval
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
 from su3d_bench.metrics.protocols.loading import protocol_names
@@ -28,15 +28,15 @@ from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.verify import rules_of_run, why_not_counted
+from su3d_bench.runs.verify import count_mismatch, rules_of_run
 from su3d_bench.store.records import MetricsRecord, RunRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
 
-MOST_RUNS = 10_000
+MAX_RUNS = 10_000
 ELSEWHERE = "made elsewhere"  # in the place of a profile
-MOST_NAMED = 4  # methods of what is left out
-MOST_FOLDERS = 1_000_000  # a folder that holds more was not meant
-MOST_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, some minutes at worst
+MAX_NAMED = 4  # methods of what is left out
+MAX_FOLDERS = 1_000_000  # a folder that holds more was not meant
+MAX_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, some minutes at worst
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Leaderboard:
 def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool = False) -> Leaderboard:
     """The rankings of all runs below ``folder``, of all protocols or only ``protocols``; links are not followed.
 
-    ``with_ranks``: the ranks that each row of up to ``MOST_RANKED`` may have are found, from tests of all pairs.
+    ``with_ranks``: the ranks that each row of up to ``MAX_RANKED`` may have are found, from tests of all pairs.
     """
     entries: list[RankingRow] = []
     refused: list[Refused] = []
@@ -133,8 +133,8 @@ def runs_below(folder: Path) -> Iterator[Path]:
         raise ConfigError(f"{printable(str(folder), 200)}: is no folder; name one that holds runs")
     n_runs = 0
     for n_folders, (path, folders, files) in enumerate(os.walk(folder, followlinks=False)):
-        if n_folders >= MOST_FOLDERS or n_runs >= MOST_RUNS:
-            raise ConfigError(f"{printable(str(folder), 200)}: holds more than {MOST_RUNS} runs; name a smaller folder")
+        if n_folders >= MAX_FOLDERS or n_runs >= MAX_RUNS:
+            raise ConfigError(f"{printable(str(folder), 200)}: holds more than {MAX_RUNS} runs; name a smaller folder")
         folders.sort()
         if "run.json" in files:
             folders.clear()  # below a run there is no other
@@ -148,13 +148,13 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         if protocols and protocol not in protocols:
             continue
         what = f"{printable(method, 80)} / {printable(protocol, 80)}"
-        if reason := _why_not(run, protocol, record.failed):
+        if reason := _missing_reason(run, protocol, record.failed):
             yield Refused(name, what, reason)
             continue
         try:
             rules = rules_of_run(run, protocol)
             scores = run.scores(method).get(protocol, {})
-            if reason := why_not_counted(run, method, protocol, scores):
+            if reason := count_mismatch(run, method, protocol, scores):
                 yield Refused(name, what, printable(reason, 300))
                 continue
             result = combine(rules, scores)
@@ -177,14 +177,14 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
             intervals=tuple(result.intervals.get(key) for key in result.headline),
             of_scenes=tuple(recomputed["per_scene"][scene][result.headline[0]] for scene in sorted(result.scenes)),
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
-            profile=ELSEWHERE if method in run.made_elsewhere else printable(run.record.profile or "", 40),
+            profile=ELSEWHERE if method in run.external else printable(run.record.profile or "", 40),
             confidences=None if record.confidences is None else printable(record.confidences, 80),
             labels=run.labels(method, protocol, rules),
             is_ceiling=is_ceiling(method, record.caveat),
         )
 
 
-def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
+def _missing_reason(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
     if run.record.is_partial:
         return f"is partial: the first {counted(run.limit, 'frame')} of each scene"
     if failed:
@@ -232,7 +232,7 @@ def in_order(rows: Sequence[AnyRow]) -> tuple[AnyRow, ...]:
 def ranked(board: tuple[AnyRow, ...]) -> tuple[AnyRow, ...]:
     """The board with the ranks that each row may have; unchanged where nothing competes, or too many rows do."""
     rivals = [entry for entry in board if not entry.is_ceiling]
-    if not 1 < len(rivals) <= MOST_RANKED:
+    if not 1 < len(rivals) <= MAX_RANKED:
         return board
     ranks = rank_intervals([np.array(entry.of_scenes, np.float64) for entry in rivals])
     return (
@@ -257,7 +257,7 @@ def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
         method, slash, protocol = refusal.what.rpartition(" / ")
         groups.setdefault((refusal.run, slash + protocol, refusal.reason), []).append(method)
     for (run, where, reason), methods in groups.items():
-        yield f"Left out: {run}, {some(methods, MOST_NAMED)}{where}: {reason}"
+        yield f"Left out: {run}, {some(methods, MAX_NAMED)}{where}: {reason}"
 
 
 def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
@@ -287,8 +287,8 @@ def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
             f"Rank: from which to which it may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
             "tests of all pairs, of their means over scenes, corrected by Holm."
         )
-    elif intervals and len(rivals) > MOST_RANKED:
-        notes.append(f"No ranks: {len(rivals)} rows are more than the {MOST_RANKED} whose pairs are all tested.")
+    elif intervals and len(rivals) > MAX_RANKED:
+        notes.append(f"No ranks: {len(rivals)} rows are more than the {MAX_RANKED} whose pairs are all tested.")
     if intervals and (rough := few_scenes(len(first.scenes))):
         notes.append(f"{rough[:1].upper()}{rough[1:]}.")
     caption = f"{first.protocol}, version {first.version}, {scenes}; per cent."
@@ -305,7 +305,7 @@ def _cell(entry: RankingRow, k: int, best: str, intervals: bool) -> Cell:
     return Cell(text, beside, is_best=text == best and not entry.is_ceiling, origin=origin)
 
 
-MOST_PROTOCOLS_NAMED = 3  # methods of a run, or protocols of a method
+MAX_PROTOCOLS_NAMED = 3  # methods of a run, or protocols of a method
 DAMAGED = "run.json is damaged"
 
 
@@ -373,7 +373,7 @@ def _written(path: Path) -> float:
 
 
 def _state(path: Path, record: RunRecord, metrics: MetricsRecord | None) -> str:
-    if is_held(path):
+    if is_locked(path):
         return "running now"
     if record.status in ("complete", "incomplete"):
         failed = {scene for one in metrics.results for scene in one.failed} if metrics is not None else set()
@@ -390,7 +390,7 @@ def runs_table(entries: Sequence[RunEntry]) -> Table:
         first = (entry.when, entry.state, str(len(entry.scenes)))
         for method in entry.methods or ("",):
             mine = [one for one in entry.headlines if one.method == method]
-            numbers = some([f"{one.protocol} {one.metric} {percent(one.value)}" for one in mine], MOST_PROTOCOLS_NAMED)
+            numbers = some([f"{one.protocol} {one.metric} {percent(one.value)}" for one in mine], MAX_PROTOCOLS_NAMED)
             cells = tuple(Cell(text) for text in (*first, method, numbers or "-"))
             rows.append(TableRow(entry.name, cells))
     columns = ("written", "state", "scenes", "method", "first number of each protocol")
@@ -405,9 +405,9 @@ def removable(path: Path) -> RunFolder:
     if not whole.is_dir() or not any(is_file(whole / mark) for mark in MARKS):
         raise StoreError(f"{shown(path)}: is no folder of a run, so nothing there is removed")
     folder = RunFolder(whole)
-    if is_held(whole):
+    if is_locked(whole):
         raise StoreError(f"{shown(path)}: a run is writing here; end it or wait for it")
-    stranger = next(folder.strangers(), None)
+    stranger = next(folder.foreign_files(), None)
     if stranger is not None:
         raise StoreError(
             f"{shown(path)}: holds '{printable(stranger, 200)}', which no run wrote; move it elsewhere first"

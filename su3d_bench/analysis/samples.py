@@ -32,10 +32,10 @@ from su3d_bench.reports.tables.samples import Sample
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
-MOST_OF_A_NAME = 200  # characters of a text in a cell
+MAX_NAME_CHARACTERS = 200  # characters of a text in a cell
 THRESHOLDS = (0.25, 0.5)
 Box = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
-NOWHERE: Box = (None,) * 6
+EMPTY_MAP_SIMILARITY: Box = (None,) * 6
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Selection:
     """Methods, protocols and scenes by name; all that a run has where none is named."""
 
     methods: Sequence[str] = ()
@@ -57,7 +57,7 @@ class Chosen:
 
 def samples(
     paths: Sequence[Path],
-    chosen: Chosen = Chosen(),
+    chosen: Selection = Selection(),
     report: Report = lambda event: None,
 ) -> Samples:
     """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of ``KINDS``.
@@ -79,7 +79,7 @@ def samples(
     return Samples(tuple(rows), tuple(dict.fromkeys(remarks)))
 
 
-def _chosen_methods(run: FinishedRun, chosen: Chosen, remarks: list[str]) -> list[Explained]:
+def _chosen_methods(run: FinishedRun, chosen: Selection, remarks: list[str]) -> list[Explained]:
     """The methods that are listed; ``remarks`` gets why another has no rows."""
     for method in chosen.methods:
         run.check_method(method)
@@ -110,17 +110,17 @@ def _of_job(matched: Matched) -> Iterator[Sample]:
     where = (
         explained.run.name, printable(matched.scene), printable(explained.method), printable(rules.name),
     )  # fmt: skip
-    if isinstance(matched.looked_at, SceneOfPoints):
-        scored = matched.looked_at.scored
+    if isinstance(matched.evaluated, SceneOfPoints):
+        scored = matched.evaluated.scored
         named = scored.points
         counts = confusion.per_scene(named.true_class, named.predicted, scored.is_counted)
-        explained.refuse_other_counts(rules.name, matched.scene, counts)
+        explained.check_same_counts(rules.name, matched.scene, counts)
         n_instances = int(matched.truth.instance.max(initial=0))
         yield from _OfPoints(rules, prediction, scored, n_instances, has_places=has_places).rows(where)
         return
-    assert isinstance(matched.looked_at, SceneOfMasks) and not isinstance(prediction, DenseFeatures)
-    explained.refuse_other_counts(rules.name, matched.scene, count_masks(*matched.looked_at.evaluated))
-    yield from _rows(where, rules, prediction, matched.looked_at, matched.truth.points if has_places else None)
+    assert isinstance(matched.evaluated, SceneOfMasks) and not isinstance(prediction, DenseFeatures)
+    explained.check_same_counts(rules.name, matched.scene, count_masks(*matched.evaluated.evaluated))
+    yield from _rows(where, rules, prediction, matched.evaluated, matched.truth.points if has_places else None)
 
 
 def _rows(
@@ -143,7 +143,7 @@ def _rows(
     for k, name in enumerate(names_of(prediction)):
         met, iou = _best(overlaps.iou[k])
         yield Sample(
-            *where, "predicted", ids[k], k, called[k], printable(name, MOST_OF_A_NAME), float(masks.scores[k]),
+            *where, "predicted", ids[k], k, called[k], printable(name, MAX_NAME_CHARACTERS), float(masks.scores[k]),
             len(masks.masks.mask(k)), None, bool(overlaps.is_counted[k]), iou,
             None if met is None else number_of[met], "" if met is None else true_classes[met],
             bool(at_25.is_hit[k]), bool(at_50.is_hit[k]), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
@@ -187,13 +187,13 @@ class _OfPoints:
         self._naming_of = np.full(len(self._rows), -1)
         self._naming_of[is_named] = naming
         self._positions = scored.positions if has_places else None
-        self._classes = [printable(entry.name, MOST_OF_A_NAME) for entry in rules.classes]
+        self._classes = [printable(entry.name, MAX_NAME_CHARACTERS) for entry in rules.classes]
         self._takes_part = scored_classes(rules)
         self._ids: list[int] = []
         self._names: list[str] = []
         if not isinstance(prediction, DenseFeatures):
             self._ids = _ids(prediction, n_predictions(prediction))
-            self._names = [printable(name, MOST_OF_A_NAME) for name in names_of(prediction)]
+            self._names = [printable(name, MAX_NAME_CHARACTERS) for name in names_of(prediction)]
 
     def rows(self, where: tuple[str, str, str, str]) -> Iterator[Sample]:
         """What is named, and then what is there."""
@@ -256,7 +256,7 @@ def _distinct(classes: Int64Array, numbers: Int64Array) -> tuple[list[tuple[int,
 def _class_names(rules: ProtocolRules) -> dict[int, str]:
     if not rules.names_masks:
         return {OBJECT: rules.curve_names[0]}
-    return {entry.id: printable(entry.name, MOST_OF_A_NAME) for entry in rules.classes}
+    return {entry.id: printable(entry.name, MAX_NAME_CHARACTERS) for entry in rules.classes}
 
 
 def _ids(prediction: Instances | Partition, n: int) -> list[int]:
@@ -273,7 +273,7 @@ def _best(iou: Float64Array) -> tuple[int | None, float]:
 
 def _box(points: Points | None, members: Int32Array | Int64Array) -> Box:
     if points is None or not len(members):
-        return NOWHERE
+        return EMPTY_MAP_SIMILARITY
     own = points[members].astype(np.float64)
     low, high = own.min(axis=0), own.max(axis=0)
     x, y, z = (float(value) for value in (low + high) / 2)

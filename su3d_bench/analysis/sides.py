@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.config import MOVES_NO_NUMBER
+from su3d_bench.core.config import NEUTRAL_SETTINGS
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Float64Array
@@ -20,7 +20,7 @@ from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 # They move no number of a common scene.
-_SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | MOVES_NO_NUMBER
+_SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | NEUTRAL_SETTINGS
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def pair_methods(left: Named, right: Named) -> list[tuple[Side, Side]]:
             f"common; name one of each, such as {run.name}:{run.methods[0]}"
         )
     for (runs, _), names in zip((left, right), zip(*methods, strict=True), strict=True):
-        refuse_other_requests(runs, set(names))
+        check_same_requests(runs, set(names))
     return [(Side(run, one, tuple(more)), Side(other, two, tuple(more_others))) for one, two in methods]
 
 
@@ -106,7 +106,7 @@ def _same_or_only(run: FinishedRun, name: str) -> str:
     return run.methods[0] if name not in run.methods and len(run.methods) == 1 else name
 
 
-def refuse_other_requests(runs: Sequence[FinishedRun], methods: Set[str]) -> None:
+def check_same_requests(runs: Sequence[FinishedRun], methods: Set[str]) -> None:
     """A ``ConfigError`` where a run differs from the first in more than the seed, or has a seed that another has."""
     seen: dict[int, FinishedRun] = {}
     first = runs[0]
@@ -157,7 +157,7 @@ def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[st
     return list(dict.fromkeys(wanted)) or common
 
 
-def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str]) -> None:
+def check_comparable(left: Side, right: Side, protocol: str, scenes: Sequence[str]) -> None:
     """A ``ConfigError`` that names the first field in which the two differ and that forbids to compare them.
 
     The encoder counts where it named the instances of both, unless predictions were made elsewhere: there it is the
@@ -191,7 +191,7 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
             )
     records = [side.run.results.get((side.method, protocol)) for side in (left, right)]
     named = [record for record in records if record is not None and record.encoder is not None]
-    are_elsewhere = left.method in left.run.made_elsewhere or right.method in right.run.made_elsewhere
+    are_elsewhere = left.method in left.run.external or right.method in right.run.external
     if len(named) == 2 and not are_elsewhere and named[0].encoder_digest != named[1].encoder_digest:
         shown = [f"{record.encoder} ({_short(record.encoder_digest)})" for record in named]
         raise ConfigError(f"{where}: encoder is {printable(' and '.join(shown), 200)}; run both with the same one")
@@ -224,7 +224,7 @@ class SideNumbers:
         scores = [self.scores(side).get(protocol, {}) for side in sides]
         common = [scene for scene in scores[0] if all(scene in of_side for of_side in scores)]
         for side in sides[1:]:
-            refuse_unlike(sides[0], side, protocol, common)
+            check_comparable(sides[0], side, protocol, common)
         if not common:
             return []
         rules = sides[0].run.rules(protocol)

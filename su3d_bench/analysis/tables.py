@@ -8,31 +8,31 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.analysis.sides import Side, refuse_unlike
+from su3d_bench.analysis.sides import Side, check_comparable
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.table import Origin, Table, is_count
+from su3d_bench.human_eval.items import SCHEMA
+from su3d_bench.human_eval.scores import FILE as SCORES_FILE
+from su3d_bench.human_eval.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
 from su3d_bench.reports.tables.ablation import ablation_table
-from su3d_bench.reports.tables.judged import JUDGED, WHO_DID, judged_table
+from su3d_bench.reports.tables.judged import JUDGED, ROLE_LABELS, judged_table
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
-from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
+from su3d_bench.reports.tables.model import ANNOTATED_SUFFIX, Measured
 from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
 from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.ablation import read_rows
-from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
+from su3d_bench.runs.finished import FinishedRun, is_scores_file, read_run
 from su3d_bench.runs.summary import found_in, without_score
-from su3d_bench.sheets.items import SCHEMA
-from su3d_bench.sheets.scores import FILE as SCORES_FILE
-from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
-MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
+MAX_SOURCE_BYTES, MAX_SOURCES = 1 << 24, 500  # of a paper's LaTeX
 _READ_SOURCE = re.compile(r"\\(?:input|include)\s*\{([^{}\0]{1,200})\}")
 _COMMENT = re.compile(r"(?<!\\)%.*")
 
@@ -46,20 +46,20 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
     """
     paths = dict.fromkeys(folders)
     runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
-    measured = [row for path in paths if is_scores(path) for row in _judged_by_people(path)]
+    measured = [row for path in paths if is_scores(path) for row in _annotated_rows(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
         for row in _results_of(name, run):
             if row.protocol in first and first[row.protocol][0] is not run:
                 other, known = first[row.protocol]
                 common = sorted(known.scenes & row.scenes)
-                refuse_unlike(Side(other, known.method), Side(run, row.method), row.protocol, common)
+                check_comparable(Side(other, known.method), Side(run, row.method), row.protocol, common)
             first.setdefault(row.protocol, (run, row))
             measured.append(row)
     return measured
 
 
-def refuse_unscored(measured: Sequence[Measured], paths: Sequence[Path]) -> None:
+def check_scored(measured: Sequence[Measured], paths: Sequence[Path]) -> None:
     """A ``ConfigError`` where no row has a scene with a score."""
     if not any(row.per_scene for row in measured):
         raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing for a table")
@@ -83,11 +83,11 @@ def found_tables(paths: Sequence[Path], methods: Sequence[str] = (), datasets: S
 def is_scores(path: Path) -> bool:
     """Whether ``path`` is what ``sheets score`` writes, rather than a run."""
     if path.suffix == ".json":
-        return not is_numbers_alone(path)
+        return not is_scores_file(path)
     return is_file(path / SCORES_FILE) and not is_file(path / "run.json")
 
 
-def _judged_by_people(path: Path) -> list[Measured]:
+def _annotated_rows(path: Path) -> list[Measured]:
     """What people say of each method and dataset."""
     scores = read_scores(path)
     groups: dict[tuple[str, str], list[ScoreCell]] = {}
@@ -101,7 +101,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
             Measured(
                 run=str(path),
                 method=method,
-                protocol=f"{dataset}-{scores.kind}{BY_PEOPLE}",
+                protocol=f"{dataset}-{scores.kind}{ANNOTATED_SUFFIX}",
                 version=SCHEMA,
                 kind=scores.kind,
                 headline=tuple(cell.metric for cell in cells),
@@ -110,14 +110,14 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 intervals={cell.metric: cell.interval for cell in cells},
                 per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
                 n_planned=len(scenes),
-                caveat=_who_judged(scores, cells),
+                caveat=_annotator_summary(scores, cells),
                 limit=scores.limit,
                 profile=scores.profile or None,
                 encoder=scores.encoder or None,
                 changed=tuple(scores.changed.get(method, ())),
                 warnings=(
                     *scores.remarks,
-                    *([f"{WHO_DID[scores.kind]}{scores.answered_by}"] if scores.answered_by else []),
+                    *([f"{ROLE_LABELS[scores.kind]}{scores.answered_by}"] if scores.answered_by else []),
                 ),
                 tests=_tests_of(scores, dataset, method),
             )
@@ -137,7 +137,7 @@ def _tests_of(scores: Scores, dataset: str, method: str) -> dict[tuple[str, str]
     return found
 
 
-def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
+def _annotator_summary(scores: Scores, cells: Sequence[ScoreCell]) -> str:
     n_people = len(scores.annotators)
     n_items = max(cell.n_items for cell in cells)
     of = "" if scores.n_judged == scores.n_items else f", {scores.n_judged} of the set's {scores.n_items} judged"
@@ -259,14 +259,14 @@ class _Recomputed:
 
     def numbers(self, origin: Origin) -> ProtocolResult | Measured:
         """Raises ``Su3dError`` where they cannot be had, or are of another version than the cell."""
-        result = self._of_people(origin) if origin.protocol.endswith(BY_PEOPLE) else self._result(origin)
+        result = self._of_people(origin) if origin.protocol.endswith(ANNOTATED_SUFFIX) else self._result(origin)
         if result.version != origin.version:
             raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {result.version}")
         return result
 
     def _of_people(self, origin: Origin) -> Measured:
         path = self._place(origin.run, lambda place: is_file(place) or is_file(place / SCORES_FILE))
-        for row in _judged_by_people(path):
+        for row in _annotated_rows(path):
             if (row.protocol, row.method) == (origin.protocol, origin.method):
                 return row
         raise ConfigError(f"{path}: holds no scores of '{printable(origin.method, 80)}' by people")
@@ -313,7 +313,7 @@ def _sources(file: Path) -> Iterator[tuple[Path, str]]:
         yield source, text
         for name in _READ_SOURCE.findall(_COMMENT.sub("", text)):
             path = _read_from(file.parent, name)
-            if path is not None and os.path.realpath(path) not in known and len(known) < MOST_SOURCES:
+            if path is not None and os.path.realpath(path) not in known and len(known) < MAX_SOURCES:
                 known.add(os.path.realpath(path))
                 waiting.append(path)
 
@@ -333,8 +333,8 @@ def _source_text(file: Path) -> str:
     shown = printable(str(file), 200)
     with reading(shown, ConfigError):
         content = file_bytes(file)
-    if len(content) > MOST_SOURCE_BYTES:
-        raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MOST_SOURCE_BYTES}")
+    if len(content) > MAX_SOURCE_BYTES:
+        raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MAX_SOURCE_BYTES}")
     return content.decode("utf-8", "replace")
 
 

@@ -18,7 +18,7 @@ from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
 from su3d_bench.analysis.page.scene import SceneData, SceneReader, fed_frames, frames_of
 from su3d_bench.core.errors import ModelMissing, StoreError, counted, printable
 from su3d_bench.core.geometry import back_project, valid_depth
-from su3d_bench.core.interfaces import HasSketches
+from su3d_bench.core.interfaces import HasPreviews
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, Int64Array
 from su3d_bench.formats.images import depth_in_units, jpeg_bytes, png_bytes
@@ -34,13 +34,13 @@ from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 
-MOST_FRAMES = 60  # of a scene, unless a stride is given
-MOST_WIDTH = 480  # pixels of an image; wider ones are made smaller
-MOST_POINTS = 60_000  # of a map, and of the truth
+MAX_FRAMES = 60  # of a scene, unless a stride is given
+MAX_WIDTH = 480  # pixels of an image; wider ones are made smaller
+MAX_POINTS = 60_000  # of a map, and of the truth
 NEAR_SPACINGS = 3.0  # a pixel is the instance's whose point lies within so many spacings of the points
 EVERY_PIXEL = 2  # of both axes is asked whose it is
 SEEN_M = 0.05  # between a point and what the camera saw there
-MOST_IDS = 0xFFFF  # rerun's ids have 16 bits, of which 0 says nobody's
+MAX_IDS = 0xFFFF  # rerun's ids have 16 bits, of which 0 says nobody's
 UInt16Array = NDArray[np.uint16]
 # A place is a path through these; names of methods stand below them and so can take no other's place.
 CAMERA = ("world", "camera")
@@ -50,7 +50,7 @@ INSTANCES, CLASSES, BOXES = "instances", "classes", "boxes"
 ROOM, TOP = "room", "ceiling"  # parts of a cloud: what is below the ceiling, and the rest
 CURVES = ("instances", "points", "milliseconds an update")
 APPLICATION = "su3d-bench"
-LEAST_VERSION = (0, 41)  # the first that the project was tried with
+MIN_VERSION = (0, 41)  # the first that the project was tried with
 UNITS_PER_METRE = 1000.0  # of depth: 16 bits reach 65 m
 JPEG_QUALITY = 80
 CAMERA_M = 0.4  # how far before the camera its picture stands in the room
@@ -67,8 +67,8 @@ def rerun_sdk() -> Any:
         raise ModelMissing(f"report rerun needs the rerun extra: {INSTALL}") from error
     version = str(getattr(rerun, "__version__", ""))
     numbers = re.match(r"(\d+)\.(\d+)", version)
-    if numbers is None or (int(numbers[1]), int(numbers[2])) < LEAST_VERSION:
-        least = ".".join(map(str, LEAST_VERSION))
+    if numbers is None or (int(numbers[1]), int(numbers[2])) < MIN_VERSION:
+        least = ".".join(map(str, MIN_VERSION))
         raise ModelMissing(f"report rerun needs rerun-sdk {least} or later, here is {version or 'another'}: {INSTALL}")
     if not rerun.RecordingStream(APPLICATION, send_properties=False).is_enabled():
         raise ModelMissing("RERUN in the environment switches rerun off, and nothing would be written; unset RERUN")
@@ -171,7 +171,7 @@ def _panels(sdk: Any, methods: Sequence[str]) -> Any:
 
 
 @dataclass(frozen=True)
-class Owned:
+class OwnedPoints:
     """Points that are drawn and whose each is: (n,) of ``instance`` and ``label``, -1 for nobody's.
 
     ``names`` and ``corners`` (k, 2, 3) m are those of the instances, ``labels`` those of the classes.
@@ -194,8 +194,8 @@ class Owned:
         instances = [(k + 1, f"{name or 'without a name'} #{k}", self.colours[k]) for k, name in enumerate(self.names)]
         classes = [(k + 1, name, tints[name]) for k, name in enumerate(self.labels)]
         return [
-            (INSTANCES, instances[: MOST_IDS - 1], self.instance),
-            (CLASSES, classes[: MOST_IDS - 1], self.label),
+            (INSTANCES, instances[: MAX_IDS - 1], self.instance),
+            (CLASSES, classes[: MAX_IDS - 1], self.label),
         ]
 
     def log_names(self, recording: Recording, place: tuple[str, ...], masks: tuple[str, ...]) -> None:
@@ -256,7 +256,9 @@ class Owned:
 class Growth:
     """A finished map as it came into the camera's view: what was seen by then of the instances that were known."""
 
-    def __init__(self, recording: Recording, place: tuple[str, ...], owned: Owned, first_frame: Sequence[int]) -> None:
+    def __init__(
+        self, recording: Recording, place: tuple[str, ...], owned: OwnedPoints, first_frame: Sequence[int]
+    ) -> None:
         self._recording, self._place, self._owned = recording, place, owned
         self._first_frame = np.append(np.array(first_frame, np.int64), 0)  # the last one: nobody's
         self._is_seen = np.zeros(len(owned.cloud.points), np.bool_)
@@ -342,22 +344,24 @@ class SceneTimeline:
         there = sorted(index for index in fed if 0 <= index < n_frames) or range(n_frames)
         if self._stride:
             return list(there[:: self._stride])
-        return [there[place] for place in evenly(len(there), MOST_FRAMES)] if len(there) else []
+        return [there[place] for place in evenly(len(there), MAX_FRAMES)] if len(there) else []
 
     def _frame(self, index: int) -> Frame | None:
         name = self.scene.partition("/")[2]
 
         def read() -> Frame:
-            if isinstance(self._reader.dataset, HasSketches):
-                return self._reader.dataset.sketch(name, index, MOST_WIDTH)
-            return smaller(self._reader.sequence[index], MOST_WIDTH)
+            if isinstance(self._reader.dataset, HasPreviews):
+                return self._reader.dataset.sketch(name, index, MAX_WIDTH)
+            return smaller(self._reader.sequence[index], MAX_WIDTH)
 
         frame: Frame | None = self._reader.had("a frame is left out", read)
         return frame
 
-    def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:
+    def _maps(
+        self, rules: ProtocolRules | None, truth: GroundTruth | None
+    ) -> dict[str, tuple[OwnedPoints, Sequence[int]]]:
         """Each method's map, and the first frame in which each of its instances was seen, 0 where nobody knows."""
-        maps: dict[str, tuple[Owned, Sequence[int]]] = {}
+        maps: dict[str, tuple[OwnedPoints, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
             prediction = self._reader.had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
@@ -369,8 +373,8 @@ class SceneTimeline:
                 maps[method] = self._owned(prediction, rules, truth), first
         return maps
 
-    def _owned(self, prediction: Prediction, rules: ProtocolRules | None, truth: GroundTruth | None) -> Owned:
-        cloud = thinned(prediction.points, MOST_POINTS)
+    def _owned(self, prediction: Prediction, rules: ProtocolRules | None, truth: GroundTruth | None) -> OwnedPoints:
+        cloud = thinned(prediction.points, MAX_POINTS)
         instance = point_owners(prediction, cloud.rows).astype(np.int64)
         is_dense = isinstance(prediction, DenseFeatures)
         label: Int64Array = np.full(len(cloud.rows), -1, np.int64)
@@ -383,7 +387,7 @@ class SceneTimeline:
             if classes is not None:
                 labels = tuple(entry.name for entry in rules.classes)
                 label = classes if is_dense else np.append(classes, -1)[instance]
-        return Owned(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
+        return OwnedPoints(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
 
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, of what the updates of a method say."""
@@ -399,8 +403,8 @@ class SceneTimeline:
     def _about(self) -> str:
         lines = [
             f"{printable(self.scene, 200)}, {self._run.name}: {', '.join(printable(m, 80) for m in self._methods)}",
-            f"{counted(self.n_frames, 'frame')} shown, images at most {MOST_WIDTH} pixels wide, colour as JPEG, depth "
-            f"in millimetres; of each map and of the truth at most {MOST_POINTS:,} points.",
+            f"{counted(self.n_frames, 'frame')} shown, images at most {MAX_WIDTH} pixels wide, colour as JPEG, depth "
+            f"in millimetres; of each map and of the truth at most {MAX_POINTS:,} points.",
             "The maps are the finished ones. A point stands from the frame on in which the camera saw it, and not "
             "before its instance was seen first; what no frame shows comes with the last. The curves are what the "
             "method's map held after each update.",
@@ -418,7 +422,7 @@ def ids_of(rows: Int64Array) -> UInt16Array:
     >>> ids_of(np.array([0, 2, -1, 65535])).tolist()
     [1, 3, 0, 0]
     """
-    return np.where((rows >= 0) & (rows < MOST_IDS - 1), rows + 1, 0).astype(np.uint16)
+    return np.where((rows >= 0) & (rows < MAX_IDS - 1), rows + 1, 0).astype(np.uint16)
 
 
 def in_view(points: Float32Array, frame: Frame) -> BoolArray:
@@ -455,16 +459,16 @@ def smaller(frame: Frame, width: int) -> Frame:
     )
 
 
-def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> Owned:
+def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> OwnedPoints:
     """The truth as a map: its instances, named by their classes, and the classes of ``rules``."""
-    cloud = thinned(truth.points, MOST_POINTS)
+    cloud = thinned(truth.points, MAX_POINTS)
     own, first, instance = np.unique(truth.instance, return_index=True, return_inverse=True)
     place = np.cumsum(own > 0) - 1
     place[own <= 0] = -1
     name_of = dict(zip(truth.labels.ids, truth.labels.names, strict=True))
     names = tuple(name_of.get(int(truth.semantic[row]), "") for row in first[own > 0])
     instance = place[instance.reshape(-1)]
-    return Owned(
+    return OwnedPoints(
         cloud,
         instance[cloud.rows],
         class_index_of_ids(rules, truth.semantic[cloud.rows]),
@@ -491,7 +495,7 @@ def _corners_of(prediction: Prediction) -> Float32Array:
     return np.nan_to_num(_corners(prediction.points, prediction.instance.astype(np.int64), n), posinf=0, neginf=0)
 
 
-def refuse_nothing(timelines: Sequence[SceneTimeline], where: str) -> None:
+def check_not_empty(timelines: Sequence[SceneTimeline], where: str) -> None:
     """A ``StoreError`` where no frame and no map could be shown."""
     if not any(one.n_frames or one.n_maps for one in timelines):
         why = next((line for one in timelines for line in one.remarks), "it has neither frames nor maps")

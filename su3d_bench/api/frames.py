@@ -28,8 +28,8 @@ METRICS = {
     **dict.fromkeys(("value", "low", "high", "ceiling"), NUMBER),
     "n_scenes": WHOLE,
 }
-OF_SCENES = {**dict.fromkeys(("method", "protocol", "scene", "metric"), TEXT), "value": NUMBER}
-OF_CLASSES = {**dict.fromkeys(("method", "protocol", "class_name", "metric"), TEXT), "value": NUMBER}
+SCENE_DTYPES = {**dict.fromkeys(("method", "protocol", "scene", "metric"), TEXT), "value": NUMBER}
+CLASS_DTYPES = {**dict.fromkeys(("method", "protocol", "class_name", "metric"), TEXT), "value": NUMBER}
 UPDATES = {"method": TEXT, "scene": TEXT, "update": WHOLE, "frame": WHOLE_OR_NONE}  # all others are numbers
 ERRORS = {
     **dict.fromkeys(("method", "protocol", "metric"), TEXT),
@@ -62,12 +62,12 @@ def metrics_frame(metrics: MetricsRecord) -> pandas.DataFrame:
 
 def scenes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
     """A row a method, protocol, scene and metric."""
-    return frame(OF_SCENES, _inner_rows(metrics, "per_scene"))
+    return frame(SCENE_DTYPES, _inner_rows(metrics, "per_scene"))
 
 
 def classes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
     """A row a method, protocol, class and metric; of the classes that have a value."""
-    return frame(OF_CLASSES, _inner_rows(metrics, "per_class"))
+    return frame(CLASS_DTYPES, _inner_rows(metrics, "per_class"))
 
 
 def _inner_rows(metrics: MetricsRecord, name: str) -> list[tuple[Any, ...]]:

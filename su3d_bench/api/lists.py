@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, frame
-from su3d_bench.api.results import Names, several
+from su3d_bench.api.tables import Names, several
 
 if TYPE_CHECKING:
     import pandas
@@ -15,11 +15,11 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     """The datasets and what of them is here, a row a scene; one of which nothing is here has a row without a scene.
 
     Columns: ``dataset``, ``scene``, its address as ``run`` takes it, ``state``, how many frames it has or what is
-    wrong, ``summary`` of the dataset (string); ``is_here`` (bool). A ``ConfigError`` for an unknown name.
+    wrong, ``summary`` of the dataset (string); ``is_available`` (bool). A ``ConfigError`` for an unknown name.
 
     >>> import su3d_bench as su3d
     >>> scenes = su3d.list_datasets("rooms")
-    >>> scenes["scene"][0], bool(scenes["is_here"].all())
+    >>> scenes["scene"][0], bool(scenes["is_available"].all())
     ('rooms/living0', True)
     """
     from su3d_bench.runs.catalogue import known_datasets
@@ -30,7 +30,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
         rows += [(one["name"], scene["scene"], scene["status"], one["summary"], True) for scene in one["scenes"]]
         if not one["scenes"]:
             rows.append((one["name"], "", one["error"] or "has no scene", one["summary"], False))
-    columns = {"dataset": TEXT, "scene": TEXT, "state": TEXT, "summary": TEXT, "is_here": TRUTH}
+    columns = {"dataset": TEXT, "scene": TEXT, "state": TEXT, "summary": TEXT, "is_available": TRUTH}
     return frame(columns, rows)
 
 

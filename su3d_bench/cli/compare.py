@@ -22,12 +22,12 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "check", call_check)
     parser.option("runs [RUN...]", "run to check")
     parser.option("--against FILE", "reference file")
-    parser.option("--learn RUN...", "repetitions of one run to build the reference from")
-    parser.option("--out FILE", "reference file that --learn writes")
-    parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --learn)", type=float)
+    parser.option("--build-from RUN...", "repetitions of one run to build the reference from")
+    parser.option("--out FILE", "reference file that --build-from writes")
+    parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --build-from)", type=float)
     parser.option(
-        "--across-machines POINTS",
-        "tolerance across machines in points (with --learn; default: 2)",
+        "--machine-tolerance POINTS",
+        "tolerance across machines in points (with --build-from; default: 2)",
         type=float,
     )
     parser.option("--markdown FILE", "write the table as Markdown, for a pull request")
@@ -54,34 +54,34 @@ def call_compare(arguments: argparse.Namespace) -> None:
 def call_check(arguments: argparse.Namespace) -> int:
     """Fail if a run regresses against a reference; or build a reference from runs.
 
-    su3d-bench check --learn runs/a runs/b runs/c --out reference.json
+    su3d-bench check --build-from runs/a runs/b runs/c --out reference.json
     su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml
     """
-    if arguments.learn:
+    if arguments.build_from:
         return _learn(arguments)
     if len(arguments.runs) != 1 or arguments.against is None:
-        raise ConfigError("check: give one RUN and --against FILE, or --learn RUN... and --out FILE")
-    if arguments.out is not None or arguments.cost_limit is not None or arguments.across_machines is not None:
-        raise ConfigError("check: --out, --cost-limit and --across-machines belong to --learn")
+        raise ConfigError("check: give one RUN and --against FILE, or --build-from RUN... and --out FILE")
+    if arguments.out is not None or arguments.cost_limit is not None or arguments.machine_tolerance is not None:
+        raise ConfigError("check: --out, --cost-limit and --machine-tolerance belong to --build-from")
     return _check(arguments)
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn, why_no_cost
+    from su3d_bench.analysis.regression_check import ACROSS_MACHINES, COST_LIMIT, MAX_COST_LIMIT, learn, no_cost_reason
     from su3d_bench.core.errors import counted, printable
     from su3d_bench.core.files.atomic import json_text
     from su3d_bench.runs.finished import read_run
 
     if arguments.runs or arguments.against or arguments.out is None:
-        raise ConfigError("check: --learn takes the runs and needs --out FILE, without RUN and --against")
+        raise ConfigError("check: --build-from takes the runs and needs --out FILE, without RUN and --against")
     cost_limit = COST_LIMIT if arguments.cost_limit is None else arguments.cost_limit
-    across = ACROSS_MACHINES if arguments.across_machines is None else arguments.across_machines / 100
-    if not 1 < cost_limit <= MOST_COST_LIMIT or not 0 <= across <= 1:
+    across = ACROSS_MACHINES if arguments.machine_tolerance is None else arguments.machine_tolerance / 100
+    if not 1 < cost_limit <= MAX_COST_LIMIT or not 0 <= across <= 1:
         raise ConfigError(
-            f"check: --cost-limit is a factor above 1 and up to {MOST_COST_LIMIT:g}, --across-machines from 0 to 100 "
+            f"check: --cost-limit is a factor above 1 and up to {MAX_COST_LIMIT:g}, --machine-tolerance from 0 to 100 "
             "points"
         )
-    runs = [read_run(path) for path in arguments.learn]
+    runs = [read_run(path) for path in arguments.build_from]
     reference = learn(runs, across, cost_limit)
     output.written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
     n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
@@ -95,16 +95,16 @@ def _learn(arguments: argparse.Namespace) -> int:
         remark("built from one run: every value must match exactly; use several runs if results vary")
     for method in runs[0].methods:
         if method not in reference.costs:
-            remark(f"{printable(method, 80)}: no cost limit: {why_no_cost(runs[0], method)}")
+            remark(f"{printable(method, 80)}: no cost limit: {no_cost_reason(runs[0], method)}")
     return EXIT_DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.analysis.gate import check, read_reference
-    from su3d_bench.core.printing import terminal_width
-    from su3d_bench.reports.gate import github_lines, junit_xml, markdown, plain_parts
+    from su3d_bench.analysis.regression_check import check, read_reference
+    from su3d_bench.core.safe_output import terminal_width
+    from su3d_bench.reports.regression_check import github_lines, junit_xml, markdown, plain_parts
     from su3d_bench.reports.tables.formats import plain
     from su3d_bench.runs.finished import read_run
 

@@ -17,7 +17,7 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, co
 SHELLS = ("bash", "zsh", "fish")
 KIND_NAMES = ("perception", "model-digests", "runs", "replies")
 DAY_S = 86400
-MOST_REFUSED = 20  # lines
+MAX_REFUSED = 20  # lines
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -142,7 +142,7 @@ def _add_registry(verbs: Verbs) -> None:
     parser.option("folder DIR", "registry, or any folder of bundles")
     parser.option("--out DIR", "folder of the site (default: site)", default=Path("site"))
     parser.option("--title TEXT", "title of the first page (default: Registry of results)")
-    parser.option("--bundles-at URL", "base URL for links to bundles (default: no links)")
+    parser.option("--bundle-url URL", "base URL for links to bundles (default: no links)")
     add_new(actions, REGISTRY)
 
 
@@ -172,18 +172,18 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     """Build a static site of a registry; exit code 1 if an entry cannot be ranked.
 
     su3d-bench dev registry build my-registry --out site
-    su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles
+    su3d-bench dev registry build . --out site --title "Maps of rooms" --bundle-url https://example.org/bundles
     """
     from su3d_bench.reproducing.registry import read_registry
     from su3d_bench.reproducing.registry_site import TITLE, write_site
 
     registry = read_registry(arguments.folder)
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
-    pages = write_site(registry, arguments.out, title, arguments.bundles_at)
+    pages = write_site(registry, arguments.out, title, arguments.bundle_url)
     refused = [f"excluded: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
-    remark(*refused[:MOST_REFUSED])
-    if len(refused) > MOST_REFUSED:
-        remark(f"excluded: {len(refused) - MOST_REFUSED} more")
+    remark(*refused[:MAX_REFUSED])
+    if len(refused) > MAX_REFUSED:
+        remark(f"excluded: {len(refused) - MAX_REFUSED} more")
     counts = f"{counted(len(registry.rows), 'row')} of {counted(registry.n_bundles, 'bundle')} in "
     value: dict[str, Any] = {
         "index": str(pages[0]),

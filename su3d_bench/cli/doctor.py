@@ -21,8 +21,8 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, coun
 
 PROGRAM = "su3d-bench"
 PATIENCE_S = 180.0  # for one import, from a cold disk
-LEAST_FREE = 10**9  # bytes: a room, its cache, its run
-LEAST_MEMORY = 4 * 10**9  # bytes: a room under opensu3d takes one; docs/running/performance.md
+MIN_FREE_BYTES = 10**9  # bytes: a room, its cache, its run
+MIN_MEMORY = 4 * 10**9  # bytes: a room under opensu3d takes one; docs/running/performance.md
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Imported in a child process: a compiled library with a missing dependency can crash it.
 LOADED = {
@@ -189,15 +189,15 @@ def _folder(what: str, folder: Path, setting: str) -> Check:
         reason = error.strerror or str(error)
         return Check(what, "missing", f"{where}: cannot be written: {reason}", f"choose another with {setting}")
     found = f"{where}: {size_text(free := shutil.disk_usage(existing).free)} free"
-    if free >= LEAST_FREE:
+    if free >= MIN_FREE_BYTES:
         return Check(what, "ok", found)
     return Check(what, "note", found, f"free some space, or choose another with {setting}")
 
 
 def _kernels() -> Check:
-    from su3d_bench.store.caches import kernel_folders, why_slow
+    from su3d_bench.store.caches import cache_warning, kernel_folders
 
-    slow = why_slow()
+    slow = cache_warning()
     kept = f"stored in the first writable one of: {', '.join(map(shown, kernel_folders()))}"
     return Check("compiled code", "note" if slow else "ok", slow or kept)
 
@@ -246,5 +246,5 @@ def _memory() -> Check:
 
     memory = psutil.virtual_memory()
     found = f"{size_text(memory.total)}, {size_text(memory.available)} of it free"
-    is_enough = memory.available >= LEAST_MEMORY
+    is_enough = memory.available >= MIN_MEMORY
     return Check("memory", "ok" if is_enough else "note", found, "" if is_enough else "fewer scenes at once: --jobs 1")

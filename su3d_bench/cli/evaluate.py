@@ -13,7 +13,15 @@ from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import ConfigError
 
 SCHEMA = 1  # version of the JSON for several methods
-OF_A_REQUEST = ("dataset", "ground_truth", "truth_values", "format", "text_features", "confidences", "queries")
+REQUEST_OPTIONS = (
+    "dataset",
+    "ground_truth",
+    "ground_truth_values",
+    "format",
+    "text_features",
+    "confidences",
+    "queries",
+)
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -32,7 +40,7 @@ def add_parser(verbs: Verbs) -> None:
         "folder of ground truth as text, one <scene>.txt each; or OpenLex3D's release",
     )
     parser.option(
-        "--truth-values",
+        "--ground-truth-values",
         "values in --ground-truth: class ids, label * 1000 + instance, or object numbers",
         choices=("classes", "instances", "numbers"),
     )
@@ -55,13 +63,13 @@ def call(arguments: argparse.Namespace) -> None:
     su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
     su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
     """
-    from su3d_bench.evaluation.as_run import evaluate_methods
-    from su3d_bench.evaluation.evaluate import said_of
+    from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.result import Request
+    from su3d_bench.evaluation.run_output import evaluate_methods
     from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
     from su3d_bench.store.records import plain
 
-    chosen: dict[str, Any] = {name: getattr(arguments, name) for name in OF_A_REQUEST}
+    chosen: dict[str, Any] = {name: getattr(arguments, name) for name in REQUEST_OPTIONS}
     chosen |= {"protocols": tuple(arguments.protocols), "scenes": tuple(arguments.scenes)}
     requests = {method: Request(tuple(paths), **chosen) for method, paths in _named(arguments).items()}
     run = evaluate_methods(requests, arguments.out)
@@ -75,14 +83,16 @@ def call(arguments: argparse.Namespace) -> None:
         tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
     answer_tables(arguments, document, tables)
     for method, result in results.items():
-        remark(*(f"{method}: {line}" if len(results) > 1 else line for line in said_of(result)), quiet=arguments.quiet)
+        remark(
+            *(f"{method}: {line}" if len(results) > 1 else line for line in warnings_of(result)), quiet=arguments.quiet
+        )
     if arguments.out is not None:
-        _say_next(arguments.out, list(results), was_there=run.was_there, is_quiet=arguments.quiet)
+        _print_next_steps(arguments.out, list(results), existed=run.existed, is_quiet=arguments.quiet)
 
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by method name."""
-    from su3d_bench.evaluation.result import own_name
+    from su3d_bench.evaluation.result import default_name
 
     if not arguments.predictions and not arguments.name:
         raise ConfigError("evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS")
@@ -99,15 +109,15 @@ def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
             named[text] = list(arguments.predictions)
     if len(named) == 1 and arguments.out is None:
         raise ConfigError("evaluate: --name names a method of a run; add --out DIR")
-    return named or {own_name(arguments.out): list(arguments.predictions)}
+    return named or {default_name(arguments.out): list(arguments.predictions)}
 
 
-def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: bool) -> None:
+def _print_next_steps(out: Path, methods: Sequence[str], *, existed: bool, is_quiet: bool) -> None:
     """Print the run folder and commands for next steps."""
     run, method = shlex.quote(str(out)), shlex.quote(methods[0])
     pair = f"{run}:{method} " + (f"{run}:{shlex.quote(methods[1])}" if len(methods) > 1 else "OTHER_RUN")
     whose = f" --method {method}" if len(methods) > 1 else ""
-    state = " (unchanged: has this evaluation already)" if was_there else ""
+    state = " (unchanged: has this evaluation already)" if existed else ""
     remark(
         f"run folder: {out}{state}",
         f"next: su3d-bench compare {pair}",

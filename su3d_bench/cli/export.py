@@ -222,15 +222,15 @@ def _write_answer(
     content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
 ) -> tuple[str, ...]:
     """The masks that answer the query of a scene: as predicted, or by querying its map."""
-    from su3d_bench.core.interfaces import AsksText, HasSurface
+    from su3d_bench.core.interfaces import HasSceneQuery, HasSurface
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.predictions import export
     from su3d_bench.predictions.base import VertexMasks
 
     if isinstance(content, VertexMasks) and export.is_answer(content):
-        return export.write_opensun3d(export.answer_as_it_is(content), name, folder)
+        return export.write_opensun3d(export.masks_as_predicted(content), name, folder)
     dataset, scene = _scene_of(source, "arkitscenes", is_quiet=arguments.quiet)
-    if not isinstance(dataset, AsksText) or not isinstance(dataset, HasSurface):
+    if not isinstance(dataset, HasSceneQuery) or not isinstance(dataset, HasSurface):
         raise PredictionError("the dataset has no queries; --to opensun3d needs scenes of arkitscenes")
     rules = load_protocol(QUERY_RULES)
     encoder = _encoder(content, source, rules, arguments.text_features)
@@ -257,7 +257,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
 
     Protocols of kind top-k fit only ranked classes (``is_ranked``).
     """
-    from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+    from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
     from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
     from su3d_bench.runs.finished import read_run
 
@@ -273,7 +273,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
     is_own = run is not None and not name.endswith(".toml") and name not in protocol_names()
     finished = read_run(run) if run is not None and is_own else None
     rules = finished.rules(name) if finished is not None and name in finished.protocols else load_protocol(name)
-    reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
+    reason = truth_incompatibility(rules, TruthFacts.of_dataset(dataset))
     if reason is not None or not (has_masks(rules) or (is_ranked and rules.kind == "top-k")):
         raise ConfigError(f"--protocol {name}: {reason or 'no instance classes'}")
     return rules
@@ -283,7 +283,7 @@ def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path
     """The encoder for the features; None if the prediction has classes or no features."""
     from su3d_bench.evaluation.scoring import facts_of
     from su3d_bench.evaluation.texts import encoder_for, read_text_features
-    from su3d_bench.metrics.fitness import n_feature_dimensions
+    from su3d_bench.metrics.compatibility import n_feature_dimensions
     from su3d_bench.runs.finished import encoder_of
     from su3d_bench.store.run_folder import RunFolder
 

@@ -16,8 +16,8 @@ from su3d_bench.cli.output import answer_either, drawn_bars, remark
 from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.fetching.bringing import Brought, Planned
-    from su3d_bench.fetching.download import Watch
+    from su3d_bench.fetching.download import Progress
+    from su3d_bench.fetching.fetch import FetchResult, Planned
     from su3d_bench.fetching.sources import Source
 
 MB = 1_000_000
@@ -54,7 +54,7 @@ def retries_of(arguments: argparse.Namespace) -> int:
 
 def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
     """Download what is missing once its licence is accepted; with ``--dry-run`` only show it."""
-    from su3d_bench.fetching.bringing import fetch
+    from su3d_bench.fetching.fetch import fetch
 
     _known_terms(arguments, [entry.source for entry in planned])
     if arguments.dry_run:
@@ -65,12 +65,14 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     missing = [entry for entry in planned if entry.here is None]
     accept(arguments, [entry.source for entry in missing])
     keep = getattr(arguments, "keep_archives", False)
-    with watching(arguments) as watch:
+    with progress_callback(arguments) as watch:
         brought = [fetch(entry, watch, n_retries, keep_archives=keep) for entry in missing]
-    answer_brought(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
+    answer_fetched(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
 
 
-def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[Brought]) -> None:
+def answer_fetched(
+    arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[FetchResult]
+) -> None:
     """Print folders and checksums."""
     rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
     lines = [f"{name}: already present: {folder}" for name, folder in here]
@@ -80,8 +82,8 @@ def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path
         lines.append(f"{entry.source.name}: {entry.place}")
         for file in entry.files:
             sums = (
-                f"verified against: {', '.join(file.held_against)}"
-                if file.held_against
+                f"verified against: {', '.join(file.verified_against)}"
+                if file.verified_against
                 else "no published checksum; recorded"
             )
             lines.append(f"  {file.sha256}  {file.name}  ({sums})")
@@ -147,7 +149,7 @@ def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> No
 
 
 @contextmanager
-def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
+def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
     """A progress callback that draws one bar per file if stderr is a terminal."""
     with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
         if bars is None:
@@ -181,7 +183,7 @@ def call_models(arguments: argparse.Namespace) -> None:
     su3d-bench models fetch --for paper --accept MIT Apache-2.0
     su3d-bench models fetch sam-vit-h --dry-run
     """
-    from su3d_bench.fetching.bringing import plan_models
+    from su3d_bench.fetching.fetch import plan_models
     from su3d_bench.fetching.sources import load_sources
     from su3d_bench.perception.models.files import models_folder
 
@@ -215,7 +217,7 @@ def call_replica(arguments: argparse.Namespace) -> None:
     su3d-bench datasets fetch replica --dry-run
     su3d-bench datasets fetch replica frames --accept replica
     """
-    from su3d_bench.fetching.bringing import plan_replica
+    from su3d_bench.fetching.fetch import plan_replica
     from su3d_bench.fetching.sources import load_sources
     from su3d_bench.runs.scenes import data_root
 
@@ -235,23 +237,23 @@ def call_scannet(arguments: argparse.Namespace) -> None:
 
     source, root = built_in().named("scannet"), data_root()
     scans = plan_scans(arguments.scans, root)
-    here = root if scans.is_here else None
+    here = root if scans.is_available else None
     if arguments.dry_run:
         missing = [name for names in scans.missing.values() for name in names]
         row = plan_row(source, here) | {"missing": missing, "label_table": scans.label_table}
         counts = f"  {scans.n_files} files of {scans.n_asked} scans are missing below {root}"
         answer_either(arguments, [row], *plan_lines(source, here), counts, *(f"  {name}" for name in missing))
         return
-    if scans.is_here:
-        answer_brought(arguments, [(source.name, root)], [])
+    if scans.is_available:
+        answer_fetched(arguments, [(source.name, root)], [])
         return
     if arguments.script is None and arguments.address is None:
         raise how_to_sign(source)
     _known_terms(arguments, [source])
     accept(arguments, [source])
-    with watching(arguments) as watch:
+    with progress_callback(arguments) as watch:
         if arguments.script is not None:
             brought = fetch_by_script(source, scans, arguments.script, watch)
         else:
             brought = fetch_from(source, scans, arguments.address, watch, retries_of(arguments))
-    answer_brought(arguments, [], [brought])
+    answer_fetched(arguments, [], [brought])

@@ -15,8 +15,8 @@ from su3d_bench.cli.options import Parser
 from su3d_bench.cli.output import remark
 from su3d_bench.core import errors
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
-from su3d_bench.core.printing import doors
-from su3d_bench.core.system.endings import Ended, ending_in_order
+from su3d_bench.core.safe_output import doors
+from su3d_bench.core.system.signals import Terminated, ending_in_order
 from su3d_bench.core.version import __version__
 
 # The commands in the order of the help; each is in the module of its name, or in that of MODULE_OF.
@@ -88,13 +88,13 @@ def complete(parser: Parser) -> None:
     argcomplete.autocomplete(parser)
 
 
-def _refuse_records(arguments: argparse.Namespace) -> None:
+def _check_not_run_files(arguments: argparse.Namespace) -> None:
     """Refuse an ``--out`` that is a file of a finished run."""
     out = getattr(arguments, "out", None)
     if isinstance(out, Path) and os.path.isfile(out):
-        from su3d_bench.store.run_folder import refuse_records
+        from su3d_bench.store.run_folder import check_not_run_file
 
-        refuse_records(out)
+        check_not_run_file(out)
 
 
 def _exit_code(words: Sequence[str]) -> int:
@@ -109,17 +109,17 @@ def _exit_code(words: Sequence[str]) -> int:
             arguments = parser.parse_args([*words, "list"])
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
-        _refuse_records(arguments)
+        _check_not_run_files(arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
         with ending_in_order():
             code: int | None = arguments.call(arguments)
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
-        how = f"stopped by {end}" if isinstance(end, Ended) else "interrupted"
+        how = f"stopped by {end}" if isinstance(end, Terminated) else "interrupted"
         again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
-        return end.exit_code if isinstance(end, Ended) else EXIT_INTERRUPTED
+        return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
     except Exception as error:  # noqa: BLE001 - the one place that turns every other exception into a line
@@ -131,7 +131,7 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        if errors.own_line(error):  # raised in a user-defined method or dataset
+        if errors.user_code_line(error):  # raised in a user-defined method or dataset
             remark(f"su3d-bench: {errors.error_line(error)}")
             return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")

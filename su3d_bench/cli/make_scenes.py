@@ -23,12 +23,12 @@ from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
-FRAMES_A_UNIT = 400  # a quarter of a room: much more work than building the room in each process
-WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")
+FRAMES_PER_UNIT = 400  # a quarter of a room: much more work than building the room in each process
+LAYOUT_PARAMETERS = ("scan", "objects", "trajectory", "intrinsics")
 
 
 @dataclass(frozen=True)
-class Unit:
+class WorkUnit:
     """A unit of work: the frames at ``indices``, or (None) the ground truth; without ``target`` only the scan.
 
     ``layout`` is a name, because units are sent to other processes.
@@ -73,12 +73,12 @@ def make(arguments: argparse.Namespace) -> None:
 
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:
     dataset_class = registry.load("dataset", name)
-    if not all(hasattr(dataset_class, wanted) for wanted in WHAT_A_LAYOUT_TAKES):
+    if not all(hasattr(dataset_class, wanted) for wanted in LAYOUT_PARAMETERS):
         raise ConfigError(f"datasets make {name}: scenes of this dataset cannot be generated; known: rooms")
-    own_name = str(dataset_class.name)
+    default_name = str(dataset_class.name)
     # A setting may have the name of the dataset as prefix, as in `run --set`.
-    texts = [text if text.partition("=")[0].count(".") else f"{own_name}.{text}" for text in assignments]
-    return part_of("dataset", name, read_assignments(texts, (), (own_name,)))
+    texts = [text if text.partition("=")[0].count(".") else f"{default_name}.{text}" for text in assignments]
+    return part_of("dataset", name, read_assignments(texts, (), (default_name,)))
 
 
 def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
@@ -93,7 +93,7 @@ def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
 
 
 def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    units = [Unit(part, out, scene, arguments.layout, None, None) for scene in scenes]
+    units = [WorkUnit(part, out, scene, arguments.layout, None, None) for scene in scenes]
     _run(units, arguments, lambda unit: None)
     return set(scenes)
 
@@ -104,12 +104,12 @@ def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse
     units = []
     for target in plan_scenes(layout, dataset, scenes, out):
         n_frames = dataset.info(target.scene, 1).n_frames
-        starts = range(0, n_frames, FRAMES_A_UNIT)
-        pieces = [range(start, min(start + FRAMES_A_UNIT, n_frames)) for start in starts]
-        units += [Unit(part, data_root(), target.scene, layout.name, target, piece) for piece in (*pieces, None)]
+        starts = range(0, n_frames, FRAMES_PER_UNIT)
+        pieces = [range(start, min(start + FRAMES_PER_UNIT, n_frames)) for start in starts]
+        units += [WorkUnit(part, data_root(), target.scene, layout.name, target, piece) for piece in (*pieces, None)]
     n_open = Counter(unit.scene for unit in units)
 
-    def count_down(unit: Unit) -> None:
+    def count_down(unit: WorkUnit) -> None:
         n_open[unit.scene] -= 1
         if n_open[unit.scene] == 0:
             assert unit.target is not None
@@ -119,7 +119,7 @@ def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse
     return set(n_open)
 
 
-def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[Unit], None]) -> None:
+def _run(units: Sequence[WorkUnit], arguments: argparse.Namespace, done: Callable[[WorkUnit], None]) -> None:
     n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
     with overall_progress("generating", is_quiet=arguments.quiet) as (begin, report):
         begin(sum(unit.n_steps for unit in units))
@@ -131,7 +131,7 @@ def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[U
             done(unit)
 
 
-def _work(unit: Unit, report: Report) -> Unit:
+def _work(unit: WorkUnit, report: Report) -> WorkUnit:
     dataset = _dataset(unit.dataset, unit.root)
     name = f"{unit.scene}, {'ground truth' if unit.indices is None else f'frames from {unit.indices.start}'}"
     if unit.target is None:
@@ -155,5 +155,5 @@ def _dataset(part: Part, root: Path) -> Any:
     return build_dataset(part, root)
 
 
-def _lost(unit: Unit, cause: str) -> NoReturn:
+def _lost(unit: WorkUnit, cause: str) -> NoReturn:
     raise DataError(f"{unit.dataset.name}/{unit.scene}: {cause}")

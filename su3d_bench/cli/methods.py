@@ -12,7 +12,7 @@ from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_either, answer_json
 from su3d_bench.core.errors import counted
-from su3d_bench.core.printing import one_line
+from su3d_bench.core.safe_output import one_line
 
 if TYPE_CHECKING:
     from su3d_bench.reports.tables.paper import Figure

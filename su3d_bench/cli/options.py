@@ -206,7 +206,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "how to answer questions: built-in (geometry) or llm (default: built-in)",
             choices=("built-in", "llm"),
         ),
-        option("--leave-out FILE", "CSV file with ids of questions to exclude"),
+        option("--exclude FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
             ".npz file with text features, for predictions with features",
@@ -263,12 +263,12 @@ def add_language_options(parser: Parser, default: str = "the paper's gpt-4-1106-
     parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI)")
     parser.shared("--config", "--set", "--dry-run")
     parser.option("--offline", SHARED["--offline"]["help"])
-    parser.option("--ask-failed-again", "repeat requests that failed in an earlier command")
+    parser.option("--retry-failed", "repeat requests that failed in an earlier command")
 
 
 def given_language_option(arguments: argparse.Namespace) -> str | None:
     """The first option of ``add_language_options`` that was set, or None."""
-    names = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
+    names = ("model", "base_url", "config", "set", "offline", "retry_failed", "dry_run")
     return next((f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)), None)
 
 
@@ -294,7 +294,7 @@ def chat_client(
     config = resolve(Settings(usual) + settings + assigned + Settings(given), LANGUAGE, LanguageConfig)
     store = ReplyStore(run.path / "language")
     arguments.takes_up = True  # from the stored replies
-    return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
+    return ChatClient(config, store, offline=arguments.offline, retry_failed=arguments.retry_failed), config
 
 
 def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> None:

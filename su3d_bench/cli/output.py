@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.core.errors import counted, printable
-from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
+from su3d_bench.core.safe_output import SafeStream, escaped_json, one_line, stream_behind, terminal_width
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Prose, Table
     from su3d_bench.runs.executors import Event, Report
 
-MOST_UNSEEN = 8  # words that are listed
+MAX_UNSEEN = 8  # words that are listed
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
-MOST_OF_A_BAR = 80  # characters of the label
+MAX_BAR_LABEL = 80  # characters of the label
 
 
 def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
@@ -84,15 +84,15 @@ def show() -> None:
 def answer_commands(lines: Sequence[str]) -> None:
     """Print workflow commands, whose text is already escaped."""
     for line in lines:
-        sys.stdout.write_command(line) if isinstance(sys.stdout, Door) else print(line)
+        sys.stdout.write_command(line) if isinstance(sys.stdout, SafeStream) else print(line)
 
 
 def written(path: Path, text: str) -> Path:
     """Write ``text`` to the file of an option, creating its folder; returns the path."""
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.store.run_folder import refuse_records
+    from su3d_bench.store.run_folder import check_not_run_file
 
-    refuse_records(path)
+    check_not_run_file(path)
     make_folder(path.parent)
     write_text(path, text)
     return path
@@ -147,11 +147,11 @@ def remark(*lines: str, quiet: bool = False) -> None:
 
 def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
     """Warn about words of ``text`` that the encoder was not trained on, if it knows."""
-    from su3d_bench.core.interfaces import KnowsItsWords
+    from su3d_bench.core.interfaces import HasTrainingVocabulary
 
-    if isinstance(encoder, KnowsItsWords) and (words := encoder.unseen_words(text)):
-        named = ", ".join(f"'{printable(word, 40)}'" for word in words[:MOST_UNSEEN])
-        more = f" and {len(words) - MOST_UNSEEN} more" if len(words) > MOST_UNSEEN else ""
+    if isinstance(encoder, HasTrainingVocabulary) and (words := encoder.unseen_words(text)):
+        named = ", ".join(f"'{printable(word, 40)}'" for word in words[:MAX_UNSEEN])
+        more = f" and {len(words) - MAX_UNSEEN} more" if len(words) > MAX_UNSEEN else ""
         remark(f"encoder {encoder.name} was not trained on {named}{more}; results are unreliable", quiet=quiet)
 
 
@@ -189,7 +189,7 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
         """The label of a bar, without markup or control characters."""
 
         def render(self, task: Task) -> Text:
-            return Text(one_line(task.description)[:MOST_OF_A_BAR], no_wrap=True, overflow="ellipsis")
+            return Text(one_line(task.description)[:MAX_BAR_LABEL], no_wrap=True, overflow="ellipsis")
 
     console = Console(file=stream_behind(sys.stderr))
     remarks = TextColumn("{task.fields[remark]}", markup=False)
@@ -210,7 +210,7 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
     def show(text: str) -> None:
         bars.console.print(Text(text.removesuffix("\n")), soft_wrap=True)
 
-    return sys.stderr.through(show) if isinstance(sys.stderr, Door) else nullcontext()
+    return sys.stderr.through(show) if isinstance(sys.stderr, SafeStream) else nullcontext()
 
 
 @contextmanager
@@ -255,9 +255,9 @@ class _Board:
     def report(self, event: Event) -> None:
         from su3d_bench.runs.executors import SCENE_DONE
 
-        self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
+        self._bars.update(self._scenes, remark=event.activity if event.label == SCENE_DONE else "")
         if event.label == SCENE_DONE:
-            if not event.doing:
+            if not event.activity:
                 self._bars.update(self._scenes, advance=1)
                 self._remove(event.unit)
             return
@@ -269,9 +269,9 @@ class _Board:
         task = self._tasks[key]
         if event.total:
             self._bars.update(task, total=event.total, completed=event.done)
-        if event.doing or event.done:
+        if event.activity or event.done:
             is_last = event.done == event.total > 0
-            self._bars.update(task, remark=event.doing or (is_last and self._last_step) or self._remark(event))
+            self._bars.update(task, remark=event.activity or (is_last and self._last_step) or self._remark(event))
 
     def _remove(self, unit: str) -> None:
         """Remove the bars of a scene that is done or starts its next method."""

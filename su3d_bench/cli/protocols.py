@@ -16,7 +16,7 @@ from su3d_bench.cli.output import answer_either, answer_tables, progress, remark
 from su3d_bench.core.errors import ConfigError, shown, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.metrics.protocols.loading import Stated
+    from su3d_bench.metrics.protocols.loading import ResolvedOriginal
     from su3d_bench.metrics.protocols.model import ProtocolRules
 
 
@@ -76,7 +76,7 @@ def call_show(arguments: argparse.Namespace) -> None:
     su3d-bench protocols show rooms-semantic
     su3d-bench protocols show rooms-semantic --names
     """
-    from su3d_bench.metrics.fitness import labels_taken
+    from su3d_bench.metrics.compatibility import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
     rules = load_protocol(arguments.name)
@@ -93,7 +93,7 @@ def call_show(arguments: argparse.Namespace) -> None:
     answer_either(arguments, value | {"original": _plain(stated)}, *lines)
 
 
-def _plain(stated: Stated | None) -> dict[str, Any] | None:
+def _plain(stated: ResolvedOriginal | None) -> dict[str, Any] | None:
     return None if stated is None else stated.original.model_dump(mode="json") | {"of": stated.base}
 
 
@@ -103,7 +103,7 @@ def call_diff(arguments: argparse.Namespace) -> None:
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png
     """
-    from su3d_bench.analysis.rules_walk import Walker, rules_apart
+    from su3d_bench.analysis.rule_attribution import RuleStepper, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.comparison import rules_tables
 
@@ -112,7 +112,7 @@ def call_diff(arguments: argparse.Namespace) -> None:
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
     apart = rules_apart(first, second)
     if arguments.prediction is not None:
-        walker = Walker.of(first, second, arguments.prediction)
+        walker = RuleStepper.of(first, second, arguments.prediction)
         with progress(len(walker.scenes), is_quiet=arguments.quiet) as report:
             walk = walker.walk(arguments.jobs or os.cpu_count() or 1, report)
         apart = rules_apart(first, second, walk)
@@ -138,7 +138,7 @@ def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """One line per rule, followed by the comment of the file that sets it."""
     from su3d_bench.core.config import flatten, toml_value
-    from su3d_bench.metrics.fitness import labels_taken
+    from su3d_bench.metrics.compatibility import labels_taken
     from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
 
     remarks = remarks_of(files)
@@ -159,7 +159,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     return lines
 
 
-FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries and their objects
+EVALUATE_SUFFIXES = (".toml", ".csv")  # of queries and their objects
 
 
 def call_texts(arguments: argparse.Namespace) -> None:
@@ -189,7 +189,7 @@ def call_texts(arguments: argparse.Namespace) -> None:
     line = "{file}: {n_texts} texts for {n_names} names of {protocol}, {n_dimensions} dimensions, encoder '{encoder}'"
     answer_either(arguments, names | numbers, line.format(**names, **numbers))
     words = ["--protocols", arguments.protocol, "--text-features", str(out)]
-    if arguments.queries is not None and arguments.queries.suffix.lower() in FORMS_OF_EVALUATE:
+    if arguments.queries is not None and arguments.queries.suffix.lower() in EVALUATE_SUFFIXES:
         words += ["--queries", str(arguments.queries)]
     remark(f"use: su3d-bench evaluate PREDICTIONS {shlex.join(words)}", quiet=arguments.quiet)
 

@@ -191,7 +191,7 @@ def _draw_ask(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None if it names no object."""
-    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.figures import AnswerRows, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:
@@ -203,5 +203,5 @@ def _draw_ask(
     for thing in scene.objects:
         names[thing.row] = thing.shown
     title = f"{arguments.scene}: {arguments.question}"
-    draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (reply.text, *reply.notes))
+    draw_reasoning(instances, AnswerRows(*rows), names, picture, title, (reply.text, *reply.notes))
     return picture

@@ -22,7 +22,7 @@ FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
 FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question, as --json shows them
 N_SHOWN = 20
-MOST_CHARACTERS = 80
+MAX_CHARACTERS = 80
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -37,7 +37,7 @@ def add_parser(verbs: Verbs) -> None:
         default=SOURCES[0],
         choices=SOURCES,
     )
-    parser.shared("--leave-out")
+    parser.shared("--exclude")
     parser.option(
         "--form",
         "own query sets, or Beacon3D's metadata_*.json (default: own)",
@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "audit", _audit)
     parser.option(*scenes)
     parser.option("--out DIR", "folder for page, pictures and table")
-    parser.option("--n N", "number of questions (default: 200)", type=count, default=200)
+    parser.option("--n-questions N", "number of questions (default: 200)", type=count, default=200)
     parser.shared("--seed")
     parser.option("--kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[])
     parser.option("--score FILE", "summarise the verdicts in this audit.csv")
@@ -65,7 +65,7 @@ def add_parser(verbs: Verbs) -> None:
 def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
-    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude disputed.csv --out queries.toml
     su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json
     """
     from su3d_bench.questions.question_files import check_form, write_questions
@@ -85,10 +85,10 @@ def _make_beacon3d(arguments: argparse.Namespace) -> None:
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.questions.chains import made_files
-    from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
+    from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, scene_objects
 
-    if arguments.leave_out is not None or arguments.source != SOURCES[0]:
-        raise ConfigError("query make: --leave-out and --source need --form own")
+    if arguments.exclude is not None or arguments.source != SOURCES[0]:
+        raise ConfigError("query make: --exclude and --source need --form own")
     if arguments.out.suffix != ".json":
         raise ConfigError(f"query make: --form {arguments.form} writes JSON; use --out FILE.json")
     objects = {}
@@ -109,10 +109,10 @@ def _make_beacon3d(arguments: argparse.Namespace) -> None:
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.generator import chosen
-    from su3d_bench.questions.query_files import read_left_out
-    from su3d_bench.questions.truths import questions_of
+    from su3d_bench.questions.ground_truths import questions_of
+    from su3d_bench.questions.query_files import read_excluded_ids
 
-    left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
+    left_out = frozenset[str]() if arguments.exclude is None else read_excluded_ids(arguments.exclude)
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         found = questions_of(dataset, scene, own=arguments.source == "auto")
@@ -143,9 +143,9 @@ def _show(arguments: argparse.Namespace) -> None:
 
 def _line(question: Question) -> str:
     ids = " ".join(map(str, question.answers or ()))
-    reply = f'"{printable(question.reply, MOST_CHARACTERS)}"' if question.reply else ""
+    reply = f'"{printable(question.reply, MAX_CHARACTERS)}"' if question.reply else ""
     known = " ".join(part for part in (ids, reply) if part) or "unknown"
-    text = printable(question.text, MOST_CHARACTERS)
+    text = printable(question.text, MAX_CHARACTERS)
     return f"{printable(question.scene, 60)}  {question.kind}  {text}  -> {known}"
 
 
@@ -165,12 +165,12 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
 def _audit(arguments: argparse.Namespace) -> None:
     """Sample questions with pictures for a manual audit, or summarise its verdicts.
 
-    su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit
+    su3d-bench query audit --scenes 'rooms/*' --n-questions 200 --out audit
     su3d-bench query audit --score audit/audit.csv
     """
     from su3d_bench.cli.scenes import chosen_scenes
+    from su3d_bench.human_eval.audit import audit_json, audit_table, make_audit, read_verdicts
     from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
-    from su3d_bench.sheets.audit import audit_json, audit_table, make_audit, read_verdicts
 
     if arguments.score is not None:
         verdicts = read_verdicts(arguments.score)
@@ -179,13 +179,13 @@ def _audit(arguments: argparse.Namespace) -> None:
     if not arguments.scenes or arguments.out is None:
         raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
     scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
-    n_each = n_of_each(arguments.n, len(scenes))
+    n_each = n_of_each(arguments.n_questions, len(scenes))
     every = []
     for dataset, scene in scenes:
         of_scene = list(audited_questions(dataset, scene, n_each=n_each, seed=arguments.seed))
         remark(f"{dataset.name}/{scene}: {counted(len(of_scene), 'question')}", quiet=arguments.quiet)
         every += of_scene
-    drawn = sample(of_kinds(every, arguments.kinds), arguments.n, arguments.seed)
+    drawn = sample(of_kinds(every, arguments.kinds), arguments.n_questions, arguments.seed)
     if not drawn:
         raise DataError("query audit: these scenes give no questions")
     places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}

@@ -12,7 +12,7 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, some
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.reproducing.recipe import Asked, Experiment, Recipe
+from su3d_bench.reproducing.recipe import Experiment, Recipe, RecipeRequest
 from su3d_bench.runs.scenes import split_address
 from su3d_bench.store.run_folder import RunFolder
 
@@ -21,8 +21,8 @@ DATA = "data"
 
 
 def rehearsed(
-    recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
-) -> Asked:
+    recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
+) -> RecipeRequest:
     """``asked`` for rooms in ``out/data``, generated if missing."""
     asked = _perceived(recipe, asked, arguments)
     rooms = tuple(arguments.rooms or recipe.rehearsal.rooms)
@@ -54,7 +54,7 @@ def places(out: Path) -> dict[str, str]:
     return {"SU3D_DATA": str((out / DATA).absolute())}
 
 
-def _perceived(recipe: Recipe, asked: Asked, arguments: argparse.Namespace) -> Asked:
+def _perceived(recipe: Recipe, asked: RecipeRequest, arguments: argparse.Namespace) -> RecipeRequest:
     """``asked`` with the profile of the rehearsal, which is printed."""
     profile = asked.profile or recipe.rehearsal.profile
     if profile == recipe.profile:

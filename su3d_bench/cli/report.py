@@ -47,7 +47,7 @@ def _add_tables(verbs: Verbs) -> None:
     ):
         parser.option(f"--{name} {name[:-1].upper()}...", what, default=[])
     parser.option("--intervals", "show 95 %% confidence intervals over scenes")
-    parser.option("--truth-scores", "show the ground-truth ceiling")
+    parser.option("--ceiling", "show the ground-truth ceiling")
     parser.option("--scenes-count", "always show the number of scenes")
     parser.option("--significant", "mark the best only if significantly better (p < 0.05)")
     parser.option(
@@ -67,13 +67,13 @@ def call_tables(arguments: argparse.Namespace) -> None:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.analysis.tables import choose, found_tables, measured_results, numbered_tables, refuse_unscored
+    from su3d_bench.analysis.tables import check_scored, choose, found_tables, measured_results, numbered_tables
     from su3d_bench.reports.tables.paper import Shown, selection_tables
 
     shown = Shown(
         metrics=tuple(arguments.metrics),
         intervals=arguments.intervals,
-        ceilings=arguments.truth_scores,
+        ceilings=arguments.ceiling,
         scenes_count=arguments.scenes_count,
         only_significant=arguments.significant,
     )
@@ -82,7 +82,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     is_selection = bool(arguments.table or arguments.protocols or arguments.metrics)
     found = [] if is_selection else found_tables(arguments.runs, arguments.methods, arguments.datasets)
     if not found:
-        refuse_unscored(every, arguments.runs)
+        check_scored(every, arguments.runs)
     elif not any(row.per_scene for row in every):
         return found
     measured = choose(every, arguments.methods, arguments.protocols, arguments.datasets)
@@ -121,7 +121,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
     timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
     times = [each for each in timed if each]
     if not times:
-        are_elsewhere = any(run.made_elsewhere for run in runs)
+        are_elsewhere = any(run.external for run in runs)
         why = "imported predictions have no timings" if are_elsewhere else "their methods process no frames"
         raise ConfigError(f"no timings in these runs: {why}")
     summaries = [summarise(each, arguments.warm_up) for each in times]
@@ -161,7 +161,7 @@ def call_samples(arguments: argparse.Namespace) -> None:
     su3d-bench report samples runs/my-run --out samples.csv
     su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
     """
-    from su3d_bench.analysis.samples import Chosen, samples
+    from su3d_bench.analysis.samples import Selection, samples
     from su3d_bench.core.files.atomic import make_folder, write_bytes
     from su3d_bench.reports.tables.samples import COLUMNS, columns_table, csv_of, parquet_of
     from su3d_bench.runs.finished import read_run
@@ -177,7 +177,7 @@ def call_samples(arguments: argparse.Namespace) -> None:
         if out is None:
             raise ConfigError("--format parquet: is binary; name a file with --out samples.parquet")
         parquet_of(())  # fail early if it is not installed
-    chosen = Chosen(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
+    chosen = Selection(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
     with output.progress(n_scenes, is_quiet=arguments.quiet) as report:
         found = samples(arguments.runs, chosen, report)

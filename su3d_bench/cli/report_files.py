@@ -27,7 +27,7 @@ def add_pages(verbs: Verbs) -> None:
     parser.option("--no-errors", "omit the error analysis and the gallery (faster)")
     parser.option("--no-gallery", "omit the gallery of errors")
     parser.option(
-        "--most-megabytes MB", "maximum page size; maps are thinned to fit (default: 30)", type=float, default=30.0
+        "--max-size-mb MB", "maximum page size; maps are thinned to fit (default: 30)", type=float, default=30.0
     )
     parser.shared("--jobs")
     parser = add_verb(verbs, "rerun", call_rerun)
@@ -52,15 +52,15 @@ def call_html(arguments: argparse.Namespace) -> None:
     su3d-bench report html runs/my-run --out page.html
     su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors
     """
-    from su3d_bench.analysis.page.contents import QUERIES, Wishes, page_contents
-    from su3d_bench.analysis.page.gallery import told_of
+    from su3d_bench.analysis.page.contents import QUERIES, PageOptions, page_contents
+    from su3d_bench.analysis.page.gallery import summary_of
     from su3d_bench.reports.page.page import page_html
 
-    if not 0 < arguments.most_megabytes <= 1000:
-        raise ConfigError(f"--most-megabytes {arguments.most_megabytes:g}: must be above 0 and at most 1000")
-    wishes = Wishes(
+    if not 0 < arguments.max_size_mb <= 1000:
+        raise ConfigError(f"--max-size-mb {arguments.max_size_mb:g}: must be above 0 and at most 1000")
+    wishes = PageOptions(
         queries=QUERIES if arguments.queries is None else tuple(printable(text, 120) for text in arguments.queries),
-        most_bytes=round(arguments.most_megabytes * MEGABYTE),
+        max_bytes=round(arguments.max_size_mb * MEGABYTE),
         with_maps=not arguments.no_maps,
         with_errors=not arguments.no_errors,
         with_gallery=not (arguments.no_gallery or arguments.no_errors),
@@ -73,14 +73,14 @@ def call_html(arguments: argparse.Namespace) -> None:
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": told_of(contents.galleries)},
+        {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": summary_of(contents.galleries)},
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         [gallery.to_json() for gallery in contents.galleries],
     )
     output.written(arguments.out, page)
     n_bytes = len(page.encode())
-    value = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points}
+    value = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "max_points": contents.max_points}
     answer_either(arguments, value, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
 
 
@@ -91,11 +91,11 @@ def call_rerun(arguments: argparse.Namespace) -> None:
     su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
     """
     from su3d_bench.analysis.page.maps import Spaces
-    from su3d_bench.analysis.timeline import Recording, SceneTimeline, refuse_nothing, rerun_sdk
+    from su3d_bench.analysis.timeline import Recording, SceneTimeline, check_not_empty, rerun_sdk
     from su3d_bench.core.files.atomic import make_folder, replacing
+    from su3d_bench.human_eval.sources import chosen_of
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.sources import chosen_of
 
     if arguments.out.suffix != ".rrd" or arguments.out.is_dir():
         raise ConfigError(f"--out {printable(str(arguments.out), 200)}: expected a file name that ends in .rrd")
@@ -110,7 +110,7 @@ def call_rerun(arguments: argparse.Namespace) -> None:
         for one in timelines:
             tell = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
             one.write(Recording(sdk, one.scene, methods, stream), tell)
-        refuse_nothing(timelines, run.name)
+        check_not_empty(timelines, run.name)
     for one in timelines:
         remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)
     n_bytes, n_frames = arguments.out.stat().st_size, sum(one.n_frames for one in timelines)
@@ -131,13 +131,13 @@ def call_bundle(arguments: argparse.Namespace) -> None:
     su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip
     """
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.reproducing.bundle import bundle_runs, is_bundle, refuse_own_code, refuse_own_truth
+    from su3d_bench.reproducing.bundle import bundle_runs, check_dataset_ground_truth, check_no_custom_code, is_bundle
     from su3d_bench.runs.finished import read_run
 
     for path in arguments.runs:
         run = read_run(path)
-        refuse_own_code(run)
-        refuse_own_truth(run)
+        check_no_custom_code(run)
+        check_dataset_ground_truth(run)
     place = arguments.out or Path(f"{arguments.runs[0].resolve().name}.zip")
     if not is_bundle(place):
         raise ConfigError(f"--out {place}: expected a file name that ends in .zip")

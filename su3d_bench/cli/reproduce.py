@@ -15,9 +15,9 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
-    from su3d_bench.reproducing.recipe import Asked, AskedRun, Experiment, Recipe
+    from su3d_bench.reproducing.recipe import Experiment, Recipe, RecipeRequest, RecipeRun
 
-OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
+RUN_OPTIONS = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -93,15 +93,15 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _asked(arguments: argparse.Namespace) -> Asked:
-    from su3d_bench.reproducing.recipe import Asked
+def _asked(arguments: argparse.Namespace) -> RecipeRequest:
+    from su3d_bench.reproducing.recipe import RecipeRequest
 
-    values = {name: getattr(arguments, name) for name in OF_A_RUN if getattr(arguments, name) is not None}
-    return Asked(arguments.profile, arguments.encoder, arguments.device, values, tuple(arguments.set))
+    values = {name: getattr(arguments, name) for name in RUN_OPTIONS if getattr(arguments, name) is not None}
+    return RecipeRequest(arguments.profile, arguments.encoder, arguments.device, values, tuple(arguments.set))
 
 
 def _reproduce(
-    recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
+    recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
@@ -122,7 +122,7 @@ def _reproduce(
             f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all{ends}"
         )
     folders = evaluate_predictions(named, experiments, asked, out)  # first, because it is much faster than the runs
-    failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]
+    failures = [failure for run in runs for failure in _execute_run(run, out, arguments)]
     folders = [run.folder(out) for run in runs] + folders
     _answer(recipe, experiments, folders, out, arguments)
     if failures:
@@ -130,13 +130,13 @@ def _reproduce(
     return EXIT_DONE
 
 
-def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
+def _execute_run(run: RecipeRun, out: Path, arguments: argparse.Namespace) -> list[str]:
     """One line per failure."""
-    from su3d_bench.reproducing.recipe import carry_out, plan_of
+    from su3d_bench.reproducing.recipe import execute, plan_of
 
     plan = plan_of(run, out)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
-        result = carry_out(run, plan, report)
+        result = execute(run, plan, report)
     remark(*result.remarks, quiet=arguments.quiet)
     remark(f"run folder: {plan.folder.path}", quiet=arguments.quiet)
     return [line for _, _, line in result.failures]

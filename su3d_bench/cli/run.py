@@ -26,7 +26,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "ablate", call_ablate, takes_up=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
     parser.option("--method METHOD", "method to vary, or file.py:Class (default: opensu3d)", default="opensu3d")
-    parser.option("--beside METHOD...", "additional methods to run without variation", default=[])
+    parser.option("--also METHOD...", "additional methods to run without variation", default=[])
     parser.option("--grid", "run every combination instead of one setting at a time")
     _add_run_options(parser)
 
@@ -71,7 +71,7 @@ def call_run(arguments: argparse.Namespace) -> int:
     su3d-bench run rooms/living0 --methods opensu3d oracle
     su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run
     """
-    return carry_out(plan_of(arguments), arguments)
+    return execute(plan_of(arguments), arguments)
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
@@ -96,15 +96,15 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     return plan
 
 
-def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
+def execute(plan: Plan, arguments: argparse.Namespace) -> int:
     """Run the plan, or with ``--dry-run`` print what it takes."""
     from su3d_bench.runs.runner import run_plan
-    from su3d_bench.store.caches import why_slow
+    from su3d_bench.store.caches import cache_warning
 
     if arguments.dry_run:
         _show_plan(plan, arguments)
         return EXIT_DONE
-    if line := why_slow():
+    if line := cache_warning():
         remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
@@ -157,18 +157,18 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
 def call_ablate(arguments: argparse.Namespace) -> int:
     """Run an ablation: vary settings of a method, one at a time, on the same scenes.
 
-    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep
+    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --also conceptgraphs --scenes 'rooms/*' --out runs/sweep
     su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run
     """
     from su3d_bench.core import registry
     from su3d_bench.runs.ablation import ablation_rows, write_rows
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
-    own_name = str(registry.load("method", arguments.method).name)
-    swept = [arguments.method + row.method.removeprefix(own_name) for row in rows]
-    arguments.methods = list(dict.fromkeys([*swept, *arguments.beside]))
+    default_name = str(registry.load("method", arguments.method).name)
+    swept = [arguments.method + row.method.removeprefix(default_name) for row in rows]
+    arguments.methods = list(dict.fromkeys([*swept, *arguments.also]))
     plan = plan_of(arguments)
-    code = carry_out(plan, arguments)
+    code = execute(plan, arguments)
     if code == EXIT_DONE and not arguments.dry_run:
         write_rows(plan.folder.path, rows, joins=arguments.extend)
         plan.place.publish()

@@ -16,14 +16,14 @@ from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
 from su3d_bench.core.types import WorldUp
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
-from su3d_bench.datasets.checks_of_frames import Finding
+from su3d_bench.datasets.frame_checks import Finding
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line, look_at
 from su3d_bench.runs.executors import Event
 from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.runs.trial import try_dataset
 
-MOST_OF_A_KIND = 10  # printed findings per kind; --json has all
+MAX_FINDINGS_PER_KIND = 10  # printed findings per kind; --json has all
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -105,10 +105,10 @@ def lines_of(inspection: Inspection) -> list[str]:
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
     shown = [f"  {fault.severity:<13} {f'{fault.where}: ' if fault.where else ''}{fault.text}" for fault in findings]
-    n_more = len(shown) - MOST_OF_A_KIND
+    n_more = len(shown) - MAX_FINDINGS_PER_KIND
     if n_more <= 0:
         return shown
-    return [*shown[:MOST_OF_A_KIND], f"  {'':<13} and {n_more} more of this kind; --json lists all"]
+    return [*shown[:MAX_FINDINGS_PER_KIND], f"  {'':<13} and {n_more} more of this kind; --json lists all"]
 
 
 def _frames_text(inspection: Inspection) -> str:

@@ -13,7 +13,7 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.scores import Scores
+    from su3d_bench.human_eval.scores import Scores
 
 SHOWN_FAULTS = 200  # lines; the total is printed
 
@@ -36,7 +36,7 @@ def _add_score(verbs: Verbs) -> None:
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review")
-    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --leave-out")
+    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude")
     parser.shared("--format")
 
 
@@ -49,10 +49,10 @@ def call_score(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
     from su3d_bench.formats.tables.table import Prose
+    from su3d_bench.human_eval.answers import check_answers, check_key, read_answers
+    from su3d_bench.human_eval.items import KEY_FILE, read_key, read_sheet
+    from su3d_bench.human_eval.scores import disputed_csv, score
     from su3d_bench.reports.tables.judged import sheet_tables
-    from su3d_bench.sheets.answers import check_answers, check_key, read_answers
-    from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.sheets.scores import disputed_csv, score
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
@@ -83,14 +83,14 @@ def call_score(arguments: argparse.Namespace) -> None:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
-        path = output.written(arguments.disputed, disputed_csv(key, scores.second_looks))
+        path = output.written(arguments.disputed, disputed_csv(key, scores.review_items))
         remark(f"written: {path}", quiet=arguments.quiet)
     output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
 
 def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
     """``sheet.json`` as given, or searched near the key and the answers."""
-    from su3d_bench.sheets.items import SHEET_FILE, read_sheet
+    from su3d_bench.human_eval.items import SHEET_FILE, read_sheet
 
     if arguments.sheet is not None:
         given: Path = arguments.sheet
@@ -123,10 +123,10 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from dataclasses import asdict
 
     from su3d_bench.core.files.atomic import make_folder, write_text
+    from su3d_bench.human_eval.items import PICTURES
+    from su3d_bench.human_eval.scores import review_items_csv, review_items_page, write_scores
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
-    from su3d_bench.sheets.items import PICTURES
-    from su3d_bench.sheets.scores import second_looks_csv, second_looks_page, write_scores
 
     make_folder(folder)
     content = asdict(scores)
@@ -135,19 +135,19 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     for suffix, form in (("md", "markdown"), ("csv", "csv"), ("html", "html")):
         write_text(folder / f"tables.{suffix}", FORMATS[form](tables))
     pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
-    write_text(folder / "second_looks.csv", second_looks_csv(scores.second_looks))
-    write_text(folder / "second_looks.html", second_looks_page(scores.second_looks, pictures, scores.sheet_id))
+    write_text(folder / "review_items.csv", review_items_csv(scores.review_items))
+    write_text(folder / "review_items.html", review_items_page(scores.review_items, pictures, scores.sheet_id))
 
 
 def _looks_line(scores: Scores) -> str:
-    n_disagree = sum(look.reason == "annotators disagree" for look in scores.second_looks)
-    n_others = len(scores.second_looks) - n_disagree
+    n_disagree = sum(look.reason == "annotators disagree" for look in scores.review_items)
+    n_others = len(scores.review_items) - n_disagree
     others = "that no annotator calls right" if scores.kind == "questions" else "against the ground truth"
     return f"To review: {n_disagree} where annotators disagree, {n_others} {others}."
 
 
 SUBJECTS = ("similarity", "labels", "reasoning")
-MOST_ROWS = 40  # of one figure
+MAX_ROWS = 40  # of one figure
 FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
 
 
@@ -155,7 +155,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
     parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
-    parser.option("--what", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
+    parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
     parser.option("--figure", "add the texts of a figure of the paper or its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
@@ -171,30 +171,28 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
     su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf
     """
+    from su3d_bench.human_eval.drawing import Figures
+    from su3d_bench.human_eval.sources import RunSource
     from su3d_bench.questions.question_files import figure_texts
     from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.drawing import Figures
-    from su3d_bench.sheets.sources import RunSource
 
     of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
     texts = [*of_figure, *(query.strip() for query in arguments.queries)]
-    if (arguments.what == "labels") == bool(texts) or not all(texts):
-        what = "labels take none" if arguments.what == "labels" else f"{arguments.what} needs at least one, not empty"
+    if (arguments.draw == "labels") == bool(texts) or not all(texts):
+        what = "labels take none" if arguments.draw == "labels" else f"{arguments.draw} needs at least one, not empty"
         raise ConfigError(f"--queries: {what}")
     run = read_run(arguments.run)
     scenes = arguments.scenes or run.scenes[:1]
-    if len(scenes) * max(1, len(texts)) > MOST_ROWS:
-        raise ConfigError(
-            f"--queries, --scenes: give {len(scenes) * len(texts)} rows; at most {MOST_ROWS} fit a figure"
-        )
+    if len(scenes) * max(1, len(texts)) > MAX_ROWS:
+        raise ConfigError(f"--queries, --scenes: give {len(scenes) * len(texts)} rows; at most {MAX_ROWS} fit a figure")
     source = RunSource(run, arguments.methods, scenes)
     figures = Figures(source, with_photo=arguments.photo, view=arguments.view)
     scale, columns = None, figures.columns
-    if arguments.what == "labels":
+    if arguments.draw == "labels":
         columns, rows = figures.labels()
-    elif arguments.what == "reasoning":
+    elif arguments.draw == "reasoning":
         rows = figures.reasoning(texts, run.encoder(arguments.device or "cpu"))
     else:
         encoder = run.encoder(arguments.device or "cpu")

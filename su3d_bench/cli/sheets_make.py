@@ -16,12 +16,12 @@ from su3d_bench.core.errors import ConfigError, counted
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from su3d_bench.human_eval.drafts import Draft
+    from su3d_bench.human_eval.drawing import PictureSource
+    from su3d_bench.human_eval.items import Key, SheetKind
+    from su3d_bench.human_eval.sources import RunSource, TruthSource
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
-    from su3d_bench.sheets.drafts import Draft
-    from su3d_bench.sheets.drawing import PictureSource
-    from su3d_bench.sheets.items import Key, SheetKind
-    from su3d_bench.sheets.sources import RunSource, TruthSource
 
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
 KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
@@ -51,7 +51,7 @@ def add_parser(verbs: Verbs) -> None:
         "scenes of the run (default: all), or patterns without RUN",
         default=[],
     )
-    parser.shared("--leave-out")
+    parser.shared("--exclude")
     parser.option(
         "--per-kind N",
         "maximum number of items per kind and scene (default: depends on the kind)",
@@ -77,12 +77,12 @@ def call(arguments: argparse.Namespace) -> None:
     su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
     su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
     """
-    from su3d_bench.questions.query_files import read_left_out
+    from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run
+    from su3d_bench.questions.query_files import read_excluded_ids
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.sources import RunSource, truth_of_addresses, truth_of_run
 
     _check(arguments)
-    left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
+    left_out = frozenset[str]() if arguments.exclude is None else read_excluded_ids(arguments.exclude)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kind))
     origins: dict[SheetKind, Key] = {}
     drafts: dict[SheetKind, list[Draft]] = {}
@@ -99,7 +99,7 @@ def call(arguments: argparse.Namespace) -> None:
         drawn = _drawn(source, source.run.name, drafts, arguments)
     if QUESTIONS in kinds:
         truth = (
-            truth_of_addresses(arguments.scenes)
+            ground_truth_of_addresses(arguments.scenes)
             if arguments.run is None
             else truth_of_run(arguments.run, arguments.scenes)
         )
@@ -121,8 +121,8 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
         raise ConfigError("RUN: name a run folder; only --kind questions works without one, with --scenes")
     has_questions = arguments.questions != "generated"
-    if kinds == {"annotation"} and (has_questions or arguments.leave_out is not None):
-        raise ConfigError("--questions, --leave-out: not valid for annotation sheets, which have no questions")
+    if kinds == {"annotation"} and (has_questions or arguments.exclude is not None):
+        raise ConfigError("--questions, --exclude: not valid for annotation sheets, which have no questions")
     if kinds == {QUESTIONS} and (has_questions or arguments.methods):
         raise ConfigError(
             "--questions, --methods: not valid for --kind questions, which uses questions from the ground truth"
@@ -159,15 +159,15 @@ def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Key]:
     """The questions to rate and their origin; kinds take the place of methods."""
-    from su3d_bench.sheets.drafts import question_drafts
-    from su3d_bench.sheets.items import Key
-    from su3d_bench.sheets.scores import OF_ALL_KINDS
-    from su3d_bench.sheets.sets import check_split
+    from su3d_bench.human_eval.drafts import question_drafts
+    from su3d_bench.human_eval.items import Key
+    from su3d_bench.human_eval.scores import ANY_KIND
+    from su3d_bench.human_eval.sets import check_split
 
     n_most = arguments.per_kind or PER_KIND[QUESTIONS]
     drafts = [draft for scene in truth.scenes for draft in question_drafts(truth, scene, n_most, left_out)]
     check_split(len(drafts), arguments.annotators, arguments.overlap)
-    counted_kinds = (*dict.fromkeys(draft.question_kind for draft in drafts), OF_ALL_KINDS)
+    counted_kinds = (*dict.fromkeys(draft.question_kind for draft in drafts), ANY_KIND)
     return {QUESTIONS: drafts}, Key("", QUESTIONS, truth.run, truth.run_digest, counted_kinds, "", ())
 
 
@@ -179,10 +179,10 @@ def _drafts(
     """
     import numpy as np
 
+    from su3d_bench.human_eval.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
+    from su3d_bench.human_eval.sets import check_split
     from su3d_bench.metrics.questions.score import relative_remark
     from su3d_bench.questions import solver
-    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
-    from su3d_bench.sheets.sets import check_split
 
     source = next(iter(sources.values()))
     random = np.random.default_rng(arguments.seed)
@@ -217,7 +217,7 @@ def _drafts(
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
     """Print the maximum cost of the language model."""
-    from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
+    from su3d_bench.human_eval.drafts import reasoning_drafts, requests_into
 
     client, config = options.chat_client(arguments, source.run.folder)
     given = _given(source, arguments)
@@ -248,8 +248,8 @@ def _drawn(
     source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
+    from su3d_bench.human_eval.drawing import draw_all
     from su3d_bench.runs.executors import Event
-    from su3d_bench.sheets.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
     with output.progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
@@ -264,7 +264,7 @@ def _drawn(
 
 
 def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Key:
-    from su3d_bench.sheets.items import Key
+    from su3d_bench.human_eval.items import Key
 
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
     run = source.run
@@ -292,7 +292,7 @@ def _write(
     arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
     """Write one set per kind, several into a folder each; returns what was written."""
-    from su3d_bench.sheets.sets import make_sheets, write_sheets
+    from su3d_bench.human_eval.sets import make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
     written_sets = []

@@ -27,7 +27,7 @@ MAX_WAIT_S = 60.0  # for another process that compiles the same function; then i
 UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 
 
-class MendingCache(FunctionCache):
+class RepairingCache(FunctionCache):
     """Numba's own store of one function; what cannot be read is compiled again, what cannot be kept is used once.
 
     Numba renames what it writes, but does not wait for the disk: after a power cut its files may hold anything. And it
@@ -46,7 +46,7 @@ class MendingCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = self._loaded(sig, target_context)
-        if found is None and self._is_our_turn():
+        if found is None and self._wait_for_turn():
             found = self._loaded(sig, target_context)  # another process may have compiled it meanwhile
             if found is not None:
                 self._end_turn()
@@ -65,7 +65,7 @@ class MendingCache(FunctionCache):
                 self.flush()  # type: ignore[no-untyped-call]
             return None
 
-    def _is_our_turn(self) -> bool:
+    def _wait_for_turn(self) -> bool:
         """Waits until no other process compiles this function; whether the wait was worth a second look."""
         if self._turn is not None:
             return False
@@ -105,7 +105,7 @@ def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
         dispatcher = numba.njit(**options)(function)
         if cache:
             with suppress(RuntimeError, OSError):  # no place for it, beside the module or elsewhere, or no source
-                dispatcher._cache = MendingCache(function)
+                dispatcher._cache = RepairingCache(function)
         return dispatcher
 
     return compiled

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.printing import one_line
+from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.files import file_text, parse_toml
 
 HEADER = re.compile(r"^\s*\[+([^\[\]]+)\]+\s*(?:#.*)?$")
@@ -93,7 +93,7 @@ DEFAULT_SOURCE = "default"
 
 
 # Where scenes run and what is drawn of them: neither moves a number.
-MOVES_NO_NUMBER = frozenset(
+NEUTRAL_SETTINGS = frozenset(
     {"jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
 )
 

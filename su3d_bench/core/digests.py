@@ -16,7 +16,7 @@ from su3d_bench.core.system.files import opened
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
-ONLY_SHOWN = ("analysis", "api", "cli", "fetching", "reports", "reproducing", "sheets")
+NON_SCORING_PACKAGES = ("analysis", "api", "cli", "fetching", "reports", "reproducing", "human_eval")
 # No part of the program: what Python and file managers leave, texts for people, what type checkers read.
 NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
@@ -43,7 +43,7 @@ def digest_file(path: Path) -> str:
 def code_digest() -> str:
     """A key of the installed code, rules, tables and weights that can move a number."""
     names = {path.relative_to(PACKAGE_ROOT).parts[0] for path in _sources(PACKAGE_ROOT)}
-    return package_digest(*sorted(names - set(ONLY_SHOWN)))[:16]
+    return package_digest(*sorted(names - set(NON_SCORING_PACKAGES)))[:16]
 
 
 @cache

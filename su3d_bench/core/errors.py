@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.english import plural
-from su3d_bench.core.printing import escaped, plain_value
+from su3d_bench.core.safe_output import escaped, plain_value
 
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
 
@@ -48,8 +48,8 @@ def printable_json(value: Any) -> Any:
     return plain_value(value, printable)
 
 
-MOST_CHOICES = 30  # that a line lists; every verb is among so many
-MOST_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
+MAX_CHOICES = 30  # that a line lists; every verb is among so many
+MAX_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
 EXIT_WRONG_INPUT = 2
@@ -73,7 +73,7 @@ class Su3dError(Exception):
     exit_code = EXIT_WRONG_INPUT
 
     def __str__(self) -> str:
-        return printable(super().__str__(), MOST_CHARACTERS)
+        return printable(super().__str__(), MAX_CHARACTERS)
 
 
 class ConfigError(Su3dError):
@@ -149,7 +149,7 @@ def suggest(word: str, known: Iterable[str], are: str = "known:") -> str:
     """
     choices = list(dict.fromkeys(known))
     near = nearest(word, choices)
-    return f"{near or ';'} {are} {some(choices, MOST_CHOICES)}" if choices else ""
+    return f"{near or ';'} {are} {some(choices, MAX_CHOICES)}" if choices else ""
 
 
 @contextmanager
@@ -171,7 +171,7 @@ def converted(known: type[Su3dError], wanted: type[Su3dError]) -> Iterator[None]
 
 
 @cache
-def _not_theirs() -> tuple[str, ...]:
+def _library_folders() -> tuple[str, ...]:
     """Where the code of the program lies, and of what is installed; what lies elsewhere is somebody's own."""
     import sysconfig
 
@@ -181,25 +181,25 @@ def _not_theirs() -> tuple[str, ...]:
     return tuple(str(folder) for folder in (package, *links, *installed))
 
 
-def own_line(error: BaseException) -> str:
+def user_code_line(error: BaseException) -> str:
     """``my_method.py:12``: the deepest line of somebody's own file that ``error`` passed through; empty without one."""
     import traceback
 
-    if isinstance(error, SyntaxError) and error.filename and not error.filename.startswith(_not_theirs()):
+    if isinstance(error, SyntaxError) and error.filename and not error.filename.startswith(_library_folders()):
         return printable(f"{Path(error.filename).name}:{error.lineno}", 200)
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file = frame.f_code.co_filename
-        if not file.startswith((*_not_theirs(), "<")):
+        if not file.startswith((*_library_folders(), "<")):
             return printable(f"{Path(file).name}:{line}", 200)
     return ""
 
 
 def error_line(error: BaseException) -> str:
     """One line for any error; one that is not ours says its type, and where in somebody's own file it arose."""
-    text = printable(str(error), MOST_CHARACTERS)
+    text = printable(str(error), MAX_CHARACTERS)
     if isinstance(error, MemoryError):
         return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
     if isinstance(error, Su3dError):
         return text
-    place = own_line(error)
+    place = user_code_line(error)
     return f"{place}{': ' if place else ''}{type(error).__name__}: {text}"

@@ -93,21 +93,21 @@ class Dataset(Protocol):
 class DatasetFacts(DatasetAbility, Protocol):
     """Values that the class may have; without one it is empty, or False.
 
-    ``further_truths``: ground truths with labels of other label spaces than its own: label space -> the one of
+    ``extra_ground_truths``: ground truths with labels of other label spaces than its own: label space -> the one of
     ``ground_truth``; ``renders_frames``: frames are computed and not read, so that none is made ahead, since the
     pipeline's timed stages would wait for the interpreter; ``reads_made_rooms``: rooms that the program makes are
     written in its layout, which are not its scenes; ``scene_names``: the regular expression of names that only its
     scenes have, by which files of predictions are known.
     """
 
-    further_truths: Mapping[str, str]
+    extra_ground_truths: Mapping[str, str]
     renders_frames: bool
     reads_made_rooms: bool
     scene_names: str
 
 
 @runtime_checkable
-class HasPlaces(DatasetAbility, Protocol):
+class ListsFolders(DatasetAbility, Protocol):
     """The folders that a dataset searches."""
 
     def places(self) -> Sequence[Path]: ...
@@ -128,14 +128,14 @@ class HasGroups(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class HasProblems(DatasetAbility, Protocol):
+class ReportsProblems(DatasetAbility, Protocol):
     """Every fault of a scene's files, a line each."""
 
     def problems(self, scene: str) -> Sequence[str]: ...
 
 
 @runtime_checkable
-class CorrectsReading(DatasetAbility, Protocol):
+class HasReadingCorrections(DatasetAbility, Protocol):
     """Its files are read as a description says: whether depth shall be held against poses, and what to change in the
     description where another reading, a ``Finding`` of ``pose_convention``, agrees better."""
 
@@ -145,7 +145,7 @@ class CorrectsReading(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class SaysUp(DatasetAbility, Protocol):
+class ProvidesUpAxis(DatasetAbility, Protocol):
     """Its files may have any world: which axis of it points up."""
 
     def up(self, scene: str) -> types.WorldUp: ...
@@ -159,7 +159,7 @@ class HasSurface(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class KnowsObjects(DatasetAbility, Protocol):
+class HasCompleteObjects(DatasetAbility, Protocol):
     """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
 
     def whole_objects(self, scene: str) -> Sequence[types.WholeObject]: ...
@@ -187,14 +187,14 @@ class HasQueries(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class AsksText(DatasetAbility, Protocol):
+class HasSceneQuery(DatasetAbility, Protocol):
     """The one text that a scene is searched for, known without its truth; its mesh has the vertices of the answer."""
 
     def asked_text(self, scene: str) -> str: ...
 
 
 @runtime_checkable
-class HasSketches(DatasetAbility, Protocol):
+class HasPreviews(DatasetAbility, Protocol):
     """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
 
     def sketch(self, scene: str, index: int, width: int) -> types.Frame: ...
@@ -290,21 +290,21 @@ class MethodFigures(MethodAbility, Protocol):
 
 
 @runtime_checkable
-class TakesTools(MethodAbility, Protocol):
+class UsesSceneTools(MethodAbility, Protocol):
     """Works on the whole scene; called before ``start``."""
 
     def receive_tools(self, tools: SceneTools) -> None: ...
 
 
 @runtime_checkable
-class TakesTruth(MethodAbility, Method, Protocol):
+class UsesGroundTruth(MethodAbility, Method, Protocol):
     """Is told the ground truth, and is a ceiling."""
 
-    def receive_truth(self, truth: types.GroundTruth) -> None: ...
+    def receive_ground_truth(self, truth: types.GroundTruth) -> None: ...
 
 
 @runtime_checkable
-class Closes(MethodAbility, Protocol):
+class Closable(MethodAbility, Protocol):
     """Gives back what it holds, called when the prediction is written or could not be."""
 
     def close(self) -> None: ...
@@ -342,7 +342,7 @@ class Encoder(Protocol):
 
 
 @runtime_checkable
-class KnowsRelativeTexts(Protocol):
+class TrainedOnRelativeTexts(Protocol):
     """An encoder that was trained on texts of the form of the relative queries; ``relative_remark`` says so."""
 
     @property
@@ -350,7 +350,7 @@ class KnowsRelativeTexts(Protocol):
 
 
 @runtime_checkable
-class KnowsItsWords(Protocol):
+class HasTrainingVocabulary(Protocol):
     """An encoder that was trained on a vocabulary that is known."""
 
     name: str

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import ConfigError, PlugInError, own_line, suggest
+from su3d_bench.core.errors import ConfigError, PlugInError, suggest, user_code_line
 
 DATASETS = {
     "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
@@ -43,12 +43,12 @@ METHODS = {
     "command": "su3d_bench.baselines.command.method:Command",
 }
 CEILING_METHOD = "oracle"  # is told the truth: what it scores stands beside every number, and is no bound
-FILES_OF_TRUTH = "ground-truth"  # before scenes whose truth are files of a dataset that is not known
+GROUND_TRUTH_FILES = "ground-truth"  # before scenes whose truth are files of a dataset that is not known
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
-OF_THE_CLASS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
-TEXTS_OF_THE_CLASS: dict[str, type] = {"name": str, "label_space": str, "variants": tuple}
-LEAST_LIKENESS = 0.84  # of a name to the one that was meant: a letter missing, added, changed or in the wrong place
+REQUIRED_CLASS_ATTRS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
+TEXT_CLASS_ATTRS: dict[str, type] = {"name": str, "label_space": str, "variants": tuple}
+MIN_SIMILARITY = 0.84  # of a name to the one that was meant: a letter missing, added, changed or in the wrong place
 
 
 def names(kind: str) -> list[str]:
@@ -110,7 +110,7 @@ def _module_of(path: Path, state: tuple[int, int]) -> Any:
     except BaseException as error:
         del sys.modules[name]
         if isinstance(error, SystemExit):
-            place = own_line(error) or path.name
+            place = user_code_line(error) or path.name
             raise PlugInError(f"{place}: ends the program when it is imported; put that under __main__") from error
         raise
     return module
@@ -137,16 +137,16 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
         where = f"{_line_of(plug_in, Path(getattr(module, '__file__', None) or '').name)}: {where}"
     own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
     known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
-    required = {*OF_THE_CLASS[kind], *(name for name, called in _members(interface).items() if called)}
+    required = {*REQUIRED_CLASS_ATTRS[kind], *(name for name, called in _members(interface).items() if called)}
     for name, called in sorted(own.items()):
         absent = [other for other in known if other not in own and known[other] == called]
-        meant = difflib.get_close_matches(name, absent, 1, LEAST_LIKENESS)
+        meant = difflib.get_close_matches(name, absent, 1, MIN_SIMILARITY)
         # ``points`` is a name of its own beside ``n_points``, and a value ``closed`` beside a function ``close``
         if meant and meant[0].count("_") == name.count("_"):
             raise PlugInError(f"{where}: a {kind} has no '{name}'; did you mean '{meant[0]}'?")
     if missing := sorted(required - set(own)):
         raise PlugInError(f"{where}: lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
-    for name, wanted in TEXTS_OF_THE_CLASS.items():
+    for name, wanted in TEXT_CLASS_ATTRS.items():
         value = getattr(plug_in, name, wanted())
         if name in required and not isinstance(value, wanted):
             raise PlugInError(f"{where}: its {name} is {value!r}; a {wanted.__name__} is expected")

@@ -19,21 +19,21 @@ from su3d_bench.core.system.files import noted
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.openlex3d.release import OpenLexRelease
 from su3d_bench.evaluation import scoring as scene_scoring
+from su3d_bench.evaluation.ground_truth import NOT_INTENDED, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, some_names
-from su3d_bench.evaluation.text_truth import FLAG, TextTruths
+from su3d_bench.evaluation.text_ground_truth import FLAG, TextTruths
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
-from su3d_bench.evaluation.truth import NOT_MEANT, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
-from su3d_bench.metrics import fitness
+from su3d_bench.metrics import compatibility
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import Source, open_sources
-from su3d_bench.predictions.own_runs import OWN_RUNS
+from su3d_bench.predictions.run_predictions import OWN_RUNS
 
-__all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "said_of"]
+__all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "warnings_of"]
 
 
-class Keeps(Protocol):
+class EvaluationStore(Protocol):
     """Who keeps what was read: of each scene its content, None where nothing stands for it, and the files."""
 
     def begin(self, truths: SceneTruths, sources: Sequence[Source], *, counts_file_confidences: bool) -> None: ...
@@ -41,17 +41,17 @@ class Keeps(Protocol):
     def keep(self, scene: str, content: Content, files: Iterable[Path], rules: Sequence[ProtocolRules]) -> None: ...
 
 
-def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
+def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluation:
     """The numbers of ``request`` under every protocol that is named, or else that fits; ``kept`` gets each scene."""
     # Load.
-    _refuse_values_without_texts(request, is_text=request.ground_truth is not None)
+    _check_values_have_texts(request, is_text=request.ground_truth is not None)
     texts = read_text_features(request.text_features)
     sources = open_sources(request.predictions, request.format)
 
     # Match to ground truth.
     truths = _open_truths(request, sources)
     if request.queries is not None:
-        truths.take_queries(request.queries)
+        truths.add_queries(request.queries)
     if not truths.matches:
         raise PredictionError(f"{shown(request.predictions[0])}: has no prediction for any scene of {truths.where}")
 
@@ -83,13 +83,13 @@ def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
     return Evaluation(protocols, not_scored, formats, truths.where, tuple(dict.fromkeys(remarks)))
 
 
-def said_of(result: Evaluation) -> list[str]:
+def warnings_of(result: Evaluation) -> list[str]:
     """What must be said of an evaluation: formats and truth, remarks on the files, why protocols did not score them."""
     lines = [f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", *result.remarks]
     reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
         reasons.setdefault(reason, []).append(name)
-    told = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_MEANT)}
+    told = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_INTENDED)}
     return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in told.items()]
 
 
@@ -98,13 +98,13 @@ def _open_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
     if request.ground_truth is None:
         return DatasetTruths(request, sources)
     if OpenLexRelease.datasets_at(request.ground_truth):
-        _refuse_values_without_texts(request, is_text=False)
+        _check_values_have_texts(request, is_text=False)
         return OpenLexTruths(request, sources)
     return TextTruths(request, sources)
 
 
-def _refuse_values_without_texts(request: Request, *, is_text: bool) -> None:
-    if request.truth_values is not None and not is_text:
+def _check_values_have_texts(request: Request, *, is_text: bool) -> None:
+    if request.ground_truth_values is not None and not is_text:
         raise ConfigError(
             f"evaluate: {FLAG} describes the text files of --ground-truth; remove it, no text files are used here"
         )
@@ -142,7 +142,7 @@ class Scoring:
         self._is_named = bool(named)
         self._first: Content | None = None  # the first prediction that is not empty
         for rules in map(load_protocol, dict.fromkeys(named or protocol_names())):
-            reason = truths.why_not(rules, is_named=self._is_named)
+            reason = truths.incompatibility(rules, is_named=self._is_named)
             if reason is None:
                 self.rules[rules.name], self.outcomes[rules.name] = rules, SceneOutcomes()
             elif self._is_named:
@@ -161,8 +161,8 @@ class Scoring:
         facts = scene_scoring.facts_of(prediction.content)
         if any(rules.names_masks for rules in self.rules.values()):
             facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
-        why_not = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
-        reasons = {name: reason for name, reason in why_not.items() if reason is not None}
+        incompatibility = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
+        reasons = {name: reason for name, reason in incompatibility.items() if reason is not None}
         for name, reason in reasons.items():
             if self._is_named or self._first is not None:
                 raise PredictionError(f"{where}: {name}: {reason}")
@@ -182,7 +182,7 @@ class Scoring:
 
         What stands for the prediction of one that is counted.
         """
-        nothing = scene_scoring.nothing_like(self._first)
+        nothing = scene_scoring.empty_like(self._first)
         for name, rules in self.rules.items():
             kept = self.outcomes[name]
             if scene_scoring.skips_missing_scenes(rules):
@@ -210,17 +210,17 @@ class Scoring:
         return tuple(protocols), dict(sorted(not_scored.items()))
 
     def _score(
-        self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: fitness.ContentFacts
+        self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: compatibility.ContentFacts
     ) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         has_points, kept = self._truths.has_points, self.outcomes[rules.name]
-        reason = fitness.why_not_content(rules, facts, has_points=has_points)
+        reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._is_named and self._first is None:
-            reason = fitness.why_not_numbers(rules, facts)
+            reason = compatibility.class_id_incompatibility(rules, facts)
         if reason is not None:
             return reason
         encoder: Encoder | str | None = None
-        if (n_dimensions := fitness.n_feature_dimensions(rules, facts)) is not None:
+        if (n_dimensions := compatibility.n_feature_dimensions(rules, facts)) is not None:
             encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OWN_RUNS.name)
         if isinstance(encoder, str):
             return encoder
@@ -229,7 +229,9 @@ class Scoring:
         if facts.n and (rules.n_labels or 0) > 1:
             content = prediction.content
             further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
-            given = fitness.labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
+            given = compatibility.labels_counted(
+                rules, by_features=encoder is not None, are_several=further is not None
+            )
             if kept.labels not in (None, given):
                 return f"gives {given} per point, but earlier scenes {kept.labels}; use the same number in all scenes"
             kept.labels = given
@@ -248,12 +250,12 @@ class Scoring:
             return str(error)
         used = scene_scoring.with_confidences_of_files(rules) if self._file_confidences else rules
         if isinstance(truth, VertexTruth):
-            if (reason := fitness.why_not_length(facts, len(truth.values))) is not None:
+            if (reason := compatibility.length_mismatch(facts, len(truth.values))) is not None:
                 raise PredictionError(f"{scene}: {reason}")
             outcome = scene_scoring.score_on_vertices(used, truth, scene, content, encoder)
             kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
         elif isinstance(truth, GroundTruth):
-            if (reason := fitness.why_not_length(facts, len(truth.points))) is not None:
+            if (reason := compatibility.length_mismatch(facts, len(truth.points))) is not None:
                 return reason
             outcome = scene_scoring.score_on_truth(used, truth, scene, content, encoder)
         else:
@@ -268,4 +270,4 @@ def _n_under_several_labels(content: Content) -> int:
     labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
     if labels is None or not isinstance(content, Masks):
         return 0
-    return int(fitness.under_several_labels(content, [*labels]).sum())
+    return int(compatibility.under_several_labels(content, [*labels]).sum())

@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from su3d_bench.metrics.fitness import LEAST_SEVERAL, labels_counted
+from su3d_bench.metrics.compatibility import MIN_MULTI_LABEL_SHARE, labels_counted
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.matching.checks import MaskFacts
@@ -25,7 +25,7 @@ ValuesForm = Literal["classes", "instances", "numbers"]
 class Request:
     """What to score: ``predictions`` are folders or files; everything else may be left out.
 
-    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``truth_values``: what
+    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``ground_truth_values``: what
     their values are, where that is not plain from them. ``protocols``: all that fit where none is named. ``scenes``:
     names or patterns. ``confidences``: where a protocol has 1 for every mask, its own rule, or what the files say;
     None: what the files say in the official script's format, which that script reads as it stands, and the protocol's
@@ -35,7 +35,7 @@ class Request:
     predictions: tuple[Path, ...]
     dataset: str | None = None
     ground_truth: Path | None = None
-    truth_values: ValuesForm | None = None
+    ground_truth_values: ValuesForm | None = None
     protocols: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
     format: str | None = None
@@ -44,7 +44,7 @@ class Request:
     queries: Path | None = None
 
 
-def own_name(out: Path | None) -> str:
+def default_name(out: Path | None) -> str:
     """The default name of predictions, used as the folder name in a run."""
     return "predictions" if out is None else out.resolve().name
 
@@ -222,7 +222,7 @@ def formed(rules: ProtocolRules, kept: SceneOutcomes, *, file_confidences: bool)
         or labels_counted(
             rules,
             by_features=kept.encoder is not None,
-            are_several=kept.n_masks > 0 and kept.n_several >= LEAST_SEVERAL * kept.n_masks,
+            are_several=kept.n_masks > 0 and kept.n_several >= MIN_MULTI_LABEL_SHARE * kept.n_masks,
         ),
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]

@@ -8,9 +8,9 @@ from su3d_bench.core import registry
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
+from su3d_bench.evaluation.ground_truth import VertexTruth
 from su3d_bench.evaluation.result import SceneOutcome
-from su3d_bench.evaluation.truth import VertexTruth
-from su3d_bench.metrics.fitness import ContentFacts
+from su3d_bench.metrics.compatibility import ContentFacts
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.score import (
@@ -30,7 +30,7 @@ from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, visible_truth
 from su3d_bench.metrics.semantic.score import with_unnamed
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks, ids_of
 
@@ -73,7 +73,7 @@ def facts_of(content: Content) -> ContentFacts:
     )
 
 
-def nothing_like(content: Content | None) -> Content:
+def empty_like(content: Content | None) -> Content:
     """An empty prediction of the same kind, for a scene that was not predicted; masks where no kind is known."""
     none = np.zeros(0, np.int32)
     if isinstance(content, VertexLabels):
@@ -243,12 +243,12 @@ def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Pred
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
     """What the truth itself scores through the same steps; None where it has no instances to hand over."""
-    told = told_truth(rules, truth)
+    told = visible_truth(rules, truth)
     if not told.instance.any():
         return None
     method_class = registry.load("method", "oracle")
     oracle = method_class(method_class.Config())
-    oracle.receive_truth(told)
+    oracle.receive_ground_truth(told)
     return score_scene(rules, truth, oracle.finish(), None)
 
 

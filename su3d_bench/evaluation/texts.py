@@ -19,7 +19,7 @@ from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
-MOST_NAMES = 1 << 20
+MAX_NAMES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class TextFeatures:
         return [name for name in names if name not in known and not known.issuperset(rules.texts_of(name))]
 
 
-class GivenTexts:
+class GivenTextEncoder:
     """``TextFeatures`` in the place of the protocol's encoder: a prompt has its own feature, or its class's."""
 
     def __init__(self, given: TextFeatures, rules: ProtocolRules) -> None:
@@ -79,10 +79,10 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
     if names is None or features is None:
         raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features per name")
     are_arrays = names.ndim == 1 and names.dtype.kind == "U" and features.ndim == 2 and features.dtype.kind == "f"
-    if not are_arrays or not 0 < len(names) == len(features) <= MOST_NAMES or not np.isfinite(features).all():
+    if not are_arrays or not 0 < len(names) == len(features) <= MAX_NAMES or not np.isfinite(features).all():
         raise DataError(
             f"{where}: names {names.shape} {names.dtype}, features {features.shape} {features.dtype}; expected texts "
-            f"(C,), at most {MOST_NAMES}, and a row of finite numbers (C, D) each"
+            f"(C,), at most {MAX_NAMES}, and a row of finite numbers (C, D) each"
         )
     texts = tuple(str(name) for name in names)
     if len(set(texts)) < len(texts):
@@ -107,7 +107,7 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
             return f"{given.path.name} has no feature for {len(missing)} of its classes, such as '{missing[0]}'"
         if given.dim != n_dimensions:
             return f"the features have {n_dimensions} dimensions, those in {given.path.name} {given.dim}"
-        return GivenTexts(given, rules)
+        return GivenTextEncoder(given, rules)
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
     embedded = EmbeddedEncoder()

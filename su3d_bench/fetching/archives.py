@@ -21,7 +21,7 @@ from typing import IO, Any, Self
 from su3d_bench.core.errors import DataError, StoreError, printable
 from su3d_bench.core.files.atomic import Allowance, allowance_of, check_member, replacing, write_error
 from su3d_bench.core.system.files import opened
-from su3d_bench.fetching.download import Watch
+from su3d_bench.fetching.download import Progress
 
 PIECE = 1 << 20
 MAX_HEADER_BYTES = 1 << 20  # of the long name or extended header before a member of a tar archive
@@ -38,7 +38,7 @@ def members(archive: Path) -> list[tuple[str, int]]:
         return [(info.filename, info.file_size) for info in file.infolist() if not info.filename.endswith("/")]
 
 
-def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Watch) -> int:
+def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Progress) -> int:
     """Bring the wanted members of a zip archive below ``folder``; how many. What is there whole is passed over."""
     with _reading(archive), opened(archive) as stream, zipfile.ZipFile(stream) as file:
         allowance, targets = allowance_of(file), _Targets(folder, goes_to)
@@ -56,7 +56,7 @@ def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Watch) -> in
     return len(wanted)
 
 
-def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: GoesTo, watch: Watch) -> int:
+def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: GoesTo, watch: Progress) -> int:
     """As ``unpack_zip``, of a packed tar archive in ``parts``, which are read one after another as one stream."""
     with _reading(parts[0]), ExitStack() as stack:
         joined = stack.enter_context(closing(_Joined(parts, watch)))
@@ -141,7 +141,7 @@ class _BoundedMember(tarfile.TarInfo):
 class _Joined:
     """Files read one after another as one."""
 
-    def __init__(self, parts: Sequence[Path], watch: Watch) -> None:
+    def __init__(self, parts: Sequence[Path], watch: Progress) -> None:
         self._left, self._watch, self._stream = list(parts), watch, io.BytesIO()
         self._n_read, self.n_bytes = 0, sum(part.stat().st_size for part in parts)
 

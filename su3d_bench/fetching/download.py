@@ -22,7 +22,7 @@ from su3d_bench.core.errors import ConfigError, DataError, printable
 from su3d_bench.core.files.atomic import write_error, write_text
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_text, opened
-from su3d_bench.fetching.sources import MOST_BYTES, Source, check_address
+from su3d_bench.fetching.sources import MAX_BYTES, Source, check_address
 
 PIECE = 1 << 20
 MAX_REDIRECTS = 5
@@ -30,11 +30,11 @@ STATUS_TO_RETRY = (408, 425, 429)
 N_RETRIES = 3  # of a broken download, counted again whenever bytes came
 FIRST_PAUSE_S = 1.0  # before the first of them
 TIMEOUT_S = 30.0  # without a byte
-Watch = Callable[[str, int, int | None], None]
+Progress = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True)
-class Stated:
+class ExpectedContent:
     """What is said of a file's content: ``git_blob`` is git's SHA-1 of it, ``recorded`` the SHA-256 of an earlier one.
 
     ``md5_prefix``: how the MD5 begins. Bytes are hexadecimal digits in lower case.
@@ -61,7 +61,7 @@ class Stated:
         return tuple(words for value, words in kinds if value)
 
 
-def checked(path: Path, stated: Stated) -> tuple[str, str | None]:
+def checked(path: Path, stated: ExpectedContent) -> tuple[str, str | None]:
     """The SHA-256 of a file, and what of ``stated`` it contradicts, in words; None where it agrees with all."""
     sha256, md5 = hashlib.sha256(), hashlib.md5(usedforsecurity=False)
     blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
@@ -83,14 +83,14 @@ def checked(path: Path, stated: Stated) -> tuple[str, str | None]:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Download:
     """A file of a server: from ``hosts`` alone; ``n_bytes`` and ``stated`` as far as anybody states them."""
 
     name: str
     address: str
     hosts: tuple[str, ...]
     n_bytes: int | None = None
-    stated: Stated = field(default_factory=Stated)
+    stated: ExpectedContent = field(default_factory=ExpectedContent)
 
 
 class _Broken(Exception):
@@ -107,7 +107,7 @@ def size_of(path: Path) -> int:
     return path.stat().st_size if path.is_file() else 0
 
 
-def bring(wanted: Wanted, place: Path, watch: Watch, n_retries: int = N_RETRIES) -> str:
+def download_file(wanted: Download, place: Path, watch: Progress, n_retries: int = N_RETRIES) -> str:
     """Put the file at ``place``, where nothing is, and give its SHA-256; ``watch`` hears how much has come.
 
     Raises ``StoreError`` where the disk refuses, and ``DataError`` where the server does not give the file that was
@@ -146,7 +146,7 @@ def _state_of(part: Path) -> Path:
     return part.with_name(f"{part.name}.state")
 
 
-def _receive(wanted: Wanted, part: Path, watch: Watch) -> None:
+def _receive(wanted: Download, part: Path, watch: Progress) -> None:
     """Append to ``part`` what is missing of the file.
 
     Without a published checksum only the rest of a file of the same entity tag or time of change is taken (RFC 9110,
@@ -206,7 +206,7 @@ def _append(response: Any, part: Path, start: int, n_bytes: int, watch: Callable
     watch(n_held)
 
 
-def _size_stated(wanted: Wanted, response: Any, start: int) -> int:
+def _size_stated(wanted: Download, response: Any, start: int) -> int:
     """The size of the whole file of which the answer holds what comes from byte ``start`` on."""
     if response.status not in (200, 206) or (response.status == 206) != (start > 0):
         raise DataError(f"{wanted.address}: answers with another part than was asked for; name a mirror with --mirror")
@@ -221,7 +221,7 @@ def _size_stated(wanted: Wanted, response: Any, start: int) -> int:
             f"{wanted.address}: has {size:,} bytes, stated are {wanted.n_bytes:,}: it is another file by now; name "
             "a mirror with --mirror, or its facts with --sources"
         )
-    if not 0 < size <= MOST_BYTES:
+    if not 0 < size <= MAX_BYTES:
         raise DataError(f"{wanted.address}: has {size:,} bytes, which is no file of this kind")
     return size
 
@@ -240,7 +240,7 @@ class _NamedHostsOnly(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _opened(wanted: Wanted, headers: dict[str, str]) -> Any:
+def _opened(wanted: Download, headers: dict[str, str]) -> Any:
     opener = urllib.request.build_opener(_NamedHostsOnly(wanted.hosts))
     try:
         return opener.open(urllib.request.Request(wanted.address, headers=headers), timeout=TIMEOUT_S)
@@ -264,7 +264,7 @@ def _refusal(address: str, error: urllib.error.HTTPError) -> Exception:
 HUB = "https://huggingface.co"
 
 
-def hub_files(source: Source) -> list[Wanted]:
+def hub_files(source: Source) -> list[Download]:
     """The files that ``source`` names, of the revision that ``main`` stands for just now, the weights last.
 
     Raises ``ModelMissing`` without ``huggingface_hub``, ``ConfigError`` where the user keeps it from asking, and
@@ -297,9 +297,9 @@ def hub_files(source: Source) -> list[Wanted]:
                 f"{ours.sha256}: the file was changed; name its facts with --sources if that is as it should be"
             )
         n_bytes = file.size if ours is None or file.size is not None else ours.n_bytes
-        checksums = Stated(sha256=sha256, git_blob=None if sha256 else file.blob_id)
+        checksums = ExpectedContent(sha256=sha256, git_blob=None if sha256 else file.blob_id)
         address = hub.hf_hub_url(repository, name, revision=info.sha, endpoint=endpoint)
-        wanted.append(Wanted(name, address, hosts, n_bytes, checksums))
+        wanted.append(Download(name, address, hosts, n_bytes, checksums))
     return wanted
 
 

@@ -29,8 +29,8 @@ from su3d_bench.datasets.scannet.folders import (
     split_scenes,
 )
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
-from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
-from su3d_bench.fetching.download import N_RETRIES, Stated, Wanted, Watch, checked
+from su3d_bench.fetching.download import N_RETRIES, Download, ExpectedContent, Progress, checked
+from su3d_bench.fetching.fetch import FetchedFile, FetchResult, Planned, fetch_file, locked_state, move, write_arrival
 from su3d_bench.fetching.sources import Source, check_address
 
 RECORDING = ".sens"
@@ -51,7 +51,7 @@ class Scans:
     label_table: bool
 
     @property
-    def is_here(self) -> bool:
+    def is_available(self) -> bool:
         return not self.missing and not self.label_table
 
     @property
@@ -94,26 +94,26 @@ def how_to_sign(source: Source) -> ConfigError:
     )
 
 
-def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Watch) -> Brought:
+def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Progress) -> FetchResult:
     """Let the user's own script bring what is missing, a file at a time, and move each whole scan to its place."""
     if not script.is_file():
         raise ConfigError(f"--script {script}: there is no such file; name the script that ScanNet's answer led to")
     n_done = itertools.count()
 
-    def bring_one(planned: Planned, scan: str, name: str) -> tuple[Path, Arrived]:
+    def fetch_one(planned: Planned, scan: str, name: str) -> tuple[Path, FetchedFile]:
         watch(name, next(n_done), scans.n_files)
         words = ["--id", scan, "--type", name.removeprefix(scan)] if scan else ["--label_map"]
         path = planned.state / _folder(scan) / name
         _run(script, planned.state, words, path)
-        sha256, n_bytes = checked(path, Stated())[0], path.stat().st_size
-        arrived = Arrived(source.name, name, "the user's own script", n_bytes, sha256, ())
+        sha256, n_bytes = checked(path, ExpectedContent())[0], path.stat().st_size
+        arrived = FetchedFile(source.name, name, "the user's own script", n_bytes, sha256, ())
         write_arrival(planned.root, arrived)
         return path, arrived
 
-    return _fetch(source, scans, bring_one)
+    return _fetch(source, scans, fetch_one)
 
 
-def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, n_retries: int = N_RETRIES) -> Brought:
+def fetch_from(source: Source, scans: Scans, address: str, watch: Progress, n_retries: int = N_RETRIES) -> FetchResult:
     """Bring what is missing out of the user's own link, the folder in which ``v1`` and ``v2`` lie."""
     try:
         check_address(address)
@@ -121,23 +121,25 @@ def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, n_retri
         raise ConfigError(f"--from: {error}") from error
     base, hosts = address.rstrip("/"), (urlsplit(address).hostname or "",)
 
-    def bring_one(planned: Planned, scan: str, name: str) -> tuple[Path, Arrived]:
+    def fetch_one(planned: Planned, scan: str, name: str) -> tuple[Path, FetchedFile]:
         release = "v1" if name.endswith(RECORDING) else "v2"
-        wanted = Wanted(name, f"{base}/{release}/{f'scans/{scan}' if scan else 'tasks'}/{name}", hosts)
-        return planned.state / name, bring_file(planned, wanted, watch, n_retries)
+        wanted = Download(name, f"{base}/{release}/{f'scans/{scan}' if scan else 'tasks'}/{name}", hosts)
+        return planned.state / name, fetch_file(planned, wanted, watch, n_retries)
 
-    return _fetch(source, scans, bring_one)
+    return _fetch(source, scans, fetch_one)
 
 
-def _fetch(source: Source, scans: Scans, bring_one: Callable[[Planned, str, str], tuple[Path, Arrived]]) -> Brought:
+def _fetch(
+    source: Source, scans: Scans, fetch_one: Callable[[Planned, str, str], tuple[Path, FetchedFile]]
+) -> FetchResult:
     """Bring each missing file and move each whole scan to its place, the table of labels (of no scan) at last."""
-    planned, files = Planned(source, scans.root), list[Arrived]()
-    with held_state(planned):
+    planned, files = Planned(source, scans.root), list[FetchedFile]()
+    with locked_state(planned):
         for scan, names in (scans.missing | ({"": (TABLE_NAME,)} if scans.label_table else {})).items():
-            brought = [bring_one(planned, scan, name) for name in names]
+            brought = [fetch_one(planned, scan, name) for name in names]
             files += [arrived for _, arrived in brought]
             move([path for path, _ in brought], scans.root / _folder(scan))
-    return Brought(source, scans.root / "scans", tuple(files))
+    return FetchResult(source, scans.root / "scans", tuple(files))
 
 
 def _folder(scan: str) -> Path:

@@ -17,11 +17,11 @@ from su3d_bench.core.system.files import file_text, parse_toml
 Group = Literal["models", "replica", "scannet"]
 TABLE = Path(__file__).with_name("sources.toml")
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-MOST_BYTES = 1 << 44  # of one file; the largest release of the field has 2**41
+MAX_BYTES = 1 << 44  # of one file; the largest release of the field has 2**41
 Text = Annotated[str, Field(min_length=1, max_length=400)]
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}$")]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Bytes = Annotated[int, Field(ge=0, le=MOST_BYTES)]
+Bytes = Annotated[int, Field(ge=0, le=MAX_BYTES)]
 
 
 def check_address(address: str, hosts: Sequence[str] | None = None) -> None:
@@ -104,7 +104,7 @@ class SceneCounts(_Strict):
     """How many scenes and frames a source of recordings has in all."""
 
     n_scenes: Annotated[int, Field(ge=1, le=1_000_000)]
-    n_frames: Annotated[int, Field(ge=1, le=MOST_BYTES)]
+    n_frames: Annotated[int, Field(ge=1, le=MAX_BYTES)]
     read_at: Text
 
 

@@ -14,9 +14,9 @@ from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 from su3d_bench.formats.images import read_bytes
 
-MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
-MOST_MASKS = 100_000  # of one scene; methods give some hundred
-MOST_MEMBERS = 50_000_000  # points of all masks of a scene together; 600 of a large ScanNet scene have 10 million
+MAX_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
+MAX_MASKS = 100_000  # of one scene; methods give some hundred
+MAX_MEMBERS = 50_000_000  # points of all masks of a scene together; 600 of a large ScanNet scene have 10 million
 ROWS_AT_ONCE, VALUES_AT_ONCE = 1 << 16, 1 << 25  # 600 masks of 55,000 points
 NOT_EMPTY = -1
 
@@ -60,14 +60,14 @@ def matrix_of(value: object, where: str) -> NDArray[Any]:
 
 def check_sizes(n_points: int, n_masks: int, where: str) -> None:
     """Refuses more points or masks than any scene has, which cost memory even where the masks are empty."""
-    if n_points > MOST_POINTS or n_masks > MOST_MASKS:
+    if n_points > MAX_POINTS or n_masks > MAX_MASKS:
         raise PredictionError(f"{where}: {n_masks} masks of {n_points} points; is it damaged?")
 
 
 def check_members(n: int, where: str) -> None:
     """Refuses masks that hold more points together than those of any scene, before they take memory."""
-    if n > MOST_MEMBERS:
-        raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
+    if n > MAX_MEMBERS:
+        raise PredictionError(f"{where}: the masks hold more than {MAX_MEMBERS} points together; is it damaged?")
 
 
 def column_members(matrix: NDArray[Any], where: str) -> list[Int32Array]:
@@ -90,7 +90,7 @@ def run_members(length: object, counts: object, where: str) -> Int32Array:
 
     ``counts`` may be a text, a list or an array, as the programs write it.
     """
-    if isinstance(length, bool) or not isinstance(length, int | np.integer) or not 0 <= length <= MOST_POINTS:
+    if isinstance(length, bool) or not isinstance(length, int | np.integer) or not 0 <= length <= MAX_POINTS:
         raise PredictionError(f"{where}: 'length' is {kind_of(length)}; expected the number of points")
     runs = _run_numbers(counts, where).reshape(-1, 2)
     starts, sizes = runs[:, 0] - 1, runs[:, 1]
@@ -120,7 +120,7 @@ def _run_numbers(counts: object, where: str) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
     if numbers.ndim != 1 or numbers.dtype.kind not in "iu" or len(numbers) % 2:
         raise PredictionError(f"{where}: the runs are {kind_of(counts)}; expected pairs of start and length")
-    if int(numbers.max()) > MOST_POINTS or int(numbers.min()) < 0:
+    if int(numbers.max()) > MAX_POINTS or int(numbers.min()) < 0:
         raise PredictionError(f"{where}: a run with {int(numbers.max())}; is it damaged?")
     return numbers.astype(np.int64)
 
@@ -152,7 +152,7 @@ def kind_of(value: object) -> str:
 def checked_points(values: object, where: str) -> Float32Array:
     """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
     table = array_of(values, f"{where}: the points are", "three coordinates a point", "fiu", None, 3)
-    if len(table) > MOST_POINTS:
+    if len(table) > MAX_POINTS:
         raise PredictionError(f"{where}: has {len(table)} points; is it damaged?")
     points = as_float32(table)
     is_finite = np.isfinite(points).all(axis=1)
@@ -189,7 +189,7 @@ def half_rows(table: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
 
 IntegerArray = NDArray[np.integer[Any]]
 DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
-MOST_DIGITS = 18  # of a number that int64 surely holds
+MAX_DIGITS = 18  # of a number that int64 surely holds
 LIMIT, MAX_CHARACTERS = 1 << 62, 40  # of a number
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how the file begins that stands for one not fetched
 
@@ -228,7 +228,7 @@ def _plain_numbers(content: bytes) -> IntegerArray | None:
     ends = np.flatnonzero(digits == np.uint8(0x100 + ord("\n") - ord("0")))
     starts = np.concatenate([[0], ends[:-1] + 1])
     lengths = ends - starts
-    if np.count_nonzero(digits > 9) != len(ends) or lengths.min() < 1 or lengths.max() > MOST_DIGITS:
+    if np.count_nonzero(digits > 9) != len(ends) or lengths.min() < 1 or lengths.max() > MAX_DIGITS:
         return None
     return np.fromstring(content, np.int64, sep="\n")
 

@@ -22,7 +22,7 @@ from su3d_bench.core.types import Float32Array, Int32Array
 
 FloatArray = NDArray[np.floating[Any]]
 BLOCK_BYTES = 16 << 20
-MOST_COLUMNS = 1 << 16  # of a table whose width is not known; features have some thousand
+MAX_COLUMNS = 1 << 16  # of a table whose width is not known; features have some thousand
 # What h5py raises on damaged files; it has no base class of its own.
 LIBRARY_ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError, MemoryError)
 
@@ -90,7 +90,7 @@ def _check_form(table: Any, n_columns: int | None, file_bytes: int, where: str) 
         raise DataError(f"{where}: is stored in chunks or compressed; save it as one piece, as gradslam does")
     if dtype.kind != "f" or dtype.itemsize > 8:
         raise DataError(f"{where}: holds values of type {str(dtype)[:40]}; expected float16, float32 or float64")
-    if shape is None or len(shape) != 2 or not 0 < shape[1] <= MOST_COLUMNS or n_columns not in (None, shape[1]):
+    if shape is None or len(shape) != 2 or not 0 < shape[1] <= MAX_COLUMNS or n_columns not in (None, shape[1]):
         raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, {n_columns or 'D'})")
     n_bytes = shape[0] * shape[1] * dtype.itemsize
     if n_bytes > file_bytes or table.id.get_storage_size() != n_bytes:

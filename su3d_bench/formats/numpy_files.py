@@ -29,8 +29,8 @@ NPY_DAMAGE = (
 )  # fmt: skip
 NPY_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 PLAIN_TYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|U\d{1,6}|S\d{1,6})")
-MOST_DIMENSIONS = 8
-MOST_CHARACTER = 0x10FFFF  # the end of Unicode
+MAX_DIMENSIONS = 8
+MAX_CHARACTER = 0x10FFFF  # the end of Unicode
 
 
 @contextmanager
@@ -68,7 +68,7 @@ def plain_type(code: object) -> np.dtype[Any]:
 
 def checked_shape(shape: object) -> tuple[int, ...]:
     """``shape`` as a tuple of sizes; ``ValueError`` where it is none."""
-    sizes = tuple(shape) if isinstance(shape, tuple | list) and len(shape) <= MOST_DIMENSIONS else (-1,)
+    sizes = tuple(shape) if isinstance(shape, tuple | list) and len(shape) <= MAX_DIMENSIONS else (-1,)
     if not all(type(size) is int and 0 <= size < 1 << 62 for size in sizes):
         raise ValueError("an array without a valid shape")
     return sizes
@@ -81,7 +81,7 @@ def plain_array(content: bytes, kind: np.dtype[Any], shape: object, is_fortran: 
     if n * kind.itemsize != n_bytes or kind.itemsize == 0:
         raise ValueError(f"an array of shape {sizes} {kind.name} needs {n * kind.itemsize} bytes, {n_bytes} are there")
     array: NDArray[Any] = np.frombuffer(content, kind, n, start)
-    if kind.kind == "U" and n and int(array.view(f"{kind.str[0]}u4").max()) > MOST_CHARACTER:
+    if kind.kind == "U" and n and int(array.view(f"{kind.str[0]}u4").max()) > MAX_CHARACTER:
         raise ValueError("a text with a character that does not exist")
     return array.reshape(sizes, order="F" if is_fortran else "C")
 

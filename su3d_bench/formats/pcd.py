@@ -17,9 +17,9 @@ from su3d_bench.core.files.atomic import Allowance, UnpackingError, write_bytes
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array
 
-MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
-MOST_FIELDS, MOST_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values
-MOST_EXPANSION = 88  # of LZF: three bytes stand for at most 264
+MAX_HEADER_BYTES = 1 << 16  # headers have some hundred
+MAX_FIELDS, MAX_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values
+MAX_EXPANSION = 88  # of LZF: three bytes stand for at most 264
 FORMS = ("ascii", "binary", "binary_compressed")
 AXES = ("x", "y", "z")
 KEYS = {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}
@@ -46,7 +46,7 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
     else:
         n_packed, n_plain = (int.from_bytes(body[k : k + 4], "little") for k in (0, 4))
         is_whole = 8 + n_packed <= there and not body[8 + n_packed :].strip(BLANKS)
-        is_whole &= n_plain == n_bytes <= n_packed * MOST_EXPANSION
+        is_whole &= n_plain == n_bytes <= n_packed * MAX_EXPANSION
     if not is_whole:
         raise DataError(
             f"{where}: the header promises {n} points of {row.itemsize} bytes, the file has {there} bytes of "
@@ -66,7 +66,7 @@ def _read_header(content: bytes, where: str) -> tuple[np.dtype[Any], int, str, i
     lines: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in lines:
-        end = content.find(b"\n", at, MOST_HEADER_BYTES)
+        end = content.find(b"\n", at, MAX_HEADER_BYTES)
         if end < 0:
             raise DataError(f"{where}: not a PCD file, or cut short: its header has no line 'DATA'")
         words = content[at:end].decode("ascii", "replace").split()
@@ -84,9 +84,9 @@ def _read_header(content: bytes, where: str) -> tuple[np.dtype[Any], int, str, i
     n = int(numbers[0][0]) * int(numbers[1][0]) if are_whole else -1
     of_axes = [(name, count) for name, count in zip(names, counts, strict=False) if name in AXES]
     is_sound = (
-        len(names) == len(sizes) == len(kinds) == len(counts) <= MOST_FIELDS
+        len(names) == len(sizes) == len(kinds) == len(counts) <= MAX_FIELDS
         and {*types} <= TYPES
-        and all(_NUMBER.fullmatch(count) and 0 < int(count) <= MOST_VALUES for count in counts)
+        and all(_NUMBER.fullmatch(count) and 0 < int(count) <= MAX_VALUES for count in counts)
         and lines.get("POINTS", [str(n)]) == [str(n)]
         and form in FORMS
         and sorted(of_axes) == [(axis, "1") for axis in AXES]

@@ -27,13 +27,13 @@ from su3d_bench.core.system.files import opened
 from su3d_bench.formats.numpy_files import plain_array, plain_type
 
 GZIP_START = b"\x1f\x8b"
-MOST_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
+MAX_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
 INFLATED_A_READ, SKIPPED_A_READ = 1 << 17, 1 << 16
 # Reads of one byte, one or two an operation; a map of ConceptGraphs takes less than a million of them.
-FREE_STEPS, MOST_STEPS = 2_000_000, 20_000_000
-MOST_NAME = 1024
-FORGET_FROM = 1 << 12  # bytes; smaller payloads are kept
-MOST_KEY = 1 << 60  # larger integers can be crafted to share one place in a dict
+FREE_STEPS, MAX_STEPS = 2_000_000, 20_000_000
+MAX_NAME = 1024
+MIN_SKIPPED_BYTES = 1 << 12  # bytes; smaller payloads are kept
+MAX_KEY = 1 << 60  # larger integers can be crafted to share one place in a dict
 # Of protocols 2 to 5, what holds plain values; ``torch.save`` uses 2.
 OPERATIONS = (
     "PROTO MARK POP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE SHORT_BINUNICODE "
@@ -45,32 +45,32 @@ CODES = {getattr(pickle, name)[0] for name in OPERATIONS.split()}
 DAMAGE = (pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, struct.error)
 
 
-class Inert:
+class Opaque:
     """The place of an object without meaning here (settings, paths, pictures): it takes any state and keeps none."""
 
     def __init__(self, *_args: object) -> None: ...
 
 
-class Forgotten:
+class Skipped:
     """The place of a payload that the caller asked not to keep."""
 
 
 @dataclass(frozen=True)
-class Named:
+class GlobalRef:
     """A class that the file names as a value."""
 
     name: str
 
 
 @dataclass(eq=False)
-class Unbuilt:
+class Deferred:
     """An object whose state follows, of which ``build`` makes its ``value``."""
 
     build: Callable[[Any], object]
     value: object = None
 
 
-OBJECTS = Named("numpy.object_")  # NumPy's dtype of Python objects
+OBJECTS = GlobalRef("numpy.object_")  # NumPy's dtype of Python objects
 
 
 class Source:
@@ -78,7 +78,7 @@ class Source:
 
     def __init__(self, stream: BinaryIO, n_bytes: int, n_packed: int) -> None:
         self._stream, self._n_left, self._allowance = stream, n_bytes, Allowance(n_packed)
-        self._n_steps = min(MOST_STEPS, max(FREE_STEPS, n_packed))
+        self._n_steps = min(MAX_STEPS, max(FREE_STEPS, n_packed))
 
     def read(self, n: int) -> bytes:
         if n == 1:
@@ -96,7 +96,7 @@ class Source:
         return content
 
     def readline(self) -> bytes:
-        return self._stream.readline(MOST_NAME)
+        return self._stream.readline(MAX_NAME)
 
     def skip(self, n: int) -> None:
         while n:
@@ -157,9 +157,9 @@ class PlainUnpickler(pickle._Unpickler):
         return text.encode("latin1")
 
     def _payload(self, n: int) -> None:
-        if n >= FORGET_FROM and self._is_forgotten():
+        if n >= MIN_SKIPPED_BYTES and self._is_forgotten():
             self._source.skip(n)
-            self.append(Forgotten())
+            self.append(Skipped())
         else:
             self.append(self.read(n))
 
@@ -170,23 +170,23 @@ class PlainUnpickler(pickle._Unpickler):
 
     def _get(self, index: int) -> None:
         value = self.memo[index]
-        self.append(value.value if isinstance(value, Unbuilt) and value.value is not None else value)
+        self.append(value.value if isinstance(value, Deferred) and value.value is not None else value)
 
     def _set(self, items: list[Any]) -> None:
         target = self.stack[-1]
         if not isinstance(target, dict):
             raise ValueError("items of what is no dict")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            is_plain = key is None or isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < MOST_KEY)
+            is_plain = key is None or isinstance(key, str | bytes) or (isinstance(key, int) and abs(key) < MAX_KEY)
             if not is_plain:
                 raise ValueError("a key that is no text or number")
             target[key] = value
 
     def _build(self) -> None:
         state, target = self.stack.pop(), self.stack[-1]
-        if isinstance(target, Unbuilt):
+        if isinstance(target, Deferred):
             self.stack[-1] = target.value = target.build(state)
-        elif not isinstance(target, Inert | dict):  # the state of an OrderedDict holds attributes, no items
+        elif not isinstance(target, Opaque | dict):  # the state of an OrderedDict holds attributes, no items
             raise ValueError("a state of what has none")
 
     dispatch |= {
@@ -205,7 +205,7 @@ class PlainUnpickler(pickle._Unpickler):
 
 def _array(payload: object, kind: object, shape: object, is_fortran: object) -> object:
     """The array of a pickle; one of objects becomes a list, or its only item where it has no dimension."""
-    if isinstance(payload, Forgotten):
+    if isinstance(payload, Skipped):
         return payload
     if kind == OBJECTS and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
         return list(payload) if shape else payload[0]
@@ -214,11 +214,11 @@ def _array(payload: object, kind: object, shape: object, is_fortran: object) -> 
     return plain_array(payload, kind, shape, is_fortran is True)
 
 
-def _reconstruct(kind: object, *_: object) -> Unbuilt:
+def _reconstruct(kind: object, *_: object) -> Deferred:
     """``_reconstruct(ndarray, (0,), b"b")``, followed by (version, shape, dtype, is_fortran, values)."""
-    if kind != Named("numpy.ndarray"):
+    if kind != GlobalRef("numpy.ndarray"):
         raise ValueError("an array of a foreign class")
-    return Unbuilt(lambda state: _array(state[4], state[2], state[1], state[3]))
+    return Deferred(lambda state: _array(state[4], state[2], state[1], state[3]))
 
 
 def _frombuffer(payload: object, kind: object, shape: object, order: object) -> object:
@@ -226,7 +226,7 @@ def _frombuffer(payload: object, kind: object, shape: object, order: object) -> 
     return _array(payload, kind, shape, isinstance(order, str) and order == "F")
 
 
-def _dtype(code: object, *_: object) -> Unbuilt:
+def _dtype(code: object, *_: object) -> Deferred:
     """``dtype("f2", False, True)``, followed by (version, byte order, None, None, None, ...)."""
     is_object = isinstance(code, str) and code == "O8"
 
@@ -235,12 +235,12 @@ def _dtype(code: object, *_: object) -> Unbuilt:
             raise ValueError("an array type with fields")
         return OBJECTS if is_object else plain_type(f"{state[1]}{code}")
 
-    return Unbuilt(build)
+    return Deferred(build)
 
 
 def _scalar(kind: object, payload: object) -> object:
     array: Any = _array(payload, kind, (), False)
-    return array if isinstance(array, Forgotten) else array[()]
+    return array if isinstance(array, Skipped) else array[()]
 
 
 # ConceptGraphs stores its settings beside the map, a tree of omegaconf nodes with paths in it, and pictures beside its
@@ -264,8 +264,8 @@ _VALUES = (
     *(f"builtins.{kind}" for kind in ["bool", "dict", "float", "int", "list", "str", "tuple"]),
 )
 NAMES: dict[str, object] = {
-    **dict.fromkeys(_INERT, Inert),
-    **{name: Named(name) for name in _VALUES},
+    **dict.fromkeys(_INERT, Opaque),
+    **{name: GlobalRef(name) for name in _VALUES},
     "numpy.dtype": _dtype,
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
@@ -280,8 +280,8 @@ NAMES: dict[str, object] = {
 def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
     """The value of a pickle, plain or gzipped: plain values, lists, dicts, tuples, and read-only arrays.
 
-    Payloads below a dict key in ``forget`` are passed over and leave ``Forgotten`` in their place; settings and paths
-    become ``Inert``. Raises ``PredictionError`` for whatever is damaged or not plain data.
+    Payloads below a dict key in ``forget`` are passed over and leave ``Skipped`` in their place; settings and paths
+    become ``Opaque``. Raises ``PredictionError`` for whatever is damaged or not plain data.
     """
     with reading(shown(path)), opened(path) as stream:
         is_gzip = stream.read(2) == GZIP_START
@@ -291,7 +291,7 @@ def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
         if is_gzip:
             inflated = cast(io.RawIOBase, gzip.GzipFile(fileobj=stream, mode="rb"))
             content = cast(BinaryIO, io.BufferedReader(inflated, INFLATED_A_READ))
-        return unpickled(content, MOST_INFLATED if is_gzip else n_bytes, n_bytes, shown(path), NAMES, forget=forget)
+        return unpickled(content, MAX_INFLATED if is_gzip else n_bytes, n_bytes, shown(path), NAMES, forget=forget)
 
 
 def unpickled(

@@ -85,7 +85,7 @@ class Property:
 
 
 @dataclass(frozen=True)
-class Promise:
+class DeclaredElement:
     """An element as the header promises it."""
 
     name: str
@@ -96,7 +96,7 @@ class Promise:
 @dataclass(frozen=True)
 class Header:
     format: str
-    elements: tuple[Promise, ...]
+    elements: tuple[DeclaredElement, ...]
     n_bytes: int
 
     def stored(self, kind: np.dtype[Any]) -> np.dtype[Any]:
@@ -134,13 +134,15 @@ def first_rows(path: Path, name: str) -> Mapping[str, Column]:
     with reading(where, DataError), opened(path) as file:
         content = file.read(FIRST_BYTES)
     header = read_header(content, where)
-    promise = header.elements[0] if header.elements else Promise("", 0, [])
+    promise = header.elements[0] if header.elements else DeclaredElement("", 0, [])
     is_plain = all(column.count_type is None for column in promise.properties)
     if promise.name != name or not promise.properties or not is_plain or header.format == "ascii":
         return {}
     stride = sum(column.type.itemsize for column in promise.properties)
     n_rows = min(promise.n_rows, (len(content) - header.n_bytes) // stride)
-    return _read_element(Promise(name, n_rows, promise.properties), header, content, header.n_bytes, where)[0].columns
+    return _read_element(DeclaredElement(name, n_rows, promise.properties), header, content, header.n_bytes, where)[
+        0
+    ].columns
 
 
 def read_header(content: bytes, where: str) -> Header:
@@ -148,7 +150,7 @@ def read_header(content: bytes, where: str) -> Header:
     if not re.match(rb"ply[ \t]*\r?\n", content):
         raise DataError(f"{where}: not a PLY file; its first line is not 'ply'")
     at, n_lines, format_name = content.index(b"\n") + 1, 1, ""
-    elements: list[Promise] = []
+    elements: list[DeclaredElement] = []
     while True:
         end = content.find(b"\n", at, MAX_HEADER_BYTES)
         if end < 0:
@@ -163,7 +165,7 @@ def read_header(content: bytes, where: str) -> Header:
             case ["format", name, "1.0"] if name in FORMATS and not format_name:
                 format_name = name
             case ["element", name, count] if _COUNT.fullmatch(count) and all(name != one.name for one in elements):
-                elements.append(Promise(name, int(count), []))
+                elements.append(DeclaredElement(name, int(count), []))
             case ["property", *rest] if elements and (new := _property(rest)) is not None:
                 if any(new.name == known.name for known in elements[-1].properties):
                     raise DataError(f"{where}:{n_lines}: property '{printable(new.name, 60)}' stands there twice")
@@ -195,7 +197,7 @@ def _parsed(text: bytes, where: str) -> bytes:
         raise DataError(f"{where}: holds something that is not a number; the file is damaged") from error
 
 
-def _read_element(promise: Promise, header: Header, body: bytes, at: int, where: str) -> tuple[PlyElement, int]:
+def _read_element(promise: DeclaredElement, header: Header, body: bytes, at: int, where: str) -> tuple[PlyElement, int]:
     """The element whose first row is at ``at``, and where the next element begins."""
     smallest = sum(header.stored(column.count_type or column.type).itemsize for column in promise.properties)
     if promise.n_rows * smallest > len(body) - at:
@@ -222,7 +224,7 @@ Found = tuple[
 ]  # lengths of the lists (scalars: None) and values of each column; the end
 
 
-def _equal_rows(promise: Promise, header: Header, body: bytes, at: int) -> Found | None:
+def _equal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int) -> Found | None:
     """The columns where each list is in all rows as long as in the first, None where one is not."""
     fields: list[tuple[str, Any, Any]] = []
     here = at
@@ -253,7 +255,7 @@ def _equal_rows(promise: Promise, header: Header, body: bytes, at: int) -> Found
     return columns, at + n_bytes
 
 
-def _unequal_rows(promise: Promise, header: Header, body: bytes, at: int, where: str) -> Found:
+def _unequal_rows(promise: DeclaredElement, header: Header, body: bytes, at: int, where: str) -> Found:
     """The columns of rows that differ in size, found by going through them one by one."""
     length_at = _lengths_of_text(body) if header.format == "ascii" else _lengths_of_bytes(body, FORMATS[header.format])
     sizes = [header.stored(column.type).itemsize for column in promise.properties]

@@ -22,7 +22,7 @@ from su3d_bench.core.files.atomic import PIECE, allowance_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.formats.numpy_files import checked_shape, opened_zip, read_member
-from su3d_bench.formats.pickles import NAMES, Named, Names, unpickled
+from su3d_bench.formats.pickles import NAMES, GlobalRef, Names, unpickled
 
 ZIP_START = b"PK\x03\x04"
 PICKLE_NAME = "data.pkl"
@@ -86,7 +86,7 @@ class Storages:
     def find(self, key: Any) -> Storage:
         """That of ("storage", type, name, place, number of values)."""
         word, kind, name, _, n, *views = key
-        if word != "storage" or not isinstance(kind, Named) or not isinstance(name, str) or type(n) is not int:
+        if word != "storage" or not isinstance(kind, GlobalRef) or not isinstance(name, str) or type(n) is not int:
             raise ValueError("a reference that is no storage")
         if not re.fullmatch(r"\d{1,20}", name) or any(view is not None for view in views):
             raise ValueError("a reference to a storage of a form that is not known")
@@ -113,7 +113,7 @@ def _tensor(storage: object, offset: object, size: object, stride: object, *_: o
 def _tensor_with_type(*parts: Any) -> NDArray[Any]:
     """``_rebuild_tensor_v3(storage, offset, size, stride, grad, hooks, type, ...)``."""
     storage, offset, size, stride, _, _, kind = parts[:7]
-    code = DTYPES.get(kind.name.removeprefix("torch.")) if isinstance(kind, Named) else None
+    code = DTYPES.get(kind.name.removeprefix("torch.")) if isinstance(kind, GlobalRef) else None
     return _view(storage, code, offset, size, stride)
 
 
@@ -151,7 +151,7 @@ TORCH_NAMES: Names = {
     "torch.serialization._get_layout": lambda name: name,
     "torch.Size": checked_shape,
     **{
-        name: Named(name)
+        name: GlobalRef(name)
         for name in (UNTYPED, *(f"torch.{kind}Storage" for kind in CODES), *(f"torch.{kind}" for kind in DTYPES))
     },
 }

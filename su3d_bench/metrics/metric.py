@@ -19,7 +19,7 @@ from su3d_bench.metrics.matching.nearest import n_farther
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean, ratio
 
-MOST_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed
+MAX_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed
 Values = dict[str, float]
 C = TypeVar("C", bound="Counts")
 ROWS = "rows"  # the axis along which scenes are put one after another; along all others they are summed
@@ -74,7 +74,7 @@ class Counts:
             fits = array.dtype.kind == number_kind and array.ndim == len(names)
             if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(names, array.shape, strict=True)):
                 raise DataError(f"counts: '{name}' is {array.dtype.name} {array.shape}; score the scene again")
-            if number_kind == "i" and array.size and not 0 <= array.min() <= array.max() < MOST_COUNTED:
+            if number_kind == "i" and array.size and not 0 <= array.min() <= array.max() < MAX_COUNTED:
                 raise DataError(f"counts: '{name}' counts from {array.min()} to {array.max()}; score the scene again")
         counts = cls(**{name: arrays[name] for name in cls.arrays()})
         if (fault := counts.contradiction()) is not None:

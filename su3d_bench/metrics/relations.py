@@ -72,7 +72,7 @@ def recalls(sums: dict[str, Float64Array]) -> dict[str, Float64Array]:
     return dict(zip(NAMES, values, strict=True))
 
 
-OWN_SHARE = 0.5  # of a predicted object's points, to stand for an object: less, and it stands for none
+MIN_OWN_SHARE = 0.5  # of a predicted object's points, to stand for an object: less, and it stands for none
 RIVAL_SHARE = 0.75  # of what the first object has of it, for the second: more, and it stands for none
 Edges = dict[tuple[int, int], int]  # rows of subject and object: the place of the predicate
 
@@ -91,7 +91,7 @@ def shared_points(
     return flat.reshape(n_objects, len(masks)).astype(np.int64)
 
 
-def stand_for(shared: Int64Array, sizes: Int64Array) -> Int64Array:
+def assign_objects(shared: Int64Array, sizes: Int64Array) -> Int64Array:
     """The mask (G,) that stands for each object, -1 for none, from shared points (G, K) and sizes (K,) of masks.
 
     A mask stands for the one object that has half of its points, unless a second has nearly as many; of several masks
@@ -107,7 +107,9 @@ def stand_for(shared: Int64Array, sizes: Int64Array) -> Int64Array:
         share = shared / sizes  # as in the original: 0.75 is held against a quotient of two such shares
         main = shared.argmax(axis=0)
         ordered = np.sort(share, axis=0)
-        is_clear = ~(ordered[-1] < OWN_SHARE) & ~((ordered[-2] / ordered[-1] > RIVAL_SHARE) if n_objects > 1 else False)
+        is_clear = ~(ordered[-1] < MIN_OWN_SHARE) & ~(
+            (ordered[-2] / ordered[-1] > RIVAL_SHARE) if n_objects > 1 else False
+        )
     own = np.where((np.arange(n_objects)[:, None] == main[None]) & is_clear[None], shared, 0)
     best = own.argmax(axis=1)
     return np.where(own[np.arange(n_objects), best] > 0, best, -1)
@@ -149,7 +151,7 @@ def geometric_edges(
     return {pair: place for pair, place in edges.items() if place >= 0}
 
 
-MOST_RELATED = 1000  # masks whose boxes are compared pair by pair; above it, only those that stand for an object
+MAX_RELATED = 1000  # masks whose boxes are compared pair by pair; above it, only those that stand for an object
 BY_BOXES = "relations of the map by the boxes of its instances: it has no edges of its own"
 
 
@@ -177,7 +179,7 @@ class RelationMetric(Metric[RelationCounts]):
         is_object = row_of_point >= 0
         true_points, owner = truth.points[is_object], row_of_point[is_object]
         shared = shared_points(prediction.points, masks, true_points, owner, len(graph.ids), rules.transfer.cap_m)
-        stands = stand_for(shared, masks.sizes)
+        stands = assign_objects(shared, masks.sizes)
         called = class_index_of_ids(rules, named_classes(rules, truth.semantic, prediction, encoder))
         edges, remark = self._edges(prediction, masks, called, stands)
         counts = self._counts(graph, stands, called, edges)
@@ -237,7 +239,7 @@ class RelationMetric(Metric[RelationCounts]):
                 edges.setdefault((pair[0], pair[1]), place)
             return edges, None
         related = np.flatnonzero((called >= 0) & (masks.sizes > 0))
-        if len(related) > MOST_RELATED:
+        if len(related) > MAX_RELATED:
             related = np.intersect1d(related, stands)
         boxes = boxes_around(prediction.points, transfer.select(masks, related))
         found = geometric_edges(boxes, [rules.classes[called[row]].name for row in related], rules.predicates)

@@ -20,12 +20,12 @@ from su3d_bench.core.files.atomic import DAMAGE, read_arrays
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.graphs import ObjectMetric, PlaceMetric
 from su3d_bench.metrics.instance.boxes import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, scene_mean
+from su3d_bench.metrics.metric import MAX_COUNTED, Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric, QueryTruth
 from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
@@ -104,7 +104,7 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
         raise DataError(f"{rules.name}: scores the label space '{rules.label_space}', the truth has '{space}'")
     if base.variant != rules.ground_truth or not isinstance(truth, metric.truth):
         raise DataError(f"{rules.name}: scores the truth '{rules.ground_truth}', this one is '{base.variant}'")
-    reason = why_not_scorable(rules, prediction)
+    reason = kind_incompatibility(rules, prediction)
     if reason:
         raise PredictionError(reason)
     _check_points(rules, prediction)
@@ -291,8 +291,10 @@ def unpack_scores(data: bytes) -> dict[str, SceneScore]:
     try:
         arrays = read_arrays(io.BytesIO(data))
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
-        if strangers := [key for key in arrays if key.rpartition("/")[0] not in names]:
-            raise DataError(f"counts: '{printable(strangers[0], 80)}' belongs to no protocol; score the scene again")
+        if foreign_files := [key for key in arrays if key.rpartition("/")[0] not in names]:
+            raise DataError(
+                f"counts: '{printable(foreign_files[0], 80)}' belongs to no protocol; score the scene again"
+            )
         return {name: _unpack_one(name, arrays) for name in names}
     except DAMAGE as error:
         raise DataError(f"counts: are damaged or of another version ({error}); score the scene again") from error
@@ -306,7 +308,7 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     if about["protocol"] != name:
         raise DataError(f"counts: '{name}' holds those of '{about['protocol']}'; score the scene again")
     for key in ("version", "n_predictions", "n_scored"):
-        if type(about[key]) is not int or not 0 <= about[key] < MOST_COUNTED:
+        if type(about[key]) is not int or not 0 <= about[key] < MAX_COUNTED:
             raise DataError(f"counts: '{key}' is {about[key]}; score the scene again")
     if not (np.diff([about["n_scored"], *n_farther, 0]) <= 0).all():
         raise DataError(

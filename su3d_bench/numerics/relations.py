@@ -30,13 +30,13 @@ WITHIN_SHARE = 0.7  # of the footprint of what lies inside
 INNER_FLOOR_M = 0.05  # an inner board lies above the holder's foot by this
 OVER_SHARE, OVER_PAD_M = 0.5, 0.1  # half of a footprint, or its centre; a picture hangs behind the sofa, not in it
 ABOVE_M = 1.0  # a lamp over a table, not one under the ceiling of a hall
-REACH_SHARE, LEAST_REACH_M, MOST_REACH_M = 0.5, 0.1, 0.5  # neighbours: half the longer side of the smaller one
+REACH_SHARE, MIN_REACH_M, MAX_REACH_M = 0.5, 0.1, 0.5  # neighbours: half the longer side of the smaller one
 HAND_M = 0.25  # within an open hand of one another some people call the smallest things neighbours
 NEAR_M = 1.0  # an arm's length
 FLAT_M, SPREAD_M = 0.03, 0.5  # so low and so wide is a rug: part of the floor for what stands beside it
 BETWEEN_ENDS = 0.05  # share of the way, at either end, that is not between
 BETWEEN_CORE = 0.5  # of either side of a footprint, about its middle: what the line grazes is not between
-LEAST_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
+MIN_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
 # What things are called whose last word decides how others lie to them.
 CONTAINERS = frozenset(
     {"basket", "bin", "box", "bag", "backpack", "bathtub", "sink", "bucket", "drawer", "pot", "bowl", "vase", "crate"}
@@ -173,7 +173,7 @@ class Relations:
         return np.asarray((share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack)))
 
     @cached_property
-    def _hangs_before(self) -> BoolArray:
+    def _hangs_in_front(self) -> BoolArray:
         """Two things that hang one in front of the other, as blinds before their window."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2]
         along = sides.argmax(axis=1)
@@ -250,7 +250,7 @@ class Relations:
     @cached_property
     def next_to(self) -> BoolArray:
         """Side by side at one height on one support, on the floor or on the wall, with nothing in between."""
-        return self._without_between(self._is_beside(np.minimum, LEAST_REACH_M) & self.one_place)
+        return self._without_between(self._is_beside(np.minimum, MIN_REACH_M) & self.one_place)
 
     @cached_property
     def may_be_next_to(self) -> BoolArray:
@@ -267,7 +267,7 @@ class Relations:
         """Pairs (K, K) at one height, aside of one another, within the reach of the larger or smaller of the two."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2].max(axis=1, initial=0.0)
         side_m = longer_or_shorter(sides[:, None], sides[None])
-        reach_m = np.clip(REACH_SHARE * side_m, least_m, MOST_REACH_M) * self._slack
+        reach_m = np.clip(REACH_SHARE * side_m, least_m, MAX_REACH_M) * self._slack
         gap_m = np.linalg.norm(self._apart[..., :2], axis=2)
         low, high = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         shared_height = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
@@ -275,7 +275,7 @@ class Relations:
         stacked = self._rests_on_top | self._rests_inside
         is_rug = self._is_spread_out[:, None] | self._is_spread_out[None]
         is_aside = self._shared() <= ON_SHARE * self._slack * np.minimum(self._area[:, None], self._area[None])
-        is_aside &= ~(self.hangs[:, None] & self.hangs[None]) | ~self._hangs_before
+        is_aside &= ~(self.hangs[:, None] & self.hangs[None]) | ~self._hangs_in_front
         return np.asarray((gap_m <= reach_m) & is_aside & is_level & ~stacked & ~stacked.T & ~is_rug & self._is_pair)
 
     def _without_between(self, pairs: BoolArray) -> BoolArray:
@@ -369,7 +369,7 @@ def bearing_rad(eye: Point, a: Point, b: Point) -> float:
 
 def is_left_of(a: Point, b: Point, eye: Point) -> bool:
     """Whether point ``a`` stands left of ``b`` for who looks at both from ``eye``."""
-    return bearing_rad(eye, a, b) > LEAST_BEARING_RAD
+    return bearing_rad(eye, a, b) > MIN_BEARING_RAD
 
 
 def gap_m(a: Float64Array, b: Float64Array) -> float:

@@ -15,8 +15,8 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Interval
 LEVEL = 0.95
 ALPHA = 0.05  # a two-sided p below it is called a difference
 FEW_SCENES = 10  # an interval over fewer is said to be rough: docs/numbers/statistics.md shows how often it holds
-MOST_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
-LEAST_ITEMS = 10  # of fewer a t interval of a change or an agreement holds the truth in less than 90 of 100 sets
+MAX_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
+MIN_ITEMS = 10  # of fewer a t interval of a change or an agreement holds the truth in less than 90 of 100 sets
 NO_SPREAD = 1e-12  # pseudo-values of fractions that differ by less differ by rounding
 SEED = 0
 N_RESAMPLES = 1000  # of the blocks of a growth's slope
@@ -24,12 +24,12 @@ MAX_EXACT_PAIRS = 40  # two halves of 2^20 sums, 8 MB each
 N_FLIPS = 100_000  # patterns drawn where there are more pairs
 FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader of a plot calls flat
 MIN_FIT = 8
-LEAST_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
+MIN_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
 SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # between which a fraction lies, and a difference of two
 POWER = 0.8
-MOST_SCENES = 100_000  # more are not looked for
-LEAST_SEEDS = 3  # of two, where seeds matter, the interval over scenes and seeds holds the truth in 85 of 100 sets
-LEAST_SCENES = 6  # of fewer, no pattern of signs has a p below 0.05: 2 of 2^5 are 0.0625
+MAX_SCENES = 100_000  # more are not looked for
+MIN_SEEDS = 3  # of two, where seeds matter, the interval over scenes and seeds holds the truth in 85 of 100 sets
+MIN_SCENES = 6  # of fewer, no pattern of signs has a p below 0.05: 2 of 2^5 are 0.0625
 
 EXACT_STEPS = 8  # up to so many every choice of steps is taken: 256 values
 N_ORDERS = 200  # that are drawn of more
@@ -37,20 +37,20 @@ Value = Callable[[int], float]  # of the steps whose bits are set
 
 
 def _group_of_scene(n_scenes: int) -> Int64Array:
-    """With which scenes each (S,) is left out: alone, or with those that stand ``MOST_GROUPS`` after it."""
-    return np.arange(n_scenes) % min(n_scenes, MOST_GROUPS)
+    """With which scenes each (S,) is left out: alone, or with those that stand ``MAX_GROUPS`` after it."""
+    return np.arange(n_scenes) % min(n_scenes, MAX_GROUPS)
 
 
 @lru_cache(maxsize=1)  # every method and protocol of a run asks for the same
 def leave_one_out(n_scenes: int) -> Int64Array:
     """How often each scene is counted (1 + G, S): all of them, then all but the first, and so on; read-only.
 
-    More than ``MOST_GROUPS`` scenes are left out in as many groups: each has a part in one of them.
+    More than ``MAX_GROUPS`` scenes are left out in as many groups: each has a part in one of them.
 
     >>> leave_one_out(2).tolist()
     [[1, 1], [0, 1], [1, 0]]
     """
-    groups = np.arange(min(n_scenes, MOST_GROUPS))
+    groups = np.arange(min(n_scenes, MAX_GROUPS))
     left_out = groups[:, None] == _group_of_scene(n_scenes)
     weights: Int64Array = np.concatenate([np.ones((1, n_scenes), bool), ~left_out]).astype(np.int64)
     weights.flags.writeable = False
@@ -337,7 +337,7 @@ def _slopes_of_blocks(x: Float64Array, y: Float64Array, starts: Int64Array, leng
     n = lengths.sum()
     sum_x, sum_y, sum_xx, sum_xy = (_block_sums(values, starts, lengths) for values in (x, y, x * x, x * y))
     spread = sum_xx - sum_x * sum_x / n
-    varies = spread > LEAST_SPREAD * (x @ x)
+    varies = spread > MIN_SPREAD * (x @ x)
     slopes: Float64Array = np.full(len(starts), np.nan)
     np.divide(sum_xy - sum_x * sum_y / n, spread, out=slopes, where=varies)
     return slopes
@@ -408,7 +408,7 @@ def crossed_interval(middle: float, variance: Variance) -> Interval | None:
 
     None where nothing varied, and of two seeds, which tell too little of seeds.
     """
-    if 1 < variance.n_seeds < LEAST_SEEDS:
+    if 1 < variance.n_seeds < MIN_SEEDS:
         return None
     error, n_free = variance.error(variance.n_scenes, variance.n_seeds)
     if error <= NO_SPREAD:
@@ -437,7 +437,7 @@ def power_of(variance: Variance, difference: float, n_scenes: int, n_seeds: int)
 def scenes_needed(variance: Variance, difference: float, n_seeds: int, power: float = POWER) -> int | None:
     """The least number of scenes that find a true ``difference`` with ``power``, each under ``n_seeds`` seeds.
 
-    At least as many as give the sign-flip test a p below 0.05. None where ``MOST_SCENES`` are too few, or where seeds
+    At least as many as give the sign-flip test a p below 0.05. None where ``MAX_SCENES`` are too few, or where seeds
     move the difference as such and there is one alone: no number of scenes tells the two apart then.
 
     >>> scenes_needed(Variance(1.0, None, 0.0, 8, 1), 0.5, 1)
@@ -445,12 +445,12 @@ def scenes_needed(variance: Variance, difference: float, n_seeds: int, power: fl
     """
     if n_seeds == 1 and variance.of_seeds:
         return None
-    low = high = LEAST_SCENES
+    low = high = MIN_SCENES
     # by doubling: where seeds outweigh scenes, their few degrees of freedom take power away again
     while power_of(variance, difference, high, n_seeds) < power:
-        if high >= MOST_SCENES:
+        if high >= MAX_SCENES:
             return None
-        low, high = high + 1, min(2 * high, MOST_SCENES)
+        low, high = high + 1, min(2 * high, MAX_SCENES)
     while low < high:
         middle = (low + high) // 2
         low, high = (low, middle) if power_of(variance, difference, middle, n_seeds) >= power else (middle + 1, high)

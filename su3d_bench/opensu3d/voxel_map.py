@@ -17,7 +17,7 @@ from su3d_bench.opensu3d.config import Density
 NO_INSTANCE = 0
 # Larger coordinates indicate poses in the wrong unit; voxel coordinates stay exact integers far beyond.
 FARTHEST_M = 1e7
-ROWS_OF_A_THREAD = 20_000  # about 2 ms of work; starting a thread takes 0.1 ms
+ROWS_PER_THREAD = 20_000  # about 2 ms of work; starting a thread takes 0.1 ms
 
 
 class VoxelMap:
@@ -162,7 +162,7 @@ def in_threads(work: Callable[[slice], int], n: int) -> list[int]:
     from numba import config
 
     allowed = int(config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]  # set when numba is imported
-    n_parts = max(1, min(allowed, n // ROWS_OF_A_THREAD))
+    n_parts = max(1, min(allowed, n // ROWS_PER_THREAD))
     ends = [n * k // n_parts for k in range(n_parts + 1)]
     parts = [slice(first, last) for first, last in pairwise(ends)]
     if n_parts == 1:

@@ -108,7 +108,7 @@ def region_under(masks: BoolArray, points: Int64Array) -> tuple[int, float]:
     return (best, float(n_inside[best] / len(points))) if n_inside[best] else (-1, 0.0)
 
 
-class OfLastFrame(Generic[Computed]):
+class LastFrameCache(Generic[Computed]):
     """The result of ``compute`` for a frame, stored for the most recent frame."""
 
     def __init__(self, compute: Callable[[Frame], Computed]) -> None:
@@ -144,7 +144,7 @@ class RegionsOnDemand(CropsOnDemand):
 
     def __init__(self, regions_of: Callable[[Frame], Regions], encoder: Encoder) -> None:
         super().__init__(encoder)
-        self._regions = OfLastFrame(regions_of)
+        self._regions = LastFrameCache(regions_of)
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
         """The mask and score of the region that contains most of ``points``; or an empty mask and 0.

@@ -61,7 +61,7 @@ class OracleNoise(BaseModel):
 Region = tuple[BoolArray, str]
 
 
-def disturb(
+def apply_noise(
     masks: list[BoolArray], names: list[str], known: list[str], noise: OracleNoise, frame_index: int
 ) -> tuple[list[BoolArray], list[str]]:
     """``masks`` and ``names`` with ``noise`` applied; ``known`` are the candidate names of a flip."""
@@ -275,7 +275,7 @@ class OracleSegmenter:
         names = [self._truth.labels.name_of(of_class[i]) for i in kept]
         masks = [instance == i for i in kept]
         known = sorted({self._truth.labels.name_of(c) for c in of_class.values()})
-        masks, names = disturb(masks, names, known, self._config.noise, frame.index)
+        masks, names = apply_noise(masks, names, known, self._config.noise, frame.index)
         pairs = [(m, n) for m, n in zip(masks, names, strict=True) if np.count_nonzero(m) >= self._config.min_pixels]
         stacked = np.array([m for m, _ in pairs], bool).reshape(len(pairs), *instance.shape)
         return Regions(stacked, mask_boxes(stacked), np.ones(len(pairs), np.float32), tuple(n for _, n in pairs))

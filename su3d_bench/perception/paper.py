@@ -27,12 +27,14 @@ from su3d_bench.perception.models.masks.grounded_sam import (
 PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h", "gpt-4-vision-preview"
 
 
-def stand_ins(config: PaperConfig, networks: Networks, encoder: Encoder, captioner: Captioner | None) -> list[str]:
+def paper_deviations(
+    config: PaperConfig, networks: Networks, encoder: Encoder, captioner: Captioner | None
+) -> list[str]:
     """What is computed here otherwise than in OpenSU3D's paper, a sentence each; nothing where all is the paper's."""
     said = [networks.tagger.caveat] if networks.tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
         said.append(f"masks: {config.segmenter} replaces the paper's {PAPER_SEGMENTER}")
-    if others := _settings_besides_the_papers(config.grounded):
+    if others := _non_default_settings(config.grounded):
         said.append(f"named masks: {', '.join(others)} differ from OpenSU3D's settings")
     if encoder.name != MODELS[PAPER_ENCODER].known_as:
         said.append(f"features: {encoder.name} replaces the paper's {PAPER_ENCODER}")
@@ -43,7 +45,7 @@ def stand_ins(config: PaperConfig, networks: Networks, encoder: Encoder, caption
     return said
 
 
-def _settings_besides_the_papers(config: GroundedConfig) -> list[str]:
+def _non_default_settings(config: GroundedConfig) -> list[str]:
     """The settings of named masks, boxes among them, that are not the defaults."""
     given, papers = (
         {f"boxes.{name}": value for name, value in one.boxes} | {name: value for name, value in one if name != "boxes"}
@@ -66,7 +68,7 @@ class PaperPerception:
         captioner: Captioner | None = None,
     ) -> None:
         self.encoder = encoder
-        self.caveat: str | None = "; ".join(stand_ins(config, networks, encoder, captioner)) or None
+        self.caveat: str | None = "; ".join(paper_deviations(config, networks, encoder, captioner)) or None
         self._networks = networks
         self._captioner = captioner
         self._cache = cache

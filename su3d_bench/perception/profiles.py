@@ -118,9 +118,9 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
         return profile
     if config is None or image_domain != "camera":
         return "embedded"
-    from su3d_bench.perception.models.loading import is_front_end_here
+    from su3d_bench.perception.models.loading import is_front_end_available
 
-    return "paper" if is_front_end_here(config.paper, config.models) else "embedded"
+    return "paper" if is_front_end_available(config.paper, config.models) else "embedded"
 
 
 def check_models(profile: str, config: PerceptionConfig) -> None:

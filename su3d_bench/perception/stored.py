@@ -36,13 +36,13 @@ from su3d_bench.perception.detections import Assembler, captioned_by_colour
 from su3d_bench.perception.embedded.lexicon import Namer
 
 INDEX = "{index}"
-MOST_REGIONS = 2_000  # of one image; SAM gives some hundred
-MOST_MASK_BYTES = 512 << 20  # of all masks of an image, a byte a pixel: 400 of 1296x968, 1,700 of 640x480
+MAX_REGIONS = 2_000  # of one image; SAM gives some hundred
+MAX_MASK_BYTES = 512 << 20  # of all masks of an image, a byte a pixel: 400 of 1296x968, 1,700 of 640x480
 
 
 def check_masks(n: int, shape: tuple[int, ...], where: str) -> None:
     """Refuses more masks (H, W) than any image has, which take far more memory than their file, before they do."""
-    if n > MOST_REGIONS or n * shape[0] * shape[1] > MOST_MASK_BYTES:
+    if n > MAX_REGIONS or n * shape[0] * shape[1] > MAX_MASK_BYTES:
         raise DataError(f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one region per object")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError, PredictionError, printable, reading, shown
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
-from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, check_members
+from su3d_bench.formats.arrays import MAX_MASKS, MAX_POINTS, check_members
 from su3d_bench.metrics.matching.nearest import masks_of_partition
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
@@ -168,7 +168,7 @@ def instances_of(clouds: Sequence[Float32Array], where: str, features: Float32Ar
     """One instance a cloud, each with points of its own, score 1 and no views; boxes of empty clouds are zeros."""
     sizes = np.array([len(cloud) for cloud in clouds], np.int64)
     n = int(sizes.sum())
-    if n > MOST_POINTS or len(clouds) > MOST_MASKS:
+    if n > MAX_POINTS or len(clouds) > MAX_MASKS:
         raise PredictionError(f"{where}: {len(clouds)} objects of {n} points; is it damaged?")
     points = np.concatenate([np.zeros((0, 3), np.float32), *clouds])
     masks = Masks(starts_of(sizes), np.arange(n, dtype=np.int32))

@@ -37,7 +37,7 @@ from su3d_bench.predictions.masks import holds
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"  # gradslam's
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")
-FOLDERS_OF_A_MAP = ("pointclouds", "saved-map", "saved-maps", "Sequence_1")
+MAP_FOLDERS = ("pointclouds", "saved-map", "saved-maps", "Sequence_1")
 CLOUD = "point_cloud.pcd"  # OpenLex3D's
 CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the order in which the original looks for them
 LEX_INDEX, LEX_EMBEDDINGS = "index.npy", "embeddings.npy"
@@ -51,7 +51,7 @@ N_COLOURS, N_COUNTS = 3, 1  # columns before and behind the features of a voxel 
 def scene_of_gradslam(folder: Path, path: Path) -> str:
     """The first name upwards that is no folder of the map's own."""
     absolute = folder.absolute()
-    names = [above.name for above in (absolute, *absolute.parents) if above.name not in FOLDERS_OF_A_MAP]
+    names = [above.name for above in (absolute, *absolute.parents) if above.name not in MAP_FOLDERS]
     return names[0] or "scene"
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError, printable
 from su3d_bench.core.files.atomic import make_folder, write_text
-from su3d_bench.core.files.locks import become, unfinished_folder
+from su3d_bench.core.files.locks import publish, unfinished_folder
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
@@ -36,7 +36,7 @@ MASKS_FOLDER = "pred_mask"
 RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer and the OpenSUN3D challenge call it
 ROWS_AT_ONCE = 1 << 14
 # demo_eval.py of OpenSun3D/cvpr24-challenge at 59db30f reads a list with numpy.loadtxt and stops at one of fewer lines.
-LEAST_MASKS = 2
+MIN_MASKS = 2
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
 
 
@@ -54,7 +54,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
     try:
         with unfinished_folder(out) as filled:
             yield filled
-            become(filled, out)
+            publish(filled, out)
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
 
@@ -327,7 +327,7 @@ def is_answer(content: Content) -> bool:
     return isinstance(content, VertexMasks) and content.features is None
 
 
-def answer_as_it_is(content: VertexMasks) -> LabelledMasks:
+def masks_as_predicted(content: VertexMasks) -> LabelledMasks:
     """Masks on the vertices with their own confidences; their classes, if they have some, say nothing here."""
     return LabelledMasks(content, content.n_points or 0, np.zeros(len(content), np.int64), content.scores)
 
@@ -357,7 +357,7 @@ def write_opensun3d(answer: LabelledMasks, scene: str, folder: Path) -> tuple[st
     form = RUNS_FOLDER, ".txt", lambda k: digits_of(answer, k)
     remarks = write_list(answer, np.zeros(len(answer.class_ids), np.int64), scene, folder, None, form)
     n_written = int((answer.masks.sizes > 0).sum())
-    if n_written < LEAST_MASKS:
+    if n_written < MIN_MASKS:
         said = f"has {n_written or 'no'} mask{'s' * (n_written != 1)}"
-        remarks = (*remarks, f"{said}: the challenge's own script stops at a list of fewer than {LEAST_MASKS}")
+        remarks = (*remarks, f"{said}: the challenge's own script stops at a list of fewer than {MIN_MASKS}")
     return tuple(remarks)

@@ -11,7 +11,7 @@ from su3d_bench.formats.torch_files import SparseTensor
 from su3d_bench.predictions import dense, hovsg, masks, objects
 from su3d_bench.predictions import scannet_text as text
 from su3d_bench.predictions.base import Reader, file_format, folder_format
-from su3d_bench.predictions.own_runs import OWN_RUNS
+from su3d_bench.predictions.run_predictions import OWN_RUNS
 from su3d_bench.predictions.scannet_text import text_format
 from su3d_bench.store.records import RunRecord, read_record
 
@@ -162,7 +162,7 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
         return same[0]
     if "/" in name:  # a scene that is made on demand stands in no list
         return name.rpartition("/")[2]
-    longer = [scene for scene in known if _goes_on(name, scene)]
+    longer = [scene for scene in known if _is_continued(name, scene)]
     if longer:
         return max(longer, key=len)
     hint = suggest(name, known)
@@ -171,10 +171,10 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
 
 def is_known(name: str, known: Sequence[str]) -> bool:
     """Whether a prediction's name fits one of the scenes; one with a dataset before it fits whatever there is."""
-    return "/" in name or any(_plain(scene) == _plain(name) or _goes_on(name, scene) for scene in known)
+    return "/" in name or any(_plain(scene) == _plain(name) or _is_continued(name, scene) for scene in known)
 
 
-def _goes_on(name: str, scene: str) -> bool:
+def _is_continued(name: str, scene: str) -> bool:
     """Whether ``name`` is ``scene`` with more behind it: ``room0_mesh``, not ``room01``."""
     forms = (scene, scene.replace("_", ""), scene.replace("-", "_"))
     return any(name.startswith(form) and not name[len(form) : len(form) + 1].isalnum() for form in forms)

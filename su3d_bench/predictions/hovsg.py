@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ValidationError
 from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown, some
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import UP, Float32Array, Floor, Places, Room
-from su3d_bench.formats.arrays import MOST_MASKS, as_float32, checked_points, feature_table, without_nonfinite
+from su3d_bench.formats.arrays import MAX_MASKS, as_float32, checked_points, feature_table, without_nonfinite
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_files import read_torch
@@ -29,12 +29,12 @@ from su3d_bench.predictions.base import ONES, Parsed, instances_of
 FEATURES = "mask_feats.pt"
 FLOORS, ROOMS, OBJECTS, GRAPH = "floors", "rooms", "objects", "graph"
 NUMBERS = {FLOORS: r"\d{1,9}", ROOMS: r"\d{1,9}_\d{1,9}", OBJECTS: r"\d{1,9}_\d{1,9}_\d{1,9}"}
-MOST_M, MOST_DIMENSIONS = 1e6, 1 << 14
+MAX_M, MAX_DIMENSIONS = 1e6, 1 << 14
 AGAIN = "copy the graph again"
 OTHER = {".ply": ".json", ".json": ".ply"}  # what lies beside each file
 Fields = TypeVar("Fields", bound=BaseModel)
-Metres = Annotated[float, Field(ge=-MOST_M, le=MOST_M)]
-Feature = Annotated[list[float], Field(min_length=1, max_length=MOST_DIMENSIONS)]
+Metres = Annotated[float, Field(ge=-MAX_M, le=MAX_M)]
+Feature = Annotated[list[float], Field(min_length=1, max_length=MAX_DIMENSIONS)]
 OBJECT_FILE = re.compile(r"pcd_(0|[1-9]\d{0,8})\.(ply|pcd)")
 
 
@@ -77,7 +77,7 @@ def _object_files(folder: Path) -> dict[int, Path]:
         name = match[0]
         if files.setdefault(int(match[1]), folder / name) != folder / name:
             raise PredictionError(f"{shown(folder)}: object {match[1]} is there as .ply and .pcd; keep one of them")
-    if len(files) > MOST_MASKS:
+    if len(files) > MAX_MASKS:
         raise PredictionError(f"{shown(folder)}: holds {len(files)} objects; is it damaged?")
     return files
 
@@ -140,7 +140,7 @@ def _members(place: Path, kind: str) -> dict[str, Path]:
     for file in files:
         if file.with_suffix(OTHER[file.suffix]) not in files:
             raise PredictionError(f"{shown(file)}: has no {OTHER[file.suffix]} beside it; {AGAIN}")
-    if len(files) > 2 * MOST_MASKS:
+    if len(files) > 2 * MAX_MASKS:
         raise PredictionError(f"{shown(folder)}: holds {len(files)} files of {kind}; is it damaged?")
     return {file.stem: file for file in files if file.suffix == ".ply"}
 

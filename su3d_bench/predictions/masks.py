@@ -35,9 +35,11 @@ FEATURES_SUFFIXES = ("_openmask3d_features.npy", "_features.npy", ".npy")
 ONLINE_MASKS, ONLINE_CLOUD = "ckpt_final.npz", "final.ply"  # OnlineAnySeg's
 POINTS, COLOURS = "points.npy", "points_color.npy"  # ESAM's
 GREY = 200  # of every channel: a point in no mask of ESAM's
-MOST_COLOURS = 256  # in its palette
+MAX_COLOURS = 256  # in its palette
 CHANNELS = ("red", "green", "blue")
-POINTS_OF_A_COLOUR = 20  # at least, on average over the first points, where colours are groups; photographs have 1 or 2
+MIN_POINTS_PER_COLOUR = (
+    20  # at least, on average over the first points, where colours are groups; photographs have 1 or 2
+)
 
 
 # ---- which format a file is of
@@ -74,7 +76,7 @@ def looks_like_colours(first: Path) -> str | None:
     if (first.parent / ONLINE_MASKS).is_file():  # the cloud that those masks are over
         return None
     colours = _colours(first_rows(first, "vertex"))
-    is_group = colours is not None and len(np.unique(colours)) * POINTS_OF_A_COLOUR <= len(colours) > 0
+    is_group = colours is not None and len(np.unique(colours)) * MIN_POINTS_PER_COLOUR <= len(colours) > 0
     return "its .ply files hold clouds in which many points share a colour" if is_group else None
 
 
@@ -243,7 +245,7 @@ def sam3d_colours(place: Path, scene: str) -> Parsed:
     if colours is None:
         raise PredictionError(f"{where}: its points have no colours red, green, blue of one byte each")
     groups = np.where(colours == 0, -1, colours)
-    if len(np.unique(groups)) > arrays.MOST_MASKS:
+    if len(np.unique(groups)) > arrays.MAX_MASKS:
         raise PredictionError(
             f"{where}: {len(np.unique(groups))} colours; expected one a group: is it the cloud of a photograph?"
         )
@@ -261,9 +263,9 @@ def esam(place: Path, scene: str) -> Parsed:
         raise PredictionError(f"{where}: a channel is {int(colours.min())} or {int(colours.max())}; expected 0 to 255")
     groups = _of_channels(*colours.reshape(-1, 3).T)
     masks = masks_of_groups(np.where(groups == _of_channels(GREY, GREY, GREY), -1, groups), "colour", where)
-    if len(masks) > MOST_COLOURS:
+    if len(masks) > MAX_COLOURS:
         raise PredictionError(
-            f"{where}: has {len(masks)} colours, ESAM's palette {MOST_COLOURS}; are they those of photographs?"
+            f"{where}: has {len(masks)} colours, ESAM's palette {MAX_COLOURS}; are they those of photographs?"
         )
     remark = "a colour is a mask: of masks that share points one has them"
     return Instances.of(places, masks, names=masks.keys), (NO_SCORES, WITHOUT_CLASSES, remark)

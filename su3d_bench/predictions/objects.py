@@ -32,13 +32,13 @@ from su3d_bench.predictions.base import ONES, Parsed, first_found, instances_of,
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"
 FULL, STREAMLINED = f"full_pcd_*{SUFFIX}", f"pcd_*{SUFFIX}"
-FORGOTTEN = ("mask", "pcd_color_np")  # the masks of every view make most of the file
+SKIPPED_FIELDS = ("mask", "pcd_color_np")  # the masks of every view make most of the file
 NAME_OF_NONE = "item"  # what the class-agnostic variant calls every object
-MOST_TEXT = 1000
+MAX_TEXT = 1000
 GRAPHS = "predictions_*.pkl"  # FROSS's
 LISTS = "replica-relations"  # the protocol with the lists by which its numbers are named
-FORGOTTEN_OF_GRAPHS = ("mean", "cov")
-MOST_SCENES, MOST_EDGES = 10_000, 10_000_000
+SKIPPED_GRAPH_FIELDS = ("mean", "cov")
+MAX_SCENES, MAX_EDGES = 10_000, 10_000_000
 
 
 def looks_like_conceptgraphs(path: Path) -> str | None:
@@ -61,7 +61,7 @@ def conceptgraphs(place: Path, scene: str) -> Parsed:
     where, remarks = shown(place), [ONES]
     if place.name.endswith(POST) and place.with_name(place.name.removesuffix(POST) + SUFFIX).exists():
         remarks.append(f"'{printable(place.name, 120)}' is read, not the map before the last merging beside it")
-    value = read_pickle_file(place, forget=FORGOTTEN)
+    value = read_pickle_file(place, forget=SKIPPED_FIELDS)
     if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
         raise PredictionError(f"{where}: holds {arrays.kind_of(value)} without a list of 'objects'; expected a map")
     background = _background(value.get("bg_objects"), where)
@@ -111,9 +111,7 @@ def _class_names(value: object) -> tuple[str, ...]:
     texts = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "U" else value
     if not isinstance(texts, list | tuple):
         return ()
-    return tuple(
-        printable(text[:MOST_TEXT], 80) if isinstance(text, str) else "" for text in texts[: arrays.MOST_MASKS]
-    )
+    return tuple(printable(text[:MAX_TEXT], 80) if isinstance(text, str) else "" for text in texts[: arrays.MAX_MASKS])
 
 
 def _instances(
@@ -125,7 +123,7 @@ def _instances(
     classes it does not load them; here they are then left out because their names are among the excluded ones.
     """
     everything = [*objects, *background]
-    if len(everything) > arrays.MOST_MASKS:
+    if len(everything) > arrays.MAX_MASKS:
         raise PredictionError(f"{where}: holds {len(everything)} objects; is it damaged?")
     clouds, names, captions = [], [], []
     for k, entry in enumerate(everything):
@@ -137,7 +135,7 @@ def _instances(
         clouds.append(arrays.checked_points(entry["pcd_np"], at))
         names.append(_name(entry, _majority(entry.get("class_id")), class_names))
         caption = entry.get("consolidated_caption")
-        captions.append(printable(caption[:MOST_TEXT], MOST_TEXT) if isinstance(caption, str) else "")
+        captions.append(printable(caption[:MAX_TEXT], MAX_TEXT) if isinstance(caption, str) else "")
     features, remarks = _features(objects, where)
     if features is not None and any(name != NAME_OF_NONE for name in names[: len(objects)]):
         remarks.append("names are those of most detections; the feature of an object decides its class, as originally")
@@ -193,7 +191,7 @@ def _name(entry: Mapping[str, Any], number: int | None, class_names: Sequence[st
         return class_names[number]
     name = entry.get("class_name")
     name = name[0] if isinstance(name, list) and name else name
-    return printable(name[:MOST_TEXT], 80) if isinstance(name, str) and name.strip() else NAME_OF_NONE
+    return printable(name[:MAX_TEXT], 80) if isinstance(name, str) and name.strip() else NAME_OF_NONE
 
 
 def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32Array | None, list[str]]:
@@ -248,7 +246,7 @@ def scene_graph(graph: object, rules: ProtocolRules, where: str) -> Instances:
     if not isinstance(graph, dict):
         raise PredictionError(f"{where}: is {arrays.kind_of(graph)}; expected a scene graph with pcd, cls and edges")
     clouds = graph.get("pcd")
-    if not isinstance(clouds, list) or len(clouds) > arrays.MOST_MASKS:
+    if not isinstance(clouds, list) or len(clouds) > arrays.MAX_MASKS:
         raise PredictionError(f"{where}: 'pcd' is {arrays.kind_of(clouds)}; expected a list of points an object")
     k = len(clouds)
     classes = _table(graph.get("cls"), (k, len(rules.classes)), f"{where}: 'cls'")
@@ -267,8 +265,8 @@ def _graph_files(path: Path) -> list[Path]:
 
 
 def _graphs(file: Path) -> dict[str, Any]:
-    value = read_pickle_file(file, forget=FORGOTTEN_OF_GRAPHS)
-    if not isinstance(value, dict) or not value or len(value) > MOST_SCENES:
+    value = read_pickle_file(file, forget=SKIPPED_GRAPH_FIELDS)
+    if not isinstance(value, dict) or not value or len(value) > MAX_SCENES:
         raise PredictionError(f"{shown(file)}: holds {arrays.kind_of(value)}; expected the scene graph of each scene")
     if not all(isinstance(scene, str) for scene in value):
         raise PredictionError(f"{shown(file)}: has a scene that is no name; expected the scene graph of each scene")
@@ -291,7 +289,7 @@ def _edges(value: object, n_objects: int, where: str) -> NDArray[np.int32]:
     if _is_empty(value):
         return np.zeros((0, 2), np.int32)
     table = arrays.array_of(value, f"{where} is", "rows of subjects and of objects", "iu", 2, None)
-    if table.shape[1] > MOST_EDGES or not 0 <= int(table.min()) <= int(table.max()) < n_objects:
+    if table.shape[1] > MAX_EDGES or not 0 <= int(table.min()) <= int(table.max()) < n_objects:
         raise PredictionError(f"{where} names object {int(table.max())}; the scene graph has {n_objects}")
     return np.ascontiguousarray(table.T).astype(np.int32)
 

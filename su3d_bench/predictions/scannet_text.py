@@ -22,17 +22,17 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError, counted, printable, reading, shown
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.arrays import MOST_POINTS, check_members, integer_lines, run_members
+from su3d_bench.formats.arrays import MAX_POINTS, check_members, integer_lines, run_members
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import Numbering, Parse, Parsed, Reader, VertexLabels, scene_files, vertex_masks
 
-OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
+EVALUATOR_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
 MASK_OF_RUNS = ".json"  # ScanNet++'s
 TOP = 3  # classes a vertex, where a line of ScanNet++ has several: eval_semantic.py takes 1 or the largest of its k
 SEPARATOR = ","  # between them
-MOST_FIRST_LINE = 4096
-MOST_LOOKED_AT = 50
+MAX_FIRST_LINE = 4096
+MAX_INSPECTED = 50
 
 
 class Line(NamedTuple):
@@ -56,16 +56,16 @@ def text_format(name: str, looks: Callable[[str], str | None], parse: Parse) -> 
 
 def _scenes(path: Path) -> Mapping[str, Path]:
     folder = path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path
-    return {name: file for name, file in scene_files(folder, (".txt",)).items() if name != OWN_OUTPUT}
+    return {name: file for name, file in scene_files(folder, (".txt",)).items() if name != EVALUATOR_OUTPUT}
 
 
 def _first_lines(path: Path) -> list[str]:
     """The first line of some files, empty for empty ones."""
     lines = []
     files = _scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
-    for file in list(files)[:MOST_LOOKED_AT]:
+    for file in list(files)[:MAX_INSPECTED]:
         with suppress(OSError), opened(file) as stream:
-            lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
+            lines.append(stream.readline(MAX_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
     return lines
 
 
@@ -160,7 +160,7 @@ def ranked_labels(place: Path, scene: str) -> Parsed:
 
 def _ranked_numbers(content: bytes, where: str) -> Int32Array:
     """The class numbers (N, 1) or (N, 3) of the vertices, the likeliest first."""
-    if (n_lines := content.count(b"\n")) > MOST_POINTS:
+    if (n_lines := content.count(b"\n")) > MAX_POINTS:
         raise PredictionError(f"{where}: has {n_lines} lines; is it damaged?")
     rows = [line.split(SEPARATOR.encode()) for line in content.splitlines()]
     if not rows:

@@ -14,12 +14,12 @@ from su3d_bench.core.english import plural, with_article
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
-from su3d_bench.questions.model import MADE_KINDS, REASONING, Answer, Question
+from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, questions_of, scene_objects
+from su3d_bench.questions.model import GENERATED_KINDS, REASONING, Answer, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
-from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, questions_of, scene_objects
 
 RETRIEVAL = "retrieval"  # stands for all kinds of queries, as ``REASONING`` for all templates
-LEAST_EACH = 20  # questions of a template and scene among which is drawn: enough for every kind to have its share
+MIN_PER_TEMPLATE = 20  # questions of a template and scene among which is drawn: enough for every kind to have its share
 Things = tuple[MapObject, ...]
 
 
@@ -27,7 +27,7 @@ Things = tuple[MapObject, ...]
 class AuditedQuestion:
     """A question with its answer in words, its answer objects, reference objects and other objects of the same name.
 
-    ``kind`` is one of ``MADE_KINDS``, or a template of the reasoning questions. No object is in two of the three;
+    ``kind`` is one of ``GENERATED_KINDS``, or a template of the reasoning questions. No object is in two of the three;
     ``room`` has all objects of the scene.
     """
 
@@ -42,7 +42,7 @@ class AuditedQuestion:
 
 
 def audited_questions(
-    dataset: Any, scene: str, *, n_each: int = LEAST_EACH, seed: int = 0
+    dataset: Any, scene: str, *, n_each: int = MIN_PER_TEMPLATE, seed: int = 0
 ) -> Iterator[AuditedQuestion]:
     """All queries of a scene and at most ``n_each`` questions of each reasoning template."""
     address = f"{dataset.name}/{scene}"
@@ -57,14 +57,14 @@ def audited_questions(
     for question in generate_questions(objects, n_each=n_each, seed=seed):
         mentioned = _mentioned(question.text, objects)
         right = _of_ids(objects, question.answer.object_ids)
-        held = held_against(question, objects)
+        held = reference_objects(question, objects)
         called = (*_called_as(right, objects), *(thing for things in mentioned for thing in things))
         others = _without(called, (*right, *held))
         words = _in_words(question.answer, objects)
         yield AuditedQuestion(address, question.kind, question.text, words, right, held, others, objects)
 
 
-def held_against(question: GeneratedQuestion, objects: SceneMap) -> Things:
+def reference_objects(question: GeneratedQuestion, objects: SceneMap) -> Things:
     """The reference objects of an answer; for negative answers, the object at the end of the text."""
     held = _of_ids(objects, question.answer.reference_ids)
     if not held and question.answer.value is False and (mentioned := _mentioned(question.text, objects)):
@@ -81,7 +81,7 @@ def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list
     wanted: set[str] = set()
     for kind in kinds:
         is_query = {RETRIEVAL: True, REASONING: False}.get(kind)
-        named = {one for one in known if one == kind or (one in MADE_KINDS) is is_query}
+        named = {one for one in known if one == kind or (one in GENERATED_KINDS) is is_query}
         if not named:
             hint = suggest(kind, (*known, RETRIEVAL, REASONING), "there are:")
             raise ConfigError(f"questions audit: no questions of kind '{printable(kind, 40)}'{hint}")
@@ -110,7 +110,7 @@ def sample(questions: Sequence[AuditedQuestion], n: int, seed: int) -> list[Audi
 
 def n_of_each(n: int, n_scenes: int) -> int:
     """The pool size per template and scene for drawing ``n`` questions, which may all come from one template."""
-    return max(LEAST_EACH, math.ceil(n / max(1, n_scenes)))
+    return max(MIN_PER_TEMPLATE, math.ceil(n / max(1, n_scenes)))
 
 
 def _n_drawn(drawn: Iterable[AuditedQuestion], scene: str, kind: str | None = None) -> int:

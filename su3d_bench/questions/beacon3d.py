@@ -38,13 +38,13 @@ from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.questions.query_files import ObjectId, Words, validated
 
 PAGE = "https://github.com/beacon-3d/beacon-3d"
-MOST_BYTES = 64 << 20  # the largest of the release has half of one MiB
-MOST_CHARACTERS = 10_000  # of an answer
+MAX_BYTES = 64 << 20  # the largest of the release has half of one MiB
+MAX_CHARACTERS = 10_000  # of an answer
 ANSWER_KEYS = ("response_pred", "answer_pred", "text", "answer_top10", "pred_response", "pred")  # in this order
 
 
 @dataclass(frozen=True)
-class AskedOfObject:
+class ObjectQuestion:
     """A question about an object with its correct answer and its type."""
 
     scene: str
@@ -74,8 +74,8 @@ class Reply:
 class Questions:
     """Three questions of each object, one after the other; ``entries``: those of the list, each text once a scene."""
 
-    asked: tuple[AskedOfObject, ...]
-    entries: tuple[AskedOfObject, ...]
+    asked: tuple[ObjectQuestion, ...]
+    entries: tuple[ObjectQuestion, ...]
 
 
 def kind_of_metadata(content: Any) -> str | None:
@@ -93,7 +93,7 @@ def read_metadata(path: Path) -> Any:
     """The content of a JSON file; ``DataError`` if it is not valid."""
     where = shown(path)
     advice = f"download the Beacon3D files from {PAGE}, data/<domain>/"
-    return parsed_json(read_bytes(path, where, advice, MOST_BYTES), where)
+    return parsed_json(read_bytes(path, where, advice, MAX_BYTES), where)
 
 
 class _Case(BaseModel):
@@ -164,14 +164,14 @@ def chains_of(content: Any, where: str) -> Chains:
 
 def questions_of_objects(content: Any, where: str) -> Questions:
     """All questions in the order of the objects."""
-    asked: list[AskedOfObject] = []
-    entries: dict[tuple[str, str], AskedOfObject] = {}
+    asked: list[ObjectQuestion] = []
+    entries: dict[tuple[str, str], ObjectQuestion] = {}
     tags: dict[tuple[str, str], str] = {}
     for scene, classes in validated(Asking, content, where).items():
         for row in (row for of_class in classes.values() for known in of_class.values() for row in known.qa):
             if tags.setdefault((scene, row.question.lower()), row.tag) != row.tag:
                 raise DataError(f"{where}: '{printable(row.question, 60)}' of {scene} has two sorts of tags")
-            asked.append(AskedOfObject(scene, row.question, row.answer, row.tag.lower()))
+            asked.append(ObjectQuestion(scene, row.question, row.answer, row.tag.lower()))
             entries.setdefault((scene, row.question), asked[-1])
     if not asked:
         raise DataError(f"{where}: contains no objects")
@@ -210,7 +210,7 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
         given = answer.model_extra or {}
         value = next((given[key] for key in ANSWER_KEYS if key in given), None)
         value = value[0] if isinstance(value, list) and value else value
-        if not isinstance(value, str) or len(value) > MOST_CHARACTERS:
+        if not isinstance(value, str) or len(value) > MAX_CHARACTERS:
             fault = f"expected an answer text under one of {', '.join(ANSWER_KEYS)}"
             raise DataError(f"{shown(path)}: answer {number}: {fault}")
         replies[entry.scene, entry.question.lower()] = Reply(value, entry.answer, answer.score)
@@ -262,7 +262,7 @@ def is_yes_or_no(right: Sequence[str]) -> bool:
     return any(word in one.lower() for one in right for word in ("yes", "no"))
 
 
-LEAST_SCORE, MOST_SCORE = 1.0, 5.0
+MIN_SCORE, MAX_SCORE = 1.0, 5.0
 RIGHT_FROM = 4.0  # the score from which an answer counts as right for its object
 FIRST = ("case", "object")  # of the numbers
 TAGS = ("class", "appearance", "geometry", "spatial", "existence", "functionality")
@@ -319,18 +319,18 @@ def scored(reply: Reply) -> tuple[bool, bool, float, float]:
     given, right = cleaned(reply.given), [cleaned(reply.right)]
     em, em_r = match(given, right)
     if em or (em_r and is_yes_or_no(right)):
-        return em, em_r, MOST_SCORE, MOST_SCORE
+        return em, em_r, MAX_SCORE, MAX_SCORE
     if reply.score is not None:
         return em, em_r, reply.score, reply.score
-    return em, em_r, LEAST_SCORE, MOST_SCORE
+    return em, em_r, MIN_SCORE, MAX_SCORE
 
 
 def _share(scores: Float64Array | Sequence[float]) -> float:
-    return float((np.mean(scores) - LEAST_SCORE) / (MOST_SCORE - LEAST_SCORE))
+    return float((np.mean(scores) - MIN_SCORE) / (MAX_SCORE - MIN_SCORE))
 
 
 _NUMBER = re.compile(r"\d+")
-MOST_READ = 8000  # characters of a reply
+MAX_READ = 8000  # characters of a reply
 
 Key = tuple[str, str]  # of a question: its scene, and its text in lower case
 
@@ -371,8 +371,8 @@ def judge_requests(replies: Mapping[Key, Reply], config: LanguageConfig) -> dict
 def judged(replies: Mapping[Key, Reply], model: LanguageModel, config: LanguageConfig) -> Judged:
     """The answers, with judge scores filled in."""
     requests = judge_requests(replies, config)
-    said = model.ask_all(list(requests.values()))
-    scores = {key: score_of(reply) for key, reply in zip(requests, said, strict=True)}
+    as_value = model.ask_all(list(requests.values()))
+    scores = {key: score_of(reply) for key, reply in zip(requests, as_value, strict=True)}
     known = {key: replace(replies[key], score=score) for key, score in scores.items() if score is not None}
     return Judged({**replies, **known}, config.text_model, len(requests), len(requests) - len(known))
 
@@ -383,12 +383,12 @@ def score_of(reply: ModelReply) -> float | None:
     >>> score_of(ModelReply("Score: 4")), score_of(ModelReply("10")), score_of(ModelReply("good"))
     (4.0, None, None)
     """
-    found = None if reply.failure else _NUMBER.search(reply.text[:MOST_READ])
+    found = None if reply.failure else _NUMBER.search(reply.text[:MAX_READ])
     score = float(found[0][:9]) if found else 0.0
-    return score if LEAST_SCORE <= score <= MOST_SCORE else None
+    return score if MIN_SCORE <= score <= MAX_SCORE else None
 
 
-NO_JUDGE = (
+JUDGE_HINT = (
     "ranges are the minimum and maximum over unscored answers; pass a "
     "language model with --judge, or give each answer its 'score', 1 to 5"
 )
@@ -436,13 +436,13 @@ def answered_table(answered: Answered) -> Table:
     is_open = any(one.least < one.most for one in answered.numbers)
     rows = tuple(TableRow(one.name, (Cell(_shown_share(one)), Cell(f"{one.n:,}"))) for one in answered.numbers)
     caption = "Beacon3D's grounding." if answered.kind == "grounding" else "Beacon3D's question answering."
-    notes = [_what_was_judged(answered.judged)] if answered.judged is not None else []
+    notes = [_judge_summary(answered.judged)] if answered.judged is not None else []
     if is_open and answered.judged is None:
-        notes.append(NO_JUDGE)
+        notes.append(JUDGE_HINT)
     return Table("beacon3d", caption, "number", ("%", "of"), rows, tuple(notes))
 
 
-def _what_was_judged(judged: Judged) -> str:
+def _judge_summary(judged: Judged) -> str:
     model, asked = printable(judged.model, 100), counted(judged.n_asked, "answer")
     line = f"judge: {model}, asked for {asked} that match no right one, with a prompt of this program's own"
     if not judged.n_open:

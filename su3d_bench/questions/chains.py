@@ -26,33 +26,33 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import gap_m
+from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES
 from su3d_bench.questions.generator import TWICE, generate, is_flat
 from su3d_bench.questions.model import KINDS, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
-from su3d_bench.questions.sight import COLOURS, SHAPES, SIZES
 
 INSTANCE, _, PROPERTY, RELATIVE = KINDS
 FORMS = SHAPES | {word for more, less, _ in SIZES for word in (more, less) if word}
 
 
-def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, most_objects: int | None = None) -> QueryTruth:
-    """The text chains of at most ``most_objects`` objects of a scene, over its ground-truth instances."""
+def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, max_objects: int | None = None) -> QueryTruth:
+    """The text chains of at most ``max_objects`` objects of a scene, over its ground-truth instances."""
     owner = truth.instance.astype(np.int64)
     owner[owner <= 0] = -1
-    cases = chains_of(generate(scene, objects), objects, most_objects)
+    cases = chains_of(generate(scene, objects), objects, max_objects)
     source = f"chains made from {truth.source}"
     return QueryTruth(truth.points, owner, cases, truth.variant, source, truth.labels.space)
 
 
 def chains_of(
-    questions: Sequence[Question], objects: SceneMap, most_objects: int | None = None
+    questions: Sequence[Question], objects: SceneMap, max_objects: int | None = None
 ) -> tuple[ChainedText, ...]:
     """All distinct texts of the chains, in the order of the objects.
 
     Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
     """
     cases: dict[str, ChainedText] = {}
-    for number, (_, chains) in enumerate(islice(_chains(questions, objects), most_objects)):
+    for number, (_, chains) in enumerate(islice(_chains(questions, objects), max_objects)):
         for k, chain in enumerate(chains):
             for step, one in enumerate(chain):
                 known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
@@ -99,23 +99,23 @@ def _tags(question: Question) -> frozenset[str]:
     return frozenset(("class", "geometry" if is_form else "appearance"))
 
 
-TALLER = 1.5  # ours: times as high, from which anybody says so
+MIN_HEIGHT_RATIO = 1.5  # ours: times as high, from which anybody says so
 LEAD_M, FAR_M = 0.5, 1.5  # ours: by how much the closer one leads; how far away is surely not next to it
-MOST_PLAIN = 3  # words of a text that needs no quotation marks in a question
-MOST_WAYS = 4  # of one template about one object
+MAX_UNQUOTED_WORDS = 3  # words of a text that needs no quotation marks in a question
+MAX_PER_TEMPLATE = 4  # of one template about one object
 
 
 @dataclass(frozen=True)
-class MadeQuestion:
-    """A question of an object; ``told`` are the words on which the answer rests: a text with them gives it away."""
+class GeneratedQuestionRecord:
+    """A question of an object; ``hint`` are the words on which the answer rests: a text with them gives it away."""
 
     text: str
     answer: str
     tag: str
-    told: str
+    hint: str
 
 
-def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) -> tuple[dict[str, Any], ...]:
+def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -> tuple[dict[str, Any], ...]:
     """The classes of a scene in the form of ``metadata_*_grounding.json`` and of ``metadata_*_qa.json``.
 
     Ids are one less than here, as in ScanNet. Objects of which fewer than three questions can be asked are in neither.
@@ -127,7 +127,7 @@ def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) 
     for thing, chains in _chains(questions, objects):
         texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
         made = _drawn(thing, texts, objects)
-        if len(made) < CHAINS_EACH or (most_objects is not None and sum(map(len, asked.values())) == most_objects):
+        if len(made) < CHAINS_EACH or (max_objects is not None and sum(map(len, asked.values())) == max_objects):
             continue
         known = {word for text in texts for word in words(text)}
         grounding.setdefault(thing.name, {})[key] = {
@@ -135,7 +135,7 @@ def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) 
         }
         rows: list[dict[str, Any]] = [{"question": one.text, "answer": one.answer, "tag": one.tag} for one in made]
         for row, one in zip(rows, made, strict=True):
-            row["extra_knowledge"] = int(not set(words(one.told)) <= known)
+            row["extra_knowledge"] = int(not set(words(one.hint)) <= known)
         asked.setdefault(thing.name, {})[key] = {"grounding_text": texts, "qa": rows}
     return grounding, asked
 
@@ -158,11 +158,11 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[MadeQuestion]:
+def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[GeneratedQuestionRecord]:
     """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
     # a text that holds the words on which an answer rests gives it away
     asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
-    every = [one for one, text in asked if not set(words(one.told)) & set(words(text))]
+    every = [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
     turn = Counter[str]()
     ranked = []
     unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
@@ -170,9 +170,9 @@ def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[Ma
         turn[one.tag] += 1
         ranked.append((turn[one.tag], _digest(f"{thing.id} {one.tag}"), one))
     ranked.sort(key=lambda entry: entry[:2])
-    drawn: dict[tuple[str, str], MadeQuestion] = {}
+    drawn: dict[tuple[str, str], GeneratedQuestionRecord] = {}
     for _, _, one in ranked:
-        drawn.setdefault((one.tag, one.told), one)
+        drawn.setdefault((one.tag, one.hint), one)
     return list(drawn.values())[:CHAINS_EACH]
 
 
@@ -180,18 +180,18 @@ def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
     """All questions about an object referred to by an unambiguous text."""
-    it = f"the {text}" if len(text.split()) <= MOST_PLAIN else f"'the {text}'"
+    it = f"the {text}" if len(text.split()) <= MAX_UNQUOTED_WORDS else f"'the {text}'"
     colours = sorted(set(thing.caption.split()) & COLOURS)
     if len(colours) == 1:
-        yield MadeQuestion(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
+        yield GeneratedQuestionRecord(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
         named = sorted(COLOURS - set(colours))
         other = named[_digest(it)[0] % len(named)]
         for word, answer in ((colours[0], "Yes"), (other, "No")):
-            yield MadeQuestion(f"Is {it} {word}?", answer, "appearance", colours[0])
+            yield GeneratedQuestionRecord(f"Is {it} {word}?", answer, "appearance", colours[0])
     alone = [other for other in objects.objects if _is_alone(other, objects) and other.id != thing.id]
-    yield from _borne(thing, it, objects)
+    yield from _supported_objects(thing, it, objects)
     yield from _measured(thing, it, alone)
     yield from _beside(thing, it, alone, objects)
     yield from _existing(thing, it, objects)
@@ -199,7 +199,7 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
 
 def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
     """Whether an object is the only one of its name and clearly visible."""
-    return thing.is_asked and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
+    return thing.is_query_target and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
 
 
 def _called(name: str, objects: SceneMap) -> list[MapObject]:
@@ -208,24 +208,24 @@ def _called(name: str, objects: SceneMap) -> list[MapObject]:
     return [other for other in objects.objects if wanted <= set(words(other.name)) or set(words(other.name)) <= wanted]
 
 
-def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+def _supported_objects(thing: MapObject, it: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
     """The supporting object, if there is exactly one."""
     others = [other for other in objects.objects if other.id != thing.id]
     under = [other for other in others if objects.holds("on", thing, other)]
     is_sure = not any(objects.is_doubtful("on", thing, other) for other in others)
-    if len(under) == 1 and is_sure and under[0].is_asked:
-        yield MadeQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
+    if len(under) == 1 and is_sure and under[0].is_query_target:
+        yield GeneratedQuestionRecord(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
 
 
-def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[MadeQuestion]:
+def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[GeneratedQuestionRecord]:
     """Height and size comparisons with a clear margin, between completely observed objects."""
     ways = 0
     for other in sorted(alone, key=lambda other: _digest(f"{it} {other.name}")):
-        if ways == MOST_WAYS or not (thing.is_whole and other.is_whole):
+        if ways == MAX_PER_TEMPLATE or not (thing.is_whole and other.is_whole):
             return
         high, low = float(thing.size[2]), float(other.size[2])
         volumes = float(np.prod(thing.size)), float(np.prod(other.size))
-        if max(high, low) >= TALLER * min(high, low):
+        if max(high, low) >= MIN_HEIGHT_RATIO * min(high, low):
             answer = "Taller" if high > low else "Shorter"
             text = f"Is {it} taller or shorter than the {other.name}?"
         elif max(volumes) >= TWICE * min(volumes) and not (is_flat(thing) or is_flat(other)):
@@ -234,10 +234,12 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator
         else:
             continue
         ways += 1
-        yield MadeQuestion(text, answer, "geometry", f"{answer} {other.name}")
+        yield GeneratedQuestionRecord(text, answer, "geometry", f"{answer} {other.name}")
 
 
-def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[MadeQuestion]:
+def _beside(
+    thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap
+) -> Iterator[GeneratedQuestionRecord]:
     """Whether an object is next to another, and which of two is closer by a clear margin."""
     for other in alone:
         if objects.is_doubtful("next to", thing, other):
@@ -245,17 +247,17 @@ def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Scen
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
             answer = "Yes" if is_next else "No"
-            yield MadeQuestion(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
+            yield GeneratedQuestionRecord(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
     ranked = sorted(alone, key=lambda other: gap_m(thing.box, other.box))
-    for near, far in zip(ranked[:MOST_WAYS], reversed(ranked), strict=False):
+    for near, far in zip(ranked[:MAX_PER_TEMPLATE], reversed(ranked), strict=False):
         if gap_m(thing.box, far.box) - gap_m(thing.box, near.box) < LEAD_M or near is far:
             continue
         first, second = sorted((near.name, far.name), key=lambda name: _digest(f"{it} {name}"))
         text = f"Which is closer to {it}, the {first} or the {second}?"
-        yield MadeQuestion(text, near.name.capitalize(), "spatial", near.name)
+        yield GeneratedQuestionRecord(text, near.name.capitalize(), "spatial", near.name)
 
 
-def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
     """Whether something of a name is next to an object; the answer is no where none is within reach."""
     names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
     ways = Counter[str]()
@@ -264,9 +266,9 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQues
         is_next = [objects.holds("next to", other, thing) for other in others]
         if any(objects.is_doubtful("next to", other, thing) for other in others):
             continue
-        plain = [other.is_asked for other, holds in zip(others, is_next, strict=True) if holds]
+        plain = [other.is_query_target for other, holds in zip(others, is_next, strict=True) if holds]
         is_far = all(gap_m(thing.box, other.box) > FAR_M for other in others)
         answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
-        if answer and ways[answer] < MOST_WAYS:
+        if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1
-            yield MadeQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)
+            yield GeneratedQuestionRecord(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)

@@ -23,22 +23,22 @@ from su3d_bench.core.english import is_countable, is_plural, plural, with_articl
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.questions.presence import SAMPLINGS
-from su3d_bench.metrics.questions.score import AskedThing
+from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
 from su3d_bench.questions.generator import extreme_of, is_flat
 from su3d_bench.questions.model import Answer
-from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, meant_by, plain_name
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
 MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # by which the closest leads: metres, and of the longest side of what is compared
 LEVEL_M = 0.75  # things whose middles differ more in height are not compared by distance
 FAR_M = 1.5  # of what is asked about with the answer no
-FEW_BETWEEN = 2  # more things between two are no answer that one would give
+MAX_BETWEEN = 2  # more things between two are no answer that one would give
 BETWEEN_M = 2.5  # nobody looks farther for what is between
-MOST_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
+MAX_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess is right within this
-HEAPED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated by the row or the pile
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated by the row or the pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 CENTRES = ", measured between centres"
 Random = np.random.Generator
@@ -79,8 +79,8 @@ def generate_questions(
     for kind, drafts in _Drafts(scene, random, with_sides=eye is not None).of_kinds().items():
         for draft in _drawn(drafts, n_each, random):
             answer = solver.answer(draft.text)
-            is_seen = all(scene.by_id(object_id).is_asked for object_id in answer.object_ids)
-            if answer.is_settled and is_seen:
+            is_seen = all(scene.by_id(object_id).is_query_target for object_id in answer.object_ids)
+            if answer.is_decided and is_seen:
                 questions.append(GeneratedQuestion(draft.text, kind, answer, draft.by_chance, draft.by_name))
     return tuple(questions)
 
@@ -108,12 +108,12 @@ class _Drafts:
         self._random = random
         self._with_sides = with_sides
         self._all = [thing for thing in scene.objects if thing.name and not is_room_surface(thing.name)]
-        hidden = {thing.name for thing in self._all if not thing.is_asked}
+        hidden = {thing.name for thing in self._all if not thing.is_query_target}
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
         single = [one for one in self._things if self._n_of[one.name] == 1]
         single = [one for one in single if not is_plural(one.name) and not one.is_cut]
-        self._single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
+        self._single = [single[k] for k in sorted(random.permutation(len(single))[:MAX_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
         kinds: dict[str, Callable[[], Iterator[_Draft]]] = {
@@ -161,9 +161,9 @@ class _Drafts:
 
     def _counts(self) -> Iterator[_Draft]:
         """Counts for every name, and for equally many absent names."""
-        counted = {name: len(meant_by(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
+        counted = {name: len(noun_objects(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
         absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
-        absent = [name for name in absent if _is_counted(name) and not meant_by(name, self._scene).objects]
+        absent = [name for name in absent if _is_counted(name) and not noun_objects(name, self._scene).objects]
         counted |= {absent[k]: 0 for k in self._random.permutation(len(absent))[: max(1, len(counted) // 4)]}
         of_value = Counter(counted.values())
         for name, n in counted.items():
@@ -191,14 +191,14 @@ class _Drafts:
             between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
             is_plain = all(self._scene.are_in_one_place(thing, a, b) and not thing.is_cut for thing in between)
             is_plain &= not any(self._scene.may_be_between(thing, a, b) for thing in self._all if thing not in between)
-            if 0 < len(between) <= FEW_BETWEEN and is_plain:
+            if 0 < len(between) <= MAX_BETWEEN and is_plain:
                 share = 1 / math.comb(len(self._all), len(between))
                 yield _Draft(f"What is between the {a.name} and the {b.name}?", share, share)
 
     def _what(self, relation: Relation) -> Iterator[_Draft]:
         for reference in self._single:
             pairs = [(thing, reference) for thing in self._all if thing is not reference]
-            if not all(self._scene.is_said(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
+            if not all(self._scene.is_usual(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
                 continue
             held = [pair for pair in pairs if self._holds(relation, *pair)]
             if held and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
@@ -216,15 +216,15 @@ class _Drafts:
                 for name in self._n_of
                 if name != reference.name
             }
-            is_held = {name: any(self._holds(relation, *pair) for pair in pairs) for name, pairs in pairs_of.items()}
+            is_locked = {name: any(self._holds(relation, *pair) for pair in pairs) for name, pairs in pairs_of.items()}
             for name, pairs in pairs_of.items():
                 is_far = all(gap_m(a.box, b.box) > FAR_M for a, b in pairs)
                 is_sure = not any(self._scene.is_doubtful(relation, *pair) for pair in pairs)
-                is_sure &= all(self._scene.is_said(relation, *pair) for pair in pairs)
-                if is_sure and (is_held[name] or (is_far and name in subjects and any(is_held.values()))):
+                is_sure &= all(self._scene.is_usual(relation, *pair) for pair in pairs)
+                if is_sure and (is_locked[name] or (is_far and name in subjects and any(is_locked.values()))):
                     verb, noun = ("Are", name) if is_plural(name) else ("Is", with_article(name))
                     text = f"{verb} there {noun} {relation} the {reference.name}?"
-                    yield _Draft(text, 0.5, 0.5, "yes" if is_held[name] else "no")
+                    yield _Draft(text, 0.5, 0.5, "yes" if is_locked[name] else "no")
 
     def _holds(self, relation: Relation, a: MapObject, b: MapObject) -> bool:
         """Whether people would say so: a cushion is within the box of a sofa, and on it."""
@@ -238,7 +238,7 @@ class _Drafts:
 
 
 def _is_counted(name: str) -> bool:
-    return is_countable(name) and words(name) not in HEAPED
+    return is_countable(name) and words(name) not in PILED
 
 
 def _away_m(a: MapObject, b: MapObject) -> float:
@@ -269,21 +269,21 @@ Rooms = Sequence[Sequence[str]]
 
 def presence_questions(
     scene: str, truth: GroundTruth, objects: SceneMap, n_things: int, rooms: Rooms
-) -> tuple[AskedThing, ...]:
+) -> tuple[PresenceQuery, ...]:
     """At most ``n_things`` things that a scene has, each with one that it has not, under every sampling.
 
     Asked for is what a frame shows plainly; absent is what is called like nothing that is there, seen or not. ``rooms``
     list what stands in each of some rooms.
     """
-    seen = {thing.name for thing in objects.objects if thing.is_asked}
+    seen = {thing.name for thing in objects.objects if thing.is_query_target}
     there = _by_digest(scene, (name for name in seen if _is_name(name)))[:n_things]
     absent = absent_names(truth, objects)
     answer = []
     for sampling in SAMPLINGS:
         for name, other in drawn(scene, sampling, there, absent, rooms):
-            answer.append(AskedThing(name, sampling, is_there=True))
+            answer.append(PresenceQuery(name, sampling, is_there=True))
             if other is not None:
-                answer.append(AskedThing(other, sampling, is_there=False))
+                answer.append(PresenceQuery(other, sampling, is_there=False))
     return tuple(answer)
 
 

@@ -21,9 +21,9 @@ import numpy as np
 from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
-from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
-from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, meant_by
-from su3d_bench.questions.sight import COLOURS, LEAD, SIZES, Looks, measure_of
+from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
+from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: what more objects answer asks for nothing
@@ -56,7 +56,7 @@ def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tupl
     made = []
     for (kind, text, name), ids in right.items():
         named = set(_called(objects, name)) if name else set[int]()
-        is_plain = all(objects.by_id(object_id).is_asked for object_id in ids | named)
+        is_plain = all(objects.by_id(object_id).is_query_target for object_id in ids | named)
         if len(ids) <= limit and is_plain and text not in doubtful:
             own_kind = BY_NAME.get(kind, kind) if named == ids else kind
             made.append(new_question(scene, own_kind, text, tuple(ids), SOURCE))
@@ -66,14 +66,14 @@ def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tupl
 def chosen(questions: Sequence[Question], per_kind: int | None) -> tuple[Question, ...]:
     """At most ``per_kind`` questions of each kind by a digest of their text, sorted by kind and text."""
     drawn: list[Question] = []
-    for kind in MADE_KINDS:
+    for kind in GENERATED_KINDS:
         of_kind = [question for question in questions if question.kind == kind]
         of_kind.sort(key=lambda question: hashlib.sha256(question.text.encode()).digest())
         drawn += sorted(of_kind[:per_kind], key=lambda question: question.text)
     return tuple(drawn)
 
 
-def right_by_name(question: Question, objects: SceneMap) -> float:
+def accuracy_by_name(question: Question, objects: SceneMap) -> float:
     """How often a system is right that knows what each object is called and nothing else; 0 without known answers.
 
     It takes one of those that the question names, and where it names none (a use) it knows which serve.
@@ -113,7 +113,7 @@ def _texts(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def _ids(objects: SceneMap, name: str) -> tuple[int, ...]:
-    return tuple(thing.id for thing in meant_by(name, objects).objects)
+    return tuple(thing.id for thing in noun_objects(name, objects).objects)
 
 
 def _called(objects: SceneMap, name: str) -> tuple[int, ...]:
@@ -185,7 +185,7 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
             yield from _measured(name, known)
 
 
-def _none_is_more(word: str, known: Sequence[tuple[MapObject, Looks]]) -> bool:
+def _none_is_more(word: str, known: Sequence[tuple[MapObject, Appearance]]) -> bool:
     """Whether nothing that is not long (tall) by itself is as long (high) as what is; true of any other word."""
     axis = {"long": 0, "tall": 2}.get(word)
     if axis is None:
@@ -194,7 +194,7 @@ def _none_is_more(word: str, known: Sequence[tuple[MapObject, Looks]]) -> bool:
     return all(LEAD * float(looks.sides[axis]) <= least for _, looks in known if word not in looks.words)
 
 
-def _measured(name: str, known: Sequence[tuple[MapObject, Looks]]) -> Iterator[_Asked]:
+def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Iterator[_Asked]:
     """The one that is large, small, long or tall beside every other of its name."""
     if len(known) < 2 or len({looks.is_flat for _, looks in known}) > 1:
         return
@@ -226,15 +226,17 @@ def _relations(objects: SceneMap) -> Iterator[_Asked]:
         for a, b in np.argwhere(held | doubtful).tolist():
             subject, other = things[a], things[b]
             text = f"{subject.name} {relation} {with_article(other.name)}"
-            if subject.name != other.name and objects.is_said(relation, subject, other):
-                is_sure = not doubtful[a, b] and other.is_asked
+            if subject.name != other.name and objects.is_usual(relation, subject, other):
+                is_sure = not doubtful[a, b] and other.is_query_target
                 yield _Asked("relative", text, (subject.id,) if is_sure else (), subject.name)
 
 
 def _between(objects: SceneMap) -> Iterator[_Asked]:
     """What stands between two things of which the scene has one each, on one level with both."""
     n_of = Counter(thing.name for thing in objects.objects)
-    single = [thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_asked and not thing.is_cut]
+    single = [
+        thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_query_target and not thing.is_cut
+    ]
     for first, second in combinations(single, 2):
         if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
             continue

@@ -21,9 +21,9 @@ from su3d_bench.opensu3d.tracking import cosine
 KINDS = ("instance", "affordance", "property", "relative")
 # Properties and relations that nothing else of the name lacks: the name alone gives the answer.
 BY_NAME = {"property": "property by name", "relative": "relative by name"}
-MADE_KINDS = (*KINDS, *BY_NAME.values())
+GENERATED_KINDS = (*KINDS, *BY_NAME.values())
 REASONING = "reasoning"
-ALL_KINDS = (*MADE_KINDS, REASONING)
+ALL_KINDS = (*GENERATED_KINDS, REASONING)
 
 
 def question_id(scene: str, kind: str, text: str) -> str:
@@ -74,7 +74,7 @@ class Answer:
     """``text`` says it; ``object_ids`` are the answer, ``reference_ids`` what it was held against.
 
     ``value`` is the number of a count, the metres of a distance, the truth of a yes-no question, else None; ``notes``
-    say what was assumed. Where ``is_settled`` is false, ``text`` says why.
+    say what was assumed. Where ``is_decided`` is false, ``text`` says why.
     """
 
     text: str
@@ -82,11 +82,11 @@ class Answer:
     reference_ids: tuple[int, ...] = ()
     value: float | int | bool | None = None
     kind: str = ""
-    is_settled: bool = True
+    is_decided: bool = True
     notes: tuple[str, ...] = ()
     solver: Literal["built-in", "llm"] = "built-in"
 
-    def said(self, like: float | int | bool) -> float | int | bool | None:
+    def as_value(self, like: float | int | bool) -> float | int | bool | None:
         """What it says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
         value = self.value
         if value is None and isinstance(like, bool):
@@ -102,12 +102,12 @@ class Answer:
         return {"answer": fields.pop("text"), **fields}
 
 
-def unsettled(reason: str, notes: tuple[str, ...] = ()) -> Answer:
+def undecided(reason: str, notes: tuple[str, ...] = ()) -> Answer:
     """The answer if geometry does not settle the question."""
-    return Answer(f"I cannot settle this: {reason}", notes=notes, is_settled=False)
+    return Answer(f"I cannot settle this: {reason}", notes=notes, is_decided=False)
 
 
-LEAST_SHARE = 0.6  # similarity_thresh of ConceptFusion's examples/demo_text_query.py (fa4e95b)
+MIN_SHARE = 0.6  # similarity_thresh of ConceptFusion's examples/demo_text_query.py (fa4e95b)
 BLOCK_ROWS = 65536  # of features that are looked at together: the table may be larger than memory
 
 
@@ -138,11 +138,11 @@ def rank_all(instances: Instances, texts: Sequence[str], encoder: Encoder) -> tu
     return tuple(rankings)
 
 
-def points_found(dense: DenseFeatures, texts: Sequence[str], encoder: Encoder) -> Instances:
+def retrieved_points(dense: DenseFeatures, texts: Sequence[str], encoder: Encoder) -> Instances:
     """An instance a text, of the points that ConceptFusion's own program shows for it.
 
     Similarities run from that of the least similar point, 0, to that of the most similar, 1; found is what reaches
-    ``LEAST_SHARE`` of that. Points without a feature have no part; where all are equally similar nothing is found.
+    ``MIN_SHARE`` of that. Points without a feature have no part; where all are equally similar nothing is found.
     """
     encoded = _encoded(texts, encoder, dense.features.shape[1] if len(dense.points) else None)
     low, high = np.full(len(texts), np.inf), np.full(len(texts), -np.inf)
@@ -150,7 +150,7 @@ def points_found(dense: DenseFeatures, texts: Sequence[str], encoder: Encoder) -
         low, high = np.minimum(low, found.min(axis=0)), np.maximum(high, found.max(axis=0))
     members: list[list[Int64Array]] = [[] for _ in texts]
     for rows, found in _similarities(dense, encoded):
-        is_found = (found - low >= LEAST_SHARE * (high - low)) & (high > low)
+        is_found = (found - low >= MIN_SHARE * (high - low)) & (high > low)
         for k, own in enumerate(members):
             own.append(rows[is_found[:, k]])
     return Instances.of(dense.points, [np.concatenate([np.zeros(0, np.int64), *own]) for own in members])

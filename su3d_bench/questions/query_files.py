@@ -30,10 +30,10 @@ from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
-MOST_OBJECTS_ID = 2**31 - 1
+MAX_OBJECTS_ID = 2**31 - 1
 ADVICE = "pass a TOML or CSV query file, e.g. from su3d-bench query make --out queries.toml"
-MOST_BYTES = 16 << 20  # some hundred thousand queries
-MOST_CHARACTERS = 20_000  # of one text
+MAX_BYTES = 16 << 20  # some hundred thousand queries
+MAX_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"
 
 
@@ -43,7 +43,7 @@ def is_text(value: str) -> bool:
     >>> is_text("\u202eright to left \U0001f600"), is_text("\x1b[2J")
     (True, False)
     """
-    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(sign) in ("Cc", "Cs") for sign in value)
+    return len(value) <= MAX_CHARACTERS and not any(unicodedata.category(sign) in ("Cc", "Cs") for sign in value)
 
 
 def only_words(text: str) -> str:
@@ -53,7 +53,7 @@ def only_words(text: str) -> str:
 
 
 Words = Annotated[str, AfterValidator(only_words)]
-ObjectId = Annotated[int, Field(ge=0, lt=MOST_OBJECTS_ID)]
+ObjectId = Annotated[int, Field(ge=0, lt=MAX_OBJECTS_ID)]
 
 
 def validated(kind: Any, content: Any, where: str) -> Any:
@@ -79,7 +79,7 @@ class QueryRow(BaseModel):
 
     scene: Words
     text: Words
-    objects: tuple[Annotated[int, Field(gt=0, le=MOST_OBJECTS_ID, strict=True)], ...]
+    objects: tuple[Annotated[int, Field(gt=0, le=MAX_OBJECTS_ID, strict=True)], ...]
     kind: Words | Literal[""] = ""
     source: Words | Literal[""] = ""
 
@@ -93,7 +93,7 @@ class _Queries(BaseModel):
 def read_query_rows(path: Path) -> list[tuple[str, QueryRow]]:
     """All queries of a file, in order, with their location for messages."""
     where = printable(str(path), 200)
-    text = read_text(path, where, ADVICE, MOST_BYTES)
+    text = read_text(path, where, ADVICE, MAX_BYTES)
     rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
     for at, row in rows:
         if len(set(row.objects)) != len(row.objects):
@@ -193,8 +193,8 @@ OTHERS = "others"
 VIEW_WORDS = frozenset(
     ("front", "behind", "back", "right", "left", "facing", "leftmost", "rightmost", "looking", "across")
 )
-MOST_EASY = 2  # objects of the class of the one that is meant, itself among them
-MOST_TOKENS = 24  # of a sentence that is scored: ``--max-seq-len``
+MAX_EASY_OBJECTS = 2  # objects of the class of the one that is meant, itself among them
+MAX_TOKENS = 24  # of a sentence that is scored: ``--max-seq-len``
 ClassOfName = Callable[[str], str | None]  # the class of NYU40 that ScanNet's table gives a raw category
 
 
@@ -241,9 +241,9 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
         raise DataError(f"{at}: 'stimulus_id' {fault}; found {printable(stimulus, 60)}")
     n = int(parts[2])
     words = [] if tokens is None else _words(tokens, at)
-    if (mentions or "True").strip() not in ("True", "true", "1") or len(words) > MOST_TOKENS or n < 2:
+    if (mentions or "True").strip() not in ("True", "true", "1") or len(words) > MAX_TOKENS or n < 2:
         return (LEFT_OUT,)
-    return (EASY if n <= MOST_EASY else HARD, BY_VIEW if VIEW_WORDS.intersection(words) else BY_ANY_VIEW)
+    return (EASY if n <= MAX_EASY_OBJECTS else HARD, BY_VIEW if VIEW_WORDS.intersection(words) else BY_ANY_VIEW)
 
 
 def _words(text: str, at: str) -> list[str]:
@@ -273,7 +273,7 @@ def grouped_by_truth(queries: Iterable[TextQuery], truth: GroundTruth) -> tuple[
         words = re.findall(r"\w+", query.text.lower())
         ours = (
             UNIQUE if n == 1 else MULTIPLE,
-            EASY if n <= MOST_EASY else HARD,
+            EASY if n <= MAX_EASY_OBJECTS else HARD,
             BY_VIEW if VIEW_WORDS.intersection(words) else BY_ANY_VIEW,
         )
         for pair, group in zip(PAIRS, ours, strict=True):
@@ -294,10 +294,10 @@ COLUMN = "question_id"  # others are for the reader alone
 _ID = re.compile(r"[0-9a-f]{12}")
 
 
-def read_left_out(path: Path) -> frozenset[str]:
+def read_excluded_ids(path: Path) -> frozenset[str]:
     """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
     where = printable(str(path), 200)
-    text = read_text(path, where, "pass a CSV file written by sheets score --disputed", MOST_BYTES)
+    text = read_text(path, where, "pass a CSV file written by sheets score --disputed", MAX_BYTES)
     rows = csv_rows(text, where, ",;\t")
     header = [word.strip() for word in rows[0]] if rows else []
     if header.count(COLUMN) != 1:

@@ -46,7 +46,7 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
     A query without a kind is one of kind instance. The same question of the same scene may stand there once.
     """
     if is_foreign(path):
-        return _each_once(read_foreign(path))
+        return _each_once(read_external_questions(path))
     questions: dict[str, Question] = {}
     for at, row in query_files.read_query_rows(path):
         kind = row.kind or KINDS[0]
@@ -145,7 +145,7 @@ def csv_text(questions: Sequence[Question]) -> str:
 
 
 DATASET = "scannet"
-MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
+MAX_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
 ADVICE = (
     "pass ScanRefer_filtered_*.json, nr3d.csv or sr3d.csv, SQA3D's v1_balanced_questions_*.json or Beacon3D's "
@@ -200,10 +200,10 @@ def is_foreign(path: Path) -> bool:
     return len(set(NR3D_COLUMNS) & {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}) > 1
 
 
-def read_foreign(path: Path) -> tuple[Question, ...]:
+def read_external_questions(path: Path) -> tuple[Question, ...]:
     """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
     where = printable(str(path), 200)
-    text = read_text(path, where, ADVICE, MOST_BYTES)
+    text = read_text(path, where, ADVICE, MAX_BYTES)
     if path.suffix.lower() == ".csv":
         return tuple(_nr3d(text, where))
     content = parsed_json(text, where, ADVICE)
@@ -216,12 +216,12 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
     raise DataError(f"{where}: contains no readable questions; {ADVICE}")
 
 
-def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
+def read_external_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     """The sentences of each scene that name an object, each as often as the file has it; Beacon3D's in their chains."""
     if path.suffix.lower() == ".json" and kind_of_metadata(content := read_metadata(path)) == "grounding":
         return dict(chains_of(content, printable(str(path), 200)).cases)
     queries_of_scene: dict[str, list[TextQuery]] = {}
-    for question in read_foreign(path):
+    for question in read_external_questions(path):
         if not question.is_known:
             raise DataError(
                 f"{printable(str(path), 200)}: {question.source} has no answer objects and cannot be scored"
@@ -280,7 +280,7 @@ def _replies(path: Path) -> dict[str, str]:
     if beside == path or not beside.is_file():
         return {}
     where = printable(str(beside), 200)
-    content = parsed_json(read_text(beside, where, ADVICE, MOST_BYTES), where, ADVICE)
+    content = parsed_json(read_text(beside, where, ADVICE, MAX_BYTES), where, ADVICE)
     rows = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(rows, list):
         raise DataError(f"{where}: missing key 'annotations'")

@@ -46,7 +46,7 @@ class FilterConfig(BaseModel):
     max_map_fraction: float = Field(default=_OF_IMAGES.max_box_fraction, gt=0, le=1)
 
 
-def undesired(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
+def exclusion_reasons(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
     """The reason for excluding each instance under its label n' in ``names``; '' if not excluded."""
     reasons = []
     for name, fraction in zip(names, _map_fractions(instances).tolist(), strict=True):
@@ -72,8 +72,8 @@ def _map_fractions(instances: Instances) -> Float64Array:
     return answer
 
 
-MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
-MOST_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
+MAX_NAMES = 5  # the paper's m: n' comes from the names of so many best views
+MAX_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
 Source = Literal["model", "vote", "label"]
 
 
@@ -148,7 +148,7 @@ class ModelRefiner:
                 config.text_model,
                 f"{REFINE}. {REFINE_FORM}",
                 list_of_names(top.names),
-                max_answer_tokens=min(config.max_answer_tokens, MOST_ANSWER_TOKENS),
+                max_answer_tokens=min(config.max_answer_tokens, MAX_ANSWER_TOKENS),
                 temperature=config.temperature,
                 seed=config.seed,
             )
@@ -184,9 +184,9 @@ def voted_names(instances: Instances) -> RefinedNames | None:
     """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
     if instances.view_names is None or instances.view_scores is None:
         return None
-    names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
-    left_out = undesired(instances, names, FilterConfig())
-    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model", left_out)
+    names = tuple(vote(top).name for top in top_names(instances, MAX_NAMES))
+    left_out = exclusion_reasons(instances, names, FilterConfig())
+    return RefinedNames(names, f"the vote of the names of {MAX_NAMES} views, no language model", left_out)
 
 
 class NameRecord(BaseModel):
@@ -242,7 +242,7 @@ def records_of(
 ) -> NameRecords:
     """The records of one map, an instance each; what is large background under its label n' is left out."""
     ids = instances.ids.tolist() if len(instances.ids) else range(len(instances))
-    left_out = undesired(instances, [name.name for name in refined], config)
+    left_out = exclusion_reasons(instances, [name.name for name in refined], config)
     names = tuple(
         NameRecord(
             id=one_id,

@@ -21,16 +21,16 @@ from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
 from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
-from su3d_bench.questions.sight import WITHOUT_COLOUR, Looks, Sight, instance_rows, looks_of
+from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
 
-MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
+MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 
 
 @dataclass(frozen=True, eq=False)
 class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
-    Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
+    Of a truth: ``is_query_target``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
     is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended;
     ``looks``, of a recording alone.
     """
@@ -41,10 +41,10 @@ class MapObject:
     centroid: Float64Array
     box: Float64Array
     row: int = -1
-    is_asked: bool = True
+    is_query_target: bool = True
     is_whole: bool = True
     is_cut: bool = False
-    looks: Looks | None = None
+    looks: Appearance | None = None
 
     @property
     def shown(self) -> str:
@@ -113,7 +113,7 @@ class SceneMap:
         return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
     @staticmethod
-    def is_said(relation: Relation, subject: MapObject, other: MapObject) -> bool:
+    def is_usual(relation: Relation, subject: MapObject, other: MapObject) -> bool:
         """Whether people speak so of such things: windows, blinds and vents are above whatever is in the room."""
         if relation not in ("above", "under"):
             return True
@@ -161,8 +161,8 @@ def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMa
         tuple(
             MapObject(
                 int(ids[row]),
-                printable(names[row], MOST_NAME),
-                printable(instances.captions[row], MOST_CAPTION),
+                printable(names[row], MAX_NAME),
+                printable(instances.captions[row], MAX_CAPTION),
                 centroids[row],
                 boxes[row],
                 int(row),
@@ -178,15 +178,15 @@ NearestName = Callable[[str, Sequence[str]], tuple[str, float]]
 
 ANYTHING = frozenset({"object", "thing", "item", "anything", "something", "everything", "one"})
 GATHERED = frozenset({"row", "pile", "stack", "heap"})  # of things of one name
-MOST_ADJECTIVES = 3
+MAX_ADJECTIVES = 3
 # Ours: by the embedded encoder other words of a thing reach 0.84 ("carpeting") to 0.93 ("armchair"), words of another
 # thing up to 0.72 ("wastebasket" for a basket).
-LEAST_LIKENESS = 0.8
+MIN_SIMILARITY = 0.8
 COLOUR_SPELLINGS = {"gray": "grey", "wood": "wooden"}
 
 
 @dataclass(frozen=True)
-class Meant:
+class NounMatch:
     """The objects that a noun means, in the map's order, and what must be said of it."""
 
     objects: tuple[MapObject, ...]
@@ -203,28 +203,28 @@ def _class_of_words() -> dict[Words, str]:
     return class_of
 
 
-def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> Meant:
+def noun_objects(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> NounMatch:
     """The objects that ``noun`` means; without relation words in it."""
     noun_words = words(noun)
     if not noun_words:
-        return Meant(())
+        return NounMatch(())
     if len(noun_words) == 1 and noun_words[0] in ANYTHING:
-        return Meant(tuple(thing for thing in scene.objects if not is_room_surface(thing.name)))
-    for n_adjectives in range(min(MOST_ADJECTIVES, len(noun_words) - 1) + 1):
+        return NounMatch(tuple(thing for thing in scene.objects if not is_room_surface(thing.name)))
+    for n_adjectives in range(min(MAX_ADJECTIVES, len(noun_words) - 1) + 1):
         adjectives, rest = noun_words[:n_adjectives], noun_words[n_adjectives:]
         named = _named(rest, scene.objects)
         held = tuple(thing for thing in named if _has(thing, adjectives))
         if held:
-            return Meant(held)
+            return NounMatch(held)
     if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
         # of which a map may know the single ones, or one of all
-        return meant_by(" ".join(noun_words[2:]), scene, nearest)
+        return noun_objects(" ".join(noun_words[2:]), scene, nearest)
     if noun_words in _class_of_words():
-        return Meant(())  # a word that is known, for a thing that is not there
+        return NounMatch(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)
 
 
-def meant_instead(noun: str, scene: SceneMap) -> str:
+def name_suggestion(noun: str, scene: SceneMap) -> str:
     """A clause ``; did you mean 'x'?`` for a noun that nobody knows and that is spelt nearly as a thing of the map."""
     noun_words = words(noun)
     if not noun_words or {noun_words, noun_words[-1:]} & (_class_of_words().keys() | groups().keys()):
@@ -269,16 +269,18 @@ def _has(thing: MapObject, adjectives: Words) -> bool:
     return all(COLOUR_SPELLINGS.get(word, word) in known or word in known for word in adjectives)
 
 
-def _by_encoder(noun: str, scene: SceneMap, nearest: NearestName | None) -> Meant:
+def _by_encoder(noun: str, scene: SceneMap, nearest: NearestName | None) -> NounMatch:
     names = sorted({thing.name for thing in scene.objects if thing.name and not is_room_surface(thing.name)})
     if nearest is None or not names:
-        return Meant(())
-    name, likeness = nearest(noun, names)
-    if likeness < LEAST_LIKENESS:
-        return Meant(())
+        return NounMatch(())
+    name, similarity = nearest(noun, names)
+    if similarity < MIN_SIMILARITY:
+        return NounMatch(())
     things = tuple(thing for thing in scene.objects if thing.name == name)
-    note = f"the map has no '{noun}'; taken for '{name}', the nearest name by the text encoder (cosine {likeness:.2f})"
-    return Meant(things, (note,))
+    note = (
+        f"the map has no '{noun}'; taken for '{name}', the nearest name by the text encoder (cosine {similarity:.2f})"
+    )
+    return NounMatch(things, (note,))
 
 
 def nearest_by(encoder: Encoder) -> NearestName:
@@ -286,9 +288,9 @@ def nearest_by(encoder: Encoder) -> NearestName:
 
     def nearest(noun: str, names: Sequence[str]) -> tuple[str, float]:
         features = encoder.encode_texts([noun, *names]).astype(np.float64)
-        likeness = np.einsum("nd,d->n", features[1:], features[0])
-        best = int(np.argmax(likeness))
-        return names[best], float(likeness[best])
+        similarity = np.einsum("nd,d->n", features[1:], features[0])
+        best = int(np.argmax(similarity))
+        return names[best], float(similarity[best])
 
     return nearest
 
@@ -316,12 +318,12 @@ def known_objects(
         if known is None or is_room_surface(known.name):
             continue
         sight = None if seen is None else seen.get(known.id)
-        is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
-        is_asked &= not any(name.endswith(f" {known.name}") for name in names)
+        is_query_target = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
+        is_query_target &= not any(name.endswith(f" {known.name}") for name in names)
         is_cut = whole is None and sight is not None and sight.is_cut
         looks = None
         if whole is None and seen is not None:
-            looks = looks_of(known.name, _without_strays(truth, rows_of[known.id]), sight, is_cut=is_cut)
+            looks = appearance_of(known.name, _without_strays(truth, rows_of[known.id]), sight, is_cut=is_cut)
         things.append(
             MapObject(
                 known.id,
@@ -329,7 +331,7 @@ def known_objects(
                 " ".join((*_colour(known, sight), *known.adjectives)),
                 known.box.mean(axis=0),
                 known.box,
-                is_asked=is_asked,
+                is_query_target=is_query_target,
                 is_whole=whole is not None,
                 is_cut=is_cut,
                 looks=looks,
@@ -342,7 +344,7 @@ def _colour(known: WholeObject, sight: Sight | None) -> tuple[str, ...]:
     """The word for what frames show, where it is what the thing was made in, or nobody knows and it is plain."""
     if sight is None or not sight.colour or last_word(known.name) in WITHOUT_COLOUR:
         return ()
-    return (sight.colour,) if known.colour == sight.colour or (not known.colour and sight.is_sure_colour) else ()
+    return (sight.colour,) if known.colour == sight.colour or (not known.colour and sight.is_certain_colour) else ()
 
 
 def _of_vertices(truth: GroundTruth, instance: int, rows: Int64Array) -> WholeObject | None:
@@ -391,7 +393,7 @@ def is_called(label: str, class_name: str) -> bool:
         return True
     if " ".join(label_words) in GROUPS:
         return False
-    return bool(meant_by(class_name, _only(label)).objects) or bool(meant_by(label, _only(class_name)).objects)
+    return bool(noun_objects(class_name, _only(label)).objects) or bool(noun_objects(label, _only(class_name)).objects)
 
 
 def _only(name: str) -> SceneMap:

@@ -24,20 +24,20 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.questions.score import GivenAnswer, TrueAnswer
+from su3d_bench.metrics.questions.score import SolverAnswer, TrueAnswer
 from su3d_bench.numerics.relations import NEAR_M, is_left_of
 from su3d_bench.perception.language.captioner import STRATEGY, reason_of
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, n_tokens
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.parsing import answered, is_refusal
 from su3d_bench.questions import scene_map
-from su3d_bench.questions.model import Answer, unsettled
-from su3d_bench.questions.scene_map import MapObject, NearestName, SceneMap, meant_by
+from su3d_bench.questions.model import Answer, undecided
+from su3d_bench.questions.scene_map import MapObject, NearestName, SceneMap, noun_objects
 
 Relation = Literal["on", "under", "in", "above", "next to", "near", "left of", "right of", "between", "with"]
 Size = Literal["largest", "smallest", "tallest", "lowest", "longest", "highest"]
 
-MOST_CHARACTERS = 400
+MAX_CHARACTERS = 400
 
 
 @cache
@@ -94,8 +94,8 @@ def read_question(text: str) -> Question | None:
     >>> read_question("Which sink is closer to bed?").subject
     Phrase(head='sink', relation=None, others=())
     """
-    plain = " ".join(text[: MOST_CHARACTERS + 1].lower().replace("’", "'").split())
-    if len(plain) > MOST_CHARACTERS:
+    plain = " ".join(text[: MAX_CHARACTERS + 1].lower().replace("’", "'").split())
+    if len(plain) > MAX_CHARACTERS:
         return None
     for pattern, by in _grammar()["clean"]:
         plain = re.sub(pattern, by, plain)
@@ -182,7 +182,7 @@ _READERS: Mapping[str, Callable[[Groups], Question | None]] = {
     "list": _list,
 }
 CLOSE_CALL_M = 0.05  # a lead smaller than this is said
-MOST_LISTED = 12
+MAX_LISTED = 12
 Objects = tuple[MapObject, ...]
 _Solved = tuple[str, Objects, Objects, float | int | bool | None]  # text, objects, references, value
 
@@ -214,7 +214,7 @@ class Solver:
         """The answer to an English question; one that says so where it cannot be read or settled."""
         question = read_question(text)
         if question is None:
-            return unsettled("the question is none of those that geometry settles; try --solver llm")
+            return undecided("the question is none of those that geometry settles; try --solver llm")
         return self.solve(question)
 
     def solve(self, question: Question) -> Answer:
@@ -224,7 +224,7 @@ class Solver:
         try:
             text, objects, references, value = solve(question)
         except _Unsettled as reason:
-            return unsettled(str(reason), tuple(self._notes))
+            return undecided(str(reason), tuple(self._notes))
         ids, held = (tuple(thing.id for thing in things) for things in (objects, references))
         return Answer(text, ids, held, value, question.kind, notes=tuple(self._notes))
 
@@ -235,7 +235,7 @@ class Solver:
 
     def _objects(self, phrase: Phrase) -> tuple[Objects, Objects]:
         """What a phrase means, and what its restrictions were held against; empty where none meets them."""
-        meant: scene_map.Meant = meant_by(phrase.head, self._scene, self._nearest)
+        meant: scene_map.NounMatch = noun_objects(phrase.head, self._scene, self._nearest)
         self._notes |= dict.fromkeys(meant.notes)
         if not meant.objects:
             raise _Unsettled(self._has_no(phrase.head))
@@ -245,7 +245,7 @@ class Solver:
         kept: list[MapObject] = []
         held: dict[int, MapObject] = {}
         for thing in meant.objects:
-            witnesses = self._witnesses(thing, phrase.relation, others)
+            witnesses = self._supporting_objects(thing, phrase.relation, others)
             if witnesses:
                 kept.append(thing)
                 held |= {other.id: other for other in witnesses}
@@ -258,9 +258,9 @@ class Solver:
         return objects
 
     def _has_no(self, noun: str) -> str:
-        return f"the map has no '{noun}'{scene_map.meant_instead(noun, self._scene)}"
+        return f"the map has no '{noun}'{scene_map.name_suggestion(noun, self._scene)}"
 
-    def _witnesses(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
+    def _supporting_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``thing`` stands in ``relation``."""
         if relation == "between":
             if len(others) == 1 and len(others[0]) == 2:
@@ -269,9 +269,11 @@ class Solver:
                 raise _Unsettled("'between' needs two things, such as: between the bed and the door")
             pairs = ((a, b) for a in others[0] for b in others[1] if a.id != b.id)
             return next(((a, b) for a, b in pairs if self._scene.is_between(thing, a, b)), ())
-        return tuple(other for other in others[0] if other.id != thing.id and self._stands(thing, relation, other))
+        return tuple(
+            other for other in others[0] if other.id != thing.id and self._relation_holds(thing, relation, other)
+        )
 
-    def _stands(self, thing: MapObject, relation: Relation, other: MapObject) -> bool:
+    def _relation_holds(self, thing: MapObject, relation: Relation, other: MapObject) -> bool:
         if relation == "left of" or relation == "right of":  # two comparisons narrow the type
             x, y = self._eye[:2]
             where = "the eye given" if self._is_eye_given else "the middle of the map"
@@ -357,7 +359,7 @@ class Solver:
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
         """As ``_objects``, but a noun that the map does not have means nothing, which answers the question."""
-        if not meant_by(phrase.head, self._scene, self._nearest).objects:
+        if not noun_objects(phrase.head, self._scene, self._nearest).objects:
             return (), ()
         return self._objects(phrase)
 
@@ -394,8 +396,8 @@ class Solver:
         if not things:
             raise _Unsettled(self._has_no(_shown(question.subject)))
         places = [f"{thing.shown} at ({', '.join(f'{value:.2f}' for value in thing.centroid)}) m" for thing in things]
-        more = f" and {len(things) - MOST_LISTED} more" if len(things) > MOST_LISTED else ""
-        return "; ".join(places[:MOST_LISTED]) + more, things, held, None
+        more = f" and {len(things) - MAX_LISTED} more" if len(things) > MAX_LISTED else ""
+        return "; ".join(places[:MAX_LISTED]) + more, things, held, None
 
     def _note_several(self, objects: Objects, phrase: Phrase) -> None:
         if len(objects) > 1:
@@ -418,12 +420,12 @@ def _shown(phrase: Phrase) -> str:
 
 
 def _listed(objects: Objects) -> str:
-    shown = ", ".join(thing.shown for thing in objects[:MOST_LISTED])
-    return shown if len(objects) <= MOST_LISTED else f"{shown} and {len(objects) - MOST_LISTED} more"
+    shown = ", ".join(thing.shown for thing in objects[:MAX_LISTED])
+    return shown if len(objects) <= MAX_LISTED else f"{shown} and {len(objects) - MAX_LISTED} more"
 
 
 # What of the language model's settings moves an answer; times, prices and limits do not.
-MOVES_ANSWERS = {"text_model", "temperature", "seed", "max_answer_tokens", "context_tokens"}
+ANSWER_SETTINGS = {"text_model", "temperature", "seed", "max_answer_tokens", "context_tokens"}
 FEW_OBJECTS = 1  # what is always given, however small the model's context
 
 
@@ -437,7 +439,7 @@ class Context:
 
 def answers_digest(config: LanguageConfig) -> str:
     """A key that moves with what moves the answers of a language model."""
-    return digest_json([system_prompt(), config.model_dump(mode="json", include=MOVES_ANSWERS)])
+    return digest_json([system_prompt(), config.model_dump(mode="json", include=ANSWER_SETTINGS)])
 
 
 def system_prompt() -> str:
@@ -485,7 +487,7 @@ def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Conte
 def by_relevance(scene: SceneMap, question: str) -> list[MapObject]:
     """Objects in the order in which they matter: those that the question names, those whose name or caption shares a
     word with it, then by how near they are to the former; large before small where none is named."""
-    named = {thing.id for phrase in _phrases(question) for thing in meant_by(phrase, scene).objects}
+    named = {thing.id for phrase in _phrases(question) for thing in noun_objects(phrase, scene).objects}
     question_words = set(_every_word(question))
     sharing = {thing.id for thing in scene.objects if question_words & {*words(thing.name), *words(thing.caption)}}
     centres = np.array([thing.centroid for thing in scene.objects if thing.id in named]).reshape(-1, 3)
@@ -558,7 +560,7 @@ class LanguageSolver:
         notes = tuple(note for note in (context.note, _dropped(reply.dropped)) if note)
         parsed = None if reply.failure else answered(reply.text, [thing.id for thing in context.objects])
         if parsed is None or (not parsed.object_ids and is_refusal(parsed.text)):
-            return replace(unsettled(f"{self._config.text_model}: {reason_of(reply)}", notes), solver="llm")
+            return replace(undecided(f"{self._config.text_model}: {reason_of(reply)}", notes), solver="llm")
         if reply.finish_reason == "length":
             notes += ("the answer was cut at max_answer_tokens",)
         if not parsed.object_ids:
@@ -600,9 +602,9 @@ def by_language_model(model: LanguageModel, config: LanguageConfig) -> MapSolver
     return MapSolver(name, lambda scene, questions: LanguageSolver(scene, model, config).answers(questions))
 
 
-def given_answer(true: TrueAnswer, answer: Answer, scene: SceneMap) -> GivenAnswer:
+def given_answer(true: TrueAnswer, answer: Answer, scene: SceneMap) -> SolverAnswer:
     """What ``answer`` about ``scene`` says of the kind of ``true``."""
     rows = [scene.by_id(object_id).row for object_id in answer.object_ids]
     # the words of a language model are read for their yes or no, or their first number
-    value = answer.value if true.value is None or answer.solver == "built-in" else answer.said(true.value)
-    return GivenAnswer(value, np.array(rows, np.int64), answer.is_settled)
+    value = answer.value if true.value is None or answer.solver == "built-in" else answer.as_value(true.value)
+    return SolverAnswer(value, np.array(rows, np.int64), answer.is_decided)

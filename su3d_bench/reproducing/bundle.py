@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
+from su3d_bench.core.config import NEUTRAL_SETTINGS, Setting, Settings
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
 from su3d_bench.core.files import atomic
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
-from su3d_bench.core.printing import escaped_json
+from su3d_bench.core.safe_output import escaped_json
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes, opened, regular
 from su3d_bench.core.system.timing import processor_digest
@@ -49,11 +49,11 @@ MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.j
 RUNS = "runs"
 DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can have
 MODE = (stat.S_IFREG | 0o644) << 16
-MOST_MEMBERS = 200_000
-MOST_MANIFEST = 64 << 20
-MOST_OF_A_REMARK = 400  # characters
+MAX_MEMBERS = 200_000
+MAX_MANIFEST = 64 << 20
+MAX_REMARK_CHARACTERS = 400  # characters
 PIECE = 1 << 20
-_OF_A_JOB = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz"
+_JOB_OPTIONS = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz"
                        r"|counts\.npz|updates\.csv|log\.txt|done\.json|refined_names\.json")  # fmt: skip
 _SAFE = re.compile(r"[^/\\:\x00-\x1f\x7f]+(/[^/\\:\x00-\x1f\x7f]+)*")
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -82,13 +82,13 @@ class Manifest(BaseModel):
     recipe: str
     runs: tuple[str, ...]
     files: dict[str, Entry]
-    trained_on: Annotated[str, Field(max_length=MOST_OF_A_REMARK)] = ""
+    trained_on: Annotated[str, Field(max_length=MAX_REMARK_CHARACTERS)] = ""
 
 
 def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Path], out: Path) -> None:
     """The archive at ``place`` of the ``runs`` of a recipe and of what ``out`` holds beside them, whole or not."""
-    beside = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
-    _write(place, runs, {**beside, RECIPE: recipe_file}, {"recipe": recipe})
+    temporary_path = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
+    _write(place, runs, {**temporary_path, RECIPE: recipe_file}, {"recipe": recipe})
 
 
 def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
@@ -101,12 +101,12 @@ def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None
     bad = next((name for name in names if not is_safe(name)), None)
     if bad is not None:
         raise StoreError(f"'{printable(bad, 100)}': a run of this name is on no other system; rename its folder")
-    said = {"trained_on": printable(trained_on, MOST_OF_A_REMARK)} if trained_on else {}
+    said = {"trained_on": printable(trained_on, MAX_REMARK_CHARACTERS)} if trained_on else {}
     _write(place, whole, {}, {"recipe": "", **said})
 
 
-def _write(place: Path, runs: Sequence[Path], beside: Mapping[str, Path], about: Mapping[str, str]) -> None:
-    sources = dict(beside)
+def _write(place: Path, runs: Sequence[Path], temporary_path: Mapping[str, Path], about: Mapping[str, str]) -> None:
+    sources = dict(temporary_path)
     names = [f"{RUNS}/{folder.name}" for folder in runs]
     for folder, name in zip(runs, names, strict=True):
         sources |= {f"{name}/{file.relative_to(folder).as_posix()}": file for file in _files_of(folder)}
@@ -145,7 +145,7 @@ def _files_of(folder: Path) -> Iterator[Path]:
     """What of a run goes into a bundle: records, maps, counts, times and the replies of language models."""
     yield from (folder / name for name in RECORDS if is_file(folder / name))
     for job in RunFolder(folder).jobs():
-        yield from sorted(file for file in job.path.iterdir() if is_file(file) and _OF_A_JOB.fullmatch(file.name))
+        yield from sorted(file for file in job.path.iterdir() if is_file(file) and _JOB_OPTIONS.fullmatch(file.name))
     yield from sorted(file for file in (folder / "language").rglob("*") if is_file(file) and not file.is_symlink())
 
 
@@ -178,7 +178,7 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
             members = _members(archive, where)
             allowance = atomic.allowance_of(archive)
             manifest = _manifest(atomic.member_bytes(archive, members[MANIFEST], allowance), where)
-            _refuse_others(members, manifest, where)
+            _check_no_others(members, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
     except OSError as error:
@@ -190,8 +190,8 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
 
 def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]:
     infos = archive.infolist()
-    if len(infos) > MOST_MEMBERS:
-        raise StoreError(f"{where}: has {len(infos)} files; a bundle has at most {MOST_MEMBERS}")
+    if len(infos) > MAX_MEMBERS:
+        raise StoreError(f"{where}: has {len(infos)} files; a bundle has at most {MAX_MEMBERS}")
     members: dict[str, zipfile.ZipInfo] = {}
     for info in infos:
         name = info.filename
@@ -202,7 +202,7 @@ def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]
             raise StoreError(f"{where}: holds '{printable(name, 120)}' twice; not unpacked")
         members[name.casefold()] = info
     manifest = members.get(MANIFEST)
-    if manifest is None or manifest.filename != MANIFEST or manifest.file_size > MOST_MANIFEST:
+    if manifest is None or manifest.filename != MANIFEST or manifest.file_size > MAX_MANIFEST:
         raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench report bundle RUN")
     return {info.filename: info for info in members.values()}
 
@@ -225,7 +225,7 @@ def _manifest(content: bytes, where: str) -> Manifest:
         raise StoreError(f"{where}: {MANIFEST}: {key or 'it'} is not as a bundle has it") from error
 
 
-def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
+def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
     named = {*manifest.files, MANIFEST}
     wrong = {"of its manifest missing": named - set(members), "beside its manifest": set(members) - named}
     for what, names in wrong.items():
@@ -271,7 +271,13 @@ def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
 
 
 TOLERANCE = 1e-9  # of a value on another machine
-OF_THE_VERIFIER = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}
+VERIFIER_SETTINGS = {
+    "profile": "embedded",
+    "executor": "auto",
+    "offline": True,
+    "pictures": False,
+    "accept_poses": True,
+}
 
 
 @dataclass
@@ -360,7 +366,7 @@ def _verify_one(array: NDArray[Any], k: int) -> str:
 
 def _of_maps(run: FinishedRun, folder: Path) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of the maps of a run that was made here or elsewhere by this program."""
-    refuse_own_code(run)
+    check_no_custom_code(run)
     encoder = encoder_of(run.folder, device_of(run))
     for job in _jobs(run, folder):
         run.dataset(job.scene)  # raises where the data here are others
@@ -373,9 +379,9 @@ def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
     """The jobs of a run with its folder here; nothing of where it ran is kept, and no model is loaded to see images."""
     settings = tuple(
         entry for entry in run.data.settings.entries
-        if entry.path[0] not in MOVES_NO_NUMBER and entry.path[:3] != ("perception", "models", "device")
+        if entry.path[0] not in NEUTRAL_SETTINGS and entry.path[:3] != ("perception", "models", "device")
     )  # fmt: skip
-    here = tuple(Setting((name,), value, "verify") for name, value in OF_THE_VERIFIER.items())
+    here = tuple(Setting((name,), value, "verify") for name, value in VERIFIER_SETTINGS.items())
     plan = make_plan(Settings((*settings, *here)), (), folder / "planned" / run.folder.path.name)
     wanted = set(run.scenes)
     missing = wanted - {job.scene for job in plan.jobs}
@@ -392,7 +398,7 @@ def device_of(run: FinishedRun) -> str:
         return "cpu"
 
 
-def refuse_own_code(run: FinishedRun) -> None:
+def check_no_custom_code(run: FinishedRun) -> None:
     """A ``StoreError`` where scoring would load a file of code that the bundle names."""
     asked = {name: run.settings.get((name,), ()) for name in ("methods", "scenes", "protocols")}
     for name, texts in asked.items():
@@ -403,7 +409,7 @@ def refuse_own_code(run: FinishedRun) -> None:
                 raise StoreError(f"names somebody's own '{printable(str(text), 80)}', which a bundle does not bring")
 
 
-def refuse_own_truth(run: FinishedRun) -> None:
+def check_dataset_ground_truth(run: FinishedRun) -> None:
     """A ``StoreError`` where predictions were held against files of ground truth in place of a dataset."""
     truth = run.record.ground_truth
     if run.record.predictions and (truth is None or truth.dataset is None):
@@ -412,7 +418,7 @@ def refuse_own_truth(run: FinishedRun) -> None:
 
 def _of_predictions(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of predictions that were made elsewhere, from the maps that the run kept of them."""
-    refuse_own_truth(run)
+    check_dataset_ground_truth(run)
     truth = run.record.ground_truth
     assert truth is not None
     for one in run.record.predictions:

@@ -30,7 +30,7 @@ from su3d_bench.store.predictions import read_prediction
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
 _ENCODER = ("perception", "models", "encoder")
 _EVERY = re.compile(r"every (\d+)(?:st|nd|rd|th)")
-MOST_RULES = 4
+MAX_RULES = 4
 WARM_UP, CAMERA_HZ = 3, 30.0  # as `report timing` has them
 SCHEMA = 1
 
@@ -38,7 +38,7 @@ SCHEMA = 1
 @dataclass(frozen=True)
 class Compared:
     """A printed cell. ``reported`` as printed in per cent; ``measured``, ``interval`` and ``difference`` in points of
-    per cent, None where nothing was measured, and ``why_not`` says why; ``causes`` in the order of their weight."""
+    per cent, None where nothing was measured, and ``incompatibility`` says why; ``causes`` in the order of their weight."""
 
     experiment: str
     method: str
@@ -53,7 +53,7 @@ class Compared:
     run_method: str | None = None
     n_scenes: int = 0
     causes: tuple[str, ...] = ()
-    why_not: str = ""
+    incompatibility: str = ""
     source: str = ""
 
     @property
@@ -120,7 +120,7 @@ def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results
     )  # fmt: skip
     row = _measured(experiment, figure, method, name, results)
     if row is None:
-        return replace(blank, why_not=_why_not(experiment, figure, method, name, results))
+        return replace(blank, incompatibility=_missing_reason(experiment, figure, method, name, results))
     interval = row.intervals.get(name)
     value = row.metrics[name]
     assert value is not None
@@ -148,7 +148,7 @@ def _measured(experiment: Experiment, figure: Figure, method: str, metric: str, 
     return None
 
 
-def _why_not(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> str:
+def _missing_reason(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> str:
     if figure.method in experiment.predictions:
         return f"no method here: give its predictions with --predictions '{figure.method}=DIR'"
     mine = [row for row in results.measured if row.method == method and row.protocol in experiment.protocols]
@@ -187,7 +187,7 @@ def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
         return
     theirs, ours = (load_protocol(name).as_json for name in (figure.protocol, row.protocol))
     keys = [key for key in dict.fromkeys([*theirs, *ours]) if key not in _NAMES and theirs.get(key) != ours.get(key)]
-    said = f" (other {', '.join(keys[:MOST_RULES])}{' and more' if len(keys) > MOST_RULES else ''})" if keys else ""
+    said = f" (other {', '.join(keys[:MAX_RULES])}{' and more' if len(keys) > MAX_RULES else ''})" if keys else ""
     yield f"protocol rule: {row.protocol} in place of {figure.protocol}{said}"
 
 
@@ -295,7 +295,7 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
 
 def _said(cell: Compared) -> list[str]:
     if cell.measured is None:
-        return [f"not measured: {cell.why_not}"]
+        return [f"not measured: {cell.incompatibility}"]
     what = list(cell.causes) or ["nothing is known to differ: protocol, encoder, proposals and stride are the paper's"]
     return [f"under {cell.protocol}", *what]
 

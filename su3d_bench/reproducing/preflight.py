@@ -17,7 +17,7 @@ from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODE
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.reproducing.recipe import AskedRun, dataset_named, known_scenes, scene_names
+from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
 from su3d_bench.runs.frame_loop import surface_of
 from su3d_bench.runs.job import build_method
 from su3d_bench.runs.plan import method_part, named_method
@@ -25,7 +25,7 @@ from su3d_bench.runs.scenes import data_root
 
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
-CAN_DO_WITHOUT = (TAGGER,)  # without RAM++ a list of words names what is looked for
+OPTIONAL_MODELS = (TAGGER,)  # without RAM++ a list of words names what is looked for
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Need:
 
     kind: str
     name: str
-    is_here: bool
+    is_available: bool
     n_bytes: float | None = None
     how: str = ""
     is_required: bool = True
@@ -53,13 +53,13 @@ class Preflight:
 
     @property
     def missing(self) -> tuple[Need, ...]:
-        return tuple(need for need in self.needs if not need.is_here and need.is_required)
+        return tuple(need for need in self.needs if not need.is_available and need.is_required)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
-def preflight(runs: Sequence[AskedRun]) -> Preflight:
+def preflight(runs: Sequence[RecipeRun]) -> Preflight:
     """What ``runs`` need; no frame is read, nothing is written and no server is contacted."""
     needs: dict[tuple[str, str], Need] = {}
     for run in runs:
@@ -77,7 +77,7 @@ def _fetched(dataset: str) -> tuple[float | None, str]:
     return None, "see docs/datasets.md"
 
 
-def _data(run: AskedRun) -> Iterator[Need]:
+def _data(run: RecipeRun) -> Iterator[Need]:
     """A need a scene, and one a truth that its protocols ask for."""
     dataset = dataset_named(run.dataset)
     known = known_scenes(dataset)
@@ -91,14 +91,14 @@ def _data(run: AskedRun) -> Iterator[Need]:
             except Su3dError as error:
                 fault = str(error)
         if fault:
-            yield Need("scene", address, is_here=False, n_bytes=n_bytes, how=how, remark=fault)
+            yield Need("scene", address, is_available=False, n_bytes=n_bytes, how=how, remark=fault)
             continue
-        yield Need("scene", address, is_here=True, n_bytes=0.0)
+        yield Need("scene", address, is_available=True, n_bytes=0.0)
         yield from _surface(run, dataset, scene, how)
         yield from _truths(run, dataset, scene, how)
 
 
-def _surface(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
+def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
     """The scan's mesh, where it is missing and a method cannot do without."""
     named = [named_method(text) for text in run.methods]
     settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
@@ -110,10 +110,10 @@ def _surface(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need
         surface_of(dataset, scene)
     except Su3dError as error:
         remark = f"{error}; {', '.join(asking)} cannot do without"
-        yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_here=False, how=how, remark=remark)
+        yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_available=False, how=how, remark=remark)
 
 
-def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
+def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
     """The truths that are missing; one that another protocol of the run can do without is not required."""
     variants: dict[str, list[str]] = {}
     for name in run.protocols:
@@ -129,10 +129,10 @@ def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]
         remark = f"{why}; without it {', '.join(variants[variant])} scores nothing"
         name = f"{run.dataset}/{scene}: {variant}"
         brings = how if "su3d-bench datasets fetch" in why else ""  # labels of others are not among what is fetched
-        yield Need("truth", name, is_here=False, how=brings, is_required=not left, remark=remark)
+        yield Need("truth", name, is_available=False, how=brings, is_required=not left, remark=remark)
 
 
-def _models(run: AskedRun) -> Iterator[Need]:
+def _models(run: RecipeRun) -> Iterator[Need]:
     """Packages and weights of the profile ``paper``; an encoder beside any other."""
     methods = {named_method(method).base for method in run.methods}
     settings = read_assignments(run.settings, tuple({*methods, *run.methods}), (run.dataset,))
@@ -144,11 +144,13 @@ def _models(run: AskedRun) -> Iterator[Need]:
         try:
             require_installed(package, "profile 'paper'")
         except Su3dError as error:
-            yield Need("package", package, is_here=False, how="pip install 'su3d-bench[models]'", remark=str(error))
+            yield Need(
+                "package", package, is_available=False, how="pip install 'su3d-bench[models]'", remark=str(error)
+            )
         else:
-            yield Need("package", package, is_here=True)
+            yield Need("package", package, is_available=True)
     for name in dict.fromkeys(names):
-        yield _model(name, config, is_required=name not in CAN_DO_WITHOUT or config.paper.tagger != "auto")
+        yield _model(name, config, is_required=name not in OPTIONAL_MODELS or config.paper.tagger != "auto")
 
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
@@ -162,8 +164,8 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
         how = f"su3d-bench models fetch {'--for paper' if name in FETCHED_FOR_PAPER else name}"
-        return Need("model", name, is_here=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
-    return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
+        return Need("model", name, is_available=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
+    return Need("model", name, is_available=True, n_bytes=0.0, remark=str(files.folder))
 
 
 # ---- shown
@@ -182,16 +184,18 @@ def preflight_tables(known: Preflight) -> list[Table]:
     """What is here and what is not."""
     rows = [["what", "name", "is here", "bytes", "how to get it"]]
     rows += [[need.kind, need.name, _state(need), _bytes(need), need.how or "-"] for need in known.needs]
-    remarks = [f"{need.name}: {need.remark}" for need in known.needs if need.remark and not need.is_here]
+    remarks = [f"{need.name}: {need.remark}" for need in known.needs if need.remark and not need.is_available]
     return [text_table("needs", rows, heading="Needed", caption=f": {_said(known)}", notes=remarks)]
 
 
 def _state(need: Need) -> str:
-    return "yes" if need.is_here else "no" if need.is_required else "no, can do without"
+    return "yes" if need.is_available else "no" if need.is_required else "no, can do without"
 
 
 def _bytes(need: Need) -> str:
-    return "-" if need.is_here and not need.n_bytes else "unknown" if need.n_bytes is None else f"{need.n_bytes:,.0f}"
+    return (
+        "-" if need.is_available and not need.n_bytes else "unknown" if need.n_bytes is None else f"{need.n_bytes:,.0f}"
+    )
 
 
 def _said(known: Preflight) -> str:
@@ -206,5 +210,5 @@ def summary(known: Preflight) -> Iterator[str]:
     """The preflight in a few lines."""
     yield f"preflight: {_said(known)[:-1]}"
     for need in known.needs:
-        if not need.is_here:
+        if not need.is_available:
             yield f"  missing: {need.kind} {need.name}" + (f" ({need.remark})" if need.remark else "")

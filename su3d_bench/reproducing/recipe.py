@@ -21,9 +21,9 @@ from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, s
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import HasGroups
 from su3d_bench.core.system.files import file_bytes, parse_toml
-from su3d_bench.evaluation.as_run import evaluate_methods
 from su3d_bench.evaluation.result import Request
-from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.evaluation.run_output import evaluate_methods
+from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.reports.tables.paper import Figure, PaperTable, published
@@ -36,7 +36,7 @@ from su3d_bench.runs.runner import RunResult, run_plan
 from su3d_bench.runs.scenes import data_root, split_address
 
 FOLDER = Path(__file__).resolve().parent / "recipes"
-MOST_BYTES = 1 << 20
+MAX_BYTES = 1 << 20
 EVERY_ROW = "*"
 Word = Annotated[str, Field(min_length=1, max_length=400)]
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -154,8 +154,8 @@ def load_recipe(name: str) -> Recipe:
     path = recipe_file(name)
     with reading(printable(str(path), 200), ConfigError):
         content = file_bytes(path)
-    if len(content) > MOST_BYTES:
-        raise ConfigError(f"{printable(path.name, 100)}: has {len(content)} bytes; expected at most {MOST_BYTES}")
+    if len(content) > MAX_BYTES:
+        raise ConfigError(f"{printable(path.name, 100)}: has {len(content)} bytes; expected at most {MAX_BYTES}")
     return parse_recipe(content, printable(path.name if name.endswith(".toml") else name, 100))
 
 
@@ -202,7 +202,7 @@ RUNS = "runs"
 
 
 @dataclass(frozen=True)
-class Asked:
+class RecipeRequest:
     """How the recipe is carried out this time: None stands for what it says itself.
 
     ``values`` are further values of a run by key (``jobs``, ``limit``, ``executor`` and the like), ``assignments`` as
@@ -218,7 +218,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class AskedRun:
+class RecipeRun:
     """One run: ``name`` is its folder's below ``runs/``; ``rows`` are those of sweeps."""
 
     name: str
@@ -258,7 +258,7 @@ def method_of_row(experiment: Experiment, method: str, row: str | None) -> str:
     return variant if variant in experiment.methods else method
 
 
-def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: Asked) -> tuple[AskedRun, ...]:
+def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest) -> tuple[RecipeRun, ...]:
     """The runs that give all ``experiments``; those of one dataset, encoder and stride are one.
 
     A ``ConfigError`` for a method, protocol or dataset that is not known.
@@ -274,7 +274,7 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: Asked) 
     runs = []
     for (dataset, encoder, stride), mine in parts.items():
         named = dataset, encoder if encoder != usual else "", f"stride{stride}" if stride else ""
-        run = AskedRun(
+        run = RecipeRun(
             name="-".join(filter(None, named)),
             dataset=dataset,
             profile=asked.profile or recipe.profile,
@@ -297,7 +297,7 @@ def _joined(parts: Iterable[Sequence[Any]]) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(chain.from_iterable(parts)))
 
 
-def _by_dataset(experiment: Experiment, asked: Asked) -> dict[str, tuple[str, ...]]:
+def _by_dataset(experiment: Experiment, asked: RecipeRequest) -> dict[str, tuple[str, ...]]:
     by_dataset: dict[str, tuple[str, ...]] = {}
     for address in experiment.scenes:
         dataset, scene = split_address(address)
@@ -312,7 +312,7 @@ def _by_dataset(experiment: Experiment, asked: Asked) -> dict[str, tuple[str, ..
 def _fitting(experiment: Experiment, dataset: str) -> tuple[str, ...]:
     """The experiment's protocols that score a dataset; a ``ConfigError`` where none does."""
     truth = TruthFacts.of_dataset(registry.load("dataset", dataset))
-    names = tuple(name for name in experiment.protocols if why_not_truth(load_protocol(name), truth) is None)
+    names = tuple(name for name in experiment.protocols if truth_incompatibility(load_protocol(name), truth) is None)
     if experiment.protocols and not names:
         raise ConfigError(f"experiment {experiment.name}: none of its protocols fits the dataset '{dataset}'")
     return names
@@ -341,7 +341,7 @@ def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
             yield from groups.get(name, (name,))
 
 
-def plan_of(run: AskedRun, out: Path) -> Plan:
+def plan_of(run: RecipeRun, out: Path) -> Plan:
     """The plan of a run; what its folder holds already is joined with, so that a table more makes it longer."""
     values = dict(run.values) | {
         "scenes": run.scenes,
@@ -357,7 +357,7 @@ def plan_of(run: AskedRun, out: Path) -> Plan:
     return make_plan(settings, run.settings, folder, into=into)
 
 
-def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
+def execute(run: RecipeRun, plan: Plan, report: Report) -> RunResult:
     """Do what of ``plan`` is not done yet; the rows of a sweep are left beside its metrics."""
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
@@ -382,7 +382,7 @@ def environment(**values: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Given:
+class GivenPredictions:
     """The predictions of one method: where they lie, and what its encoder makes of texts, where that is given."""
 
     place: Path
@@ -391,7 +391,7 @@ class Given:
 
 def named_predictions(
     experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
-) -> dict[str, Given]:
+) -> dict[str, GivenPredictions]:
     """What ``METHOD=DIR`` and ``METHOD=FILE`` give, by printed method.
 
     Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, and for what is
@@ -401,7 +401,7 @@ def named_predictions(
         "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
     )
     features = _named("--text-features", "FILE", places, text_features)
-    return {method: Given(place, features.get(method)) for method, place in places.items()}
+    return {method: GivenPredictions(place, features.get(method)) for method, place in places.items()}
 
 
 def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[str]) -> dict[str, Path]:
@@ -422,7 +422,7 @@ def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[st
 
 
 def evaluate_predictions(
-    named: Mapping[str, Given], experiments: Sequence[Experiment], asked: Asked, out: Path
+    named: Mapping[str, GivenPredictions], experiments: Sequence[Experiment], asked: RecipeRequest, out: Path
 ) -> list[Path]:
     """The run folders of predictions, one a method and dataset; a folder that holds the same stays as it is."""
     folders: list[Path] = []
@@ -440,7 +440,7 @@ def evaluate_predictions(
     return folders
 
 
-def _scenes(experiments: Sequence[Experiment], asked: Asked, dataset: str) -> tuple[str, ...]:
+def _scenes(experiments: Sequence[Experiment], asked: RecipeRequest, dataset: str) -> tuple[str, ...]:
     """The recipe's scenes of ``dataset``: what else was predicted is of no row of its tables."""
     addresses = asked.scenes.get(dataset) if asked.scenes else None
     if addresses is None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_order, ranked
-from su3d_bench.core.config import MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
+from su3d_bench.core.config import NEUTRAL_SETTINGS, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
@@ -26,7 +26,7 @@ from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import JOBS, RECORDS
 
 UNKNOWN = "not known: run.toml is not whole"
-MOST_CHARACTERS = 2000
+MAX_CHARACTERS = 2000
 
 
 def command_of(run: FinishedRun, method: str) -> str:
@@ -34,14 +34,14 @@ def command_of(run: FinishedRun, method: str) -> str:
 
     What moves no number is left out, and so is what nobody asked for.
     """
-    if method in run.made_elsewhere:
-        return printable(_evaluation(run, method), MOST_CHARACTERS)
+    if method in run.external:
+        return printable(_evaluation(run, method), MAX_CHARACTERS)
     held = existing_run(run.folder.path)
     if held is None or not held.is_known:
         return UNKNOWN
     asked = held.requested
     words = ["su3d-bench", "run", *_flags(asked, run, method), *_settings(asked, method)]
-    return printable(shlex.join(words), MOST_CHARACTERS)
+    return printable(shlex.join(words), MAX_CHARACTERS)
 
 
 def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Iterator[str]:
@@ -49,7 +49,7 @@ def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Itera
     yield from ("--scenes", *map(str, scenes), "--methods", method)
     for name in RunConfig.model_fields:
         value = asked.get((name,))
-        if name in ("scenes", "methods") or name in MOVES_NO_NUMBER or value is None:
+        if name in ("scenes", "methods") or name in NEUTRAL_SETTINGS or value is None:
             continue
         yield f"--{name.replace('_', '-')}"
         yield from map(str, value) if isinstance(value, list | tuple) else (str(value),)
@@ -70,17 +70,17 @@ def _settings(asked: Mapping[KeyPath, Any], method: str) -> Iterator[str]:
 
 
 def _evaluation(run: FinishedRun, method: str) -> str:
-    record, truth = run.made_elsewhere[method], run.record.ground_truth
+    record, truth = run.external[method], run.record.ground_truth
     words = ["su3d-bench", "evaluate", *record.paths]
     if truth is not None and truth.dataset is not None:
         words += ["--dataset", truth.dataset]
     return shlex.join([*words, "--protocols", *run.protocols])
 
 
-NOT_SAID = "not said"
-TOLD_THE_TRUTH = "none: it was told the truth"
-NO_WEIGHTS = {"oracle": "none: masks of the ground truth", "stored": f"{NOT_SAID}: detections of another program"}
-OF_A_ROW = ("counts.npz", "updates.csv", "done.json")  # what of a job a row needs; its map stays in the archive
+NOT_STATED = "not said"
+USES_GROUND_TRUTH = "none: it was told the truth"
+NO_WEIGHTS = {"oracle": "none: masks of the ground truth", "stored": f"{NOT_STATED}: detections of another program"}
+ROW_FILES = ("counts.npz", "updates.csv", "done.json")  # what of a job a row needs; its map stays in the archive
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the first line of the specification's pointer files
 
 
@@ -96,7 +96,7 @@ class BundleFacts:
 
 
 @dataclass(frozen=True)
-class Weights:
+class ModelWeights:
     """A model that a row needed; ``files`` is SHA-256 by file name, as far as the run recorded it."""
 
     model: str
@@ -120,8 +120,8 @@ class Row(RankingRow):
     n_updates: int
     hardware: str
     encoder: str | None
-    weights: tuple[Weights, ...]
-    said_trained_on: str
+    weights: tuple[ModelWeights, ...]
+    stated_training_data: str
     command: str
     code: str
     commit: str
@@ -137,7 +137,7 @@ class Row(RankingRow):
     def trained_on(self) -> str:
         """What all weights were trained on, in a line."""
         known = [f"{one.model}: {one.trained_on}" for one in self.weights]
-        return self.said_trained_on or "; ".join(known) or (TOLD_THE_TRUTH if self.is_ceiling else NOT_SAID)
+        return self.stated_training_data or "; ".join(known) or (USES_GROUND_TRUTH if self.is_ceiling else NOT_STATED)
 
 
 def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
@@ -151,7 +151,7 @@ def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
     if file.is_symlink():
         raise DataError(f"{shown(file)}: is a link; name or copy the bundle itself")
     with TemporaryFolder("su3d-bundle-") as folder:
-        unpacked = unpack(file, folder, keep=_is_of_a_row)
+        unpacked = unpack(file, folder, keep=_is_row_file)
         manifest = unpacked.manifest
         facts = BundleFacts(
             printable(file.stem, 120),
@@ -167,11 +167,11 @@ def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
         return rows, [replace(one, reason=one.reason.replace(f"{folder}/", "")) for one in refused]
 
 
-def _is_of_a_row(name: str) -> bool:
+def _is_row_file(name: str) -> bool:
     parts = name.split("/")
     if name == MANIFEST or parts[0] != RUNS:
         return False
-    return (len(parts) == 3 and parts[2] in RECORDS) or (parts[2:3] == [JOBS] and parts[-1] in OF_A_ROW)
+    return (len(parts) == 3 and parts[2] in RECORDS) or (parts[2:3] == [JOBS] and parts[-1] in ROW_FILES)
 
 
 def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
@@ -208,7 +208,7 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
     times = read_update_times(run, entry.method)
     stages = {stage.name: stage for stage in summarise(times, WARM_UP).stages} if times else {}
     per_scene = record.result.per_scene
-    is_elsewhere = entry.method in run.made_elsewhere
+    is_elsewhere = entry.method in run.external
     return Row(
         **vars(entry),
         bundle=bundle,
@@ -218,10 +218,10 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
         update_s=_seconds(stages[TOTAL].p50) if stages else None,
         map_s=_seconds(stages[MAP].p50) if stages else None,
         n_updates=sum(map(len, times)),
-        hardware=NOT_SAID if is_elsewhere else printable(run.record.hardware, 200),
+        hardware=NOT_STATED if is_elsewhere else printable(run.record.hardware, 200),
         encoder=None if record.encoder is None else printable(record.encoder, 80),
         weights=() if is_elsewhere else tuple(_weights(run, record.encoder, record.profile)),
-        said_trained_on=printable(unpacked.manifest.trained_on, 400),
+        stated_training_data=printable(unpacked.manifest.trained_on, 400),
         command=command_of(run, entry.method),
         code=printable(run.record.code, 80),
         commit="" if run.record.git is None else printable(run.record.git.commit, 80),
@@ -235,10 +235,10 @@ def _seconds(ms: float) -> float | None:
     return ms / 1e3 if ms == ms else None
 
 
-def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iterator[Weights]:
+def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iterator[ModelWeights]:
     """The models of the profile and those that the run recorded, and the one whose features named the instances."""
     parts = (profile or "").split(", ")
-    yield from (Weights(f"profile {part}", NO_WEIGHTS[part]) for part in parts if part in NO_WEIGHTS)
+    yield from (ModelWeights(f"profile {part}", NO_WEIGHTS[part]) for part in parts if part in NO_WEIGHTS)
     known = encoder_known_as(encoder)
     named = [EmbeddedEncoder.name] if "embedded" in parts else []
     named += [encoder] if known is None and encoder is not None else [known.name] if known is not None else []
@@ -247,15 +247,15 @@ def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iter
             (printable(name, 120), printable(sha, 80)) for name, sha in run.record.models.get(model, {}).items()
         )
         if model == EmbeddedEncoder.name:
-            yield Weights(model, EmbeddedEncoder.trained_on)
+            yield ModelWeights(model, EmbeddedEncoder.trained_on)
         else:
-            yield Weights(printable(model, 80), MODELS[model].trained_on if model in MODELS else NOT_SAID, files)
+            yield ModelWeights(printable(model, 80), MODELS[model].trained_on if model in MODELS else NOT_STATED, files)
 
 
 N_DIGITS = 12  # of a digest, in a message
 
 
-def why_not_beside(row: Row, held: Sequence[Row]) -> str | None:
+def conflict_with(row: Row, held: Sequence[Row]) -> str | None:
     """Why ``row`` cannot stand in a registry that holds the rows ``held``, with what to do; None where it can."""
     return next((f"{row.what}: {fault}" for other in held for fault in _faults_beside(row, other)), None)
 
@@ -305,8 +305,8 @@ def _names_encoder(protocol: str) -> bool:
 
 BUNDLES = "bundles"
 SUFFIX = ".zip"
-MOST_BUNDLES = 2000
-MOST_NAMED = 3  # reasons of one bundle in its line
+MAX_BUNDLES = 2000
+MAX_NAMED = 3  # reasons of one bundle in its line
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _ANY = "bundle"  # what reproduce calls every one of its archives
 
@@ -336,8 +336,8 @@ def bundle_files(folder: Path) -> list[Path]:
         files = sorted(place / name for name in os.listdir(place) if name.lower().endswith(SUFFIX))
     except OSError as error:
         raise StoreError(f"{shown(place)}: cannot be read: {error.strerror or error}") from error
-    if len(files) > MOST_BUNDLES:
-        raise ConfigError(f"{shown(place)}: holds {len(files)} bundles; a registry has at most {MOST_BUNDLES}")
+    if len(files) > MAX_BUNDLES:
+        raise ConfigError(f"{shown(place)}: holds {len(files)} bundles; a registry has at most {MAX_BUNDLES}")
     return files
 
 
@@ -358,7 +358,7 @@ def read_registry(folder: Path) -> Registry:
         mine, others = _read(file)
         refused += others
         for row in mine:
-            reason = why_not_beside(row, rows)
+            reason = conflict_with(row, rows)
             if reason is None:
                 rows.append(row)
             else:
@@ -445,7 +445,7 @@ def _beside(rows: Sequence[Row], others: Sequence[Path], digest: str) -> Iterato
             return
         held += mine
     for row in rows:
-        if reason := why_not_beside(row, held):
+        if reason := conflict_with(row, held):
             yield reason
         held.append(row)
 
@@ -494,6 +494,6 @@ def lines_of(found: Added) -> list[str]:
         how = "to the last bit" if found.is_to_the_bit else "integers the same, values within 1e-9"
         scores = f"{counted(found.n_scores, 'score')} made anew, {how}"
         return [f"{found.bundle}: in the registry as {found.place}: {counted(found.n_rows, 'row')}; {scores}"]
-    told = [f"{found.bundle}: refused: {reason}" for reason in found.reasons[:MOST_NAMED]]
+    told = [f"{found.bundle}: refused: {reason}" for reason in found.reasons[:MAX_NAMED]]
     more = len(found.reasons) - len(told)
     return [*told, *([f"{found.bundle}: refused: and {counted(more, 'reason')} more"] if more else [])]

@@ -21,22 +21,22 @@ INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
 SCHEMA = 1
 KIND = "su3d-bench dev registry"  # by which an earlier site is known
-MOST_OF_AN_ADDRESS = 500
+MAX_ADDRESS_CHARACTERS = 500
 TITLE = "Registry of results"
-OF_A_ROW = (  # what a page says of a row as it is
+ROW_FIELDS = (  # what a page says of a row as it is
     "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
     "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run",
 )  # fmt: skip
 
 
-def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: str | None = None) -> list[Path]:
+def write_site(registry: Registry, out: Path, title: str = TITLE, bundle_url: str | None = None) -> list[Path]:
     """The pages of ``registry`` in the folder ``out``, in the place of an earlier site; what was written, by name.
 
-    ``bundles_at``: the https address below which the bundles lie; None: they are named and not linked. A
+    ``bundle_url``: the https address below which the bundles lie; None: they are named and not linked. A
     ``ConfigError`` where ``out`` holds something else.
     """
     earlier = _earlier_pages(out)
-    address = _checked_address(bundles_at)
+    address = _checked_address(bundle_url)
     value = _value(registry, title, address)
     pages = {INDEX: registry_page_html("index", title, _index(value), [_plain_tables(registry)])}
     makers: tuple[tuple[Kind, Callable[..., dict[str, Any]]], ...] = (("method", _method_page), ("scene", _scene_page))
@@ -80,8 +80,8 @@ def _is_page(name: str) -> bool:
 def _checked_address(text: str | None) -> str | None:
     if text is None:
         return None
-    if not text.startswith("https://") or len(text) > MOST_OF_AN_ADDRESS or printable(text, 10_000) != text:
-        raise ConfigError(f"--bundles-at '{printable(text, 100)}': expected an address that begins with https://")
+    if not text.startswith("https://") or len(text) > MAX_ADDRESS_CHARACTERS or printable(text, 10_000) != text:
+        raise ConfigError(f"--bundle-url '{printable(text, 100)}': expected an address that begins with https://")
     return text.rstrip("/") + "/"
 
 
@@ -146,7 +146,7 @@ def _notes(board: Sequence[Row]) -> Iterator[str]:
 def _row(row: Row, address: str | None) -> dict[str, Any]:
     file = f"{row.bundle.name}{SUFFIX}"
     return {
-        **{name: getattr(row, name) for name in OF_A_ROW},
+        **{name: getattr(row, name) for name in ROW_FIELDS},
         "page": _page(METHODS, row.method),
         "of_scenes": dict(row.values_of_scenes),
         "weights": [{**asdict(one), "files": dict(one.files)} for one in row.weights],

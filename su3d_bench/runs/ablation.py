@@ -21,7 +21,7 @@ from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.runs.plan import COMMA_OUTSIDE_BRACKETS
 
 FILE = "ablation.json"
-MOST_VARIANTS = 1000
+MAX_VARIANTS = 1000
 Short = tuple[str, Callable[[Any], Any]]
 
 
@@ -45,8 +45,8 @@ def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[S
     method_class = registry.load("method", method)
     choices = [_choices(method, method_class, text) for text in vary]
     n_rows = math.prod(map(len, choices)) if is_grid else sum(map(len, choices))
-    if n_rows > MOST_VARIANTS:
-        raise ConfigError(f"ablate: {n_rows} variants; at most {MOST_VARIANTS} make one run")
+    if n_rows > MAX_VARIANTS:
+        raise ConfigError(f"ablate: {n_rows} variants; at most {MAX_VARIANTS} make one run")
     combinations = itertools.product(*choices) if is_grid else ((choice,) for each in choices for choice in each)
     names = {_effective(method_class.Config()): str(method_class.name)}
     return tuple(_row(method_class, combination, names) for combination in combinations)

@@ -47,7 +47,7 @@ def estimate(plan: Plan) -> list[JobEstimate]:
     rows = []
     for job, part in ((each, part) for each in plan.jobs for part in each.methods):
         folder = plan.folder.job(job.scene, part.name)
-        is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
+        is_done = {"predict", "score"} <= set(folder.completion_records()) and folder.path not in going
         n_updates, remark = 0, None
         if part in needs_frames:
             try:
@@ -131,4 +131,4 @@ def _numbers(result: RunResult, run: str) -> list[list[str]]:
     methods = max(scored.values(), key=len, default=[])
     if len(methods) > 1:
         return [["compare", f"{run}:{methods[0]}", f"{run}:{methods[1]}"]]
-    return [["check", "--learn", run, "--out", "reference.json"]] if methods else []
+    return [["check", "--build-from", run, "--out", "reference.json"]] if methods else []

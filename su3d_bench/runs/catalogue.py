@@ -19,13 +19,13 @@ def known_datasets(names: Sequence[str], root: Path) -> list[dict[str, Any]]:
 
 
 def _dataset(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
-    from su3d_bench.core.interfaces import HasPlaces
+    from su3d_bench.core.interfaces import ListsFolders
 
     dataset = dataset_class(root, dataset_class.Options())
     row: dict[str, Any] = {
         "name": name,
         "summary": (dataset_class.__doc__ or "").strip().partition("\n")[0].replace("`", ""),
-        "places": [str(place) for place in (dataset.places() if isinstance(dataset, HasPlaces) else ())],
+        "places": [str(place) for place in (dataset.places() if isinstance(dataset, ListsFolders) else ())],
         "ground_truth": list(dataset_class.variants),
         "scenes": [],
         "error": None,

@@ -24,14 +24,14 @@ from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.core.files.atomic import TemporaryFolder
-from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
+from su3d_bench.core.system.signals import Terminated, ending_in_order, restored_handlers
 from su3d_bench.runs import executors
 from su3d_bench.runs.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
-from su3d_bench.store.run_folder import refuse_links
+from su3d_bench.store.run_folder import check_no_links
 
 RunUnits = Callable[..., Iterator[Any]]
 ENDED = "ended"  # the kind of answer of a worker that was asked to end
-MOST_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
+MAX_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
 
 
 def run_ray(
@@ -47,7 +47,7 @@ def run_ray(
     waiting = deque((unit, 1) for unit in units)
     running: dict[Any, tuple[Unit, int]] = {}
     while waiting or running:
-        while waiting and len(running) < min(jobs, MOST_AT_ONCE):
+        while waiting and len(running) < min(jobs, MAX_AT_ONCE):
             unit, attempt = waiting.popleft()
             running[remote.remote(work, unit, versions)] = unit, attempt
         for reference in ray.wait(list(running), num_returns=1)[0]:
@@ -91,7 +91,7 @@ def _on_node(work: Work[Unit, Outcome], unit: Unit, versions: dict[str, str]) ->
     try:
         with ending_in_order():  # where Ray's own handler would leave the work as if it had failed
             return answer_of(work, unit, lambda event: None)
-    except Ended as end:
+    except Terminated as end:
         return ENDED, str(end)
 
 
@@ -113,7 +113,7 @@ def connected(config: RunConfig) -> Iterator[Any]:
     if not was_connected:
         _connect(ray, config.ray_address)
     try:
-        _refuse_too_many_gpus(ray, config.gpus_per_job)
+        _check_gpu_count(ray, config.gpus_per_job)
         yield ray
     finally:
         if not was_connected:
@@ -122,7 +122,7 @@ def connected(config: RunConfig) -> Iterator[Any]:
 
 def _connect(ray: Any, address: str) -> None:
     try:
-        with kept_handlers():  # Ray's own would end the process as if a check had failed
+        with restored_handlers():  # Ray's own would end the process as if a check had failed
             ray.init(address=address or "auto", log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
         named = address or os.environ.get("RAY_ADDRESS")
@@ -133,7 +133,7 @@ def _connect(ray: Any, address: str) -> None:
         ) from error
 
 
-def _refuse_too_many_gpus(ray: Any, gpus_per_job: float) -> None:
+def _check_gpu_count(ray: Any, gpus_per_job: float) -> None:
     """Ray waits for ever for a machine that has what a task asks for."""
     most = max((node["Resources"].get("GPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
     if gpus_per_job > most:
@@ -155,8 +155,8 @@ def run_slurm(
     ``folder`` is on a shared disk. A unit whose job died ``config.retries`` + 1 times has the outcome that ``lost``
     makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all.
     """
-    refuse_links(folder.parent, folder)
-    n_at_once = min(jobs, MOST_AT_ONCE)
+    check_no_links(folder.parent, folder)
+    n_at_once = min(jobs, MAX_AT_ONCE)
     executor, failures = slurm_executor(folder, config, n_at_once)
     waiting = deque((unit, 1) for unit in units)
     running: list[tuple[Any, Unit, int]] = []

@@ -23,14 +23,14 @@ from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.core.printing import doors
-from su3d_bench.core.system.endings import Ended, ending_in_order
+from su3d_bench.core.safe_output import doors
+from su3d_bench.core.system.signals import Terminated, ending_in_order
 
 ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
 # For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it
 # is ended then, as by a loss of power, after which all that is on disk is whole and the scene is taken up again.
 PATIENCE_S = 1.0
-FOR_THE_PARENT = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
+PARENT_SIGNALS = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
 SCENE_DONE = "scene"  # label of the event that says that a unit is finished
 Unit = TypeVar("Unit")
 Outcome = TypeVar("Outcome")
@@ -43,7 +43,7 @@ class Event:
     """Progress of one unit: ``done`` of ``total`` steps under ``label``, 0 where nobody knows their number yet;
     ``n_instances`` of the map so far.
 
-    ``doing``: what is done from now on that is none of these steps.
+    ``activity``: what is done from now on that is none of these steps.
     """
 
     unit: str
@@ -51,7 +51,7 @@ class Event:
     done: int = 0
     total: int = 0
     n_instances: int | None = None
-    doing: str = ""
+    activity: str = ""
 
 
 Report = Callable[[Event], None]
@@ -143,7 +143,7 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet. The
     # tracker, whose start would let them through again, has started by then.
     resource_tracker.ensure_running()
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_PARENT)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, PARENT_SIGNALS)
     try:
         process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
         process.start()
@@ -168,13 +168,13 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 
 
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
-    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises ``Ended`` alone."""
+    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises ``Terminated`` alone."""
     try:
         with doors(), one_thread():
             return "outcome", work(unit, report)
     except Su3dError as error:
         return "user-error", error
-    except Ended:
+    except Terminated:
         raise
     except BaseException:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
         return "internal-error", traceback.format_exc()
@@ -199,16 +199,16 @@ def _cause(exit_code: int | None) -> str:
 
 
 def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
-    for number in FOR_THE_PARENT:
+    for number in PARENT_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, FOR_THE_PARENT)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, PARENT_SIGNALS)
     try:
         with ending_in_order():
             threading.Thread(target=_end_with_parent, daemon=True).start()
             connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
             connection.close()
         gc.freeze()  # all that is left goes with the process: nobody need search it for cycles
-    except Ended as end:  # all is let go of; the parent is told how it came
+    except Terminated as end:  # all is let go of; the parent is told how it came
         signal.signal(end.number, signal.SIG_DFL)
         os.kill(os.getpid(), end.number)
 

@@ -13,22 +13,22 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, Setting, Settings, read_file
+from su3d_bench.core.config import DEFAULT_SOURCE, NEUTRAL_SETTINGS, KeyPath, Setting, Settings, read_file
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, StoreError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.questions.solver import MOVES_ANSWERS
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, ConfiguredMethods, SceneJob
+from su3d_bench.questions.solver import ANSWER_SETTINGS
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, NOT_IN_KEY, REPLACE_HINT, ConfiguredMethods, SceneJob
 from su3d_bench.store.records import RunRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Into = Literal["own", "extend", "replace"]  # what a request wants of a folder that holds a run
 Start = Literal["begun", "kept", "replaced"]  # what a plan does with it, see ``Plan``
 JOINED = ("scenes", "methods", "protocols")
-OF_THIS_CALL = MOVES_NO_NUMBER - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
+CALL_SETTINGS = NEUTRAL_SETTINGS - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
 FINISHED = ("complete", "incomplete")
-MOST_NAMED = 3
+MAX_NAMED = 3
 SEAL = "# whole: "
 
 
@@ -82,7 +82,7 @@ class ExistingRun:
         return own or self.asked("protocols")
 
 
-def sealed(text: str) -> str:
+def with_end_marker(text: str) -> str:
     """``run.toml`` with a last line that tells whether all of it is there, as after a power cut it may not be."""
     return f"{text}{SEAL}{digest_bytes(text.encode())}\n"
 
@@ -96,15 +96,15 @@ def existing_run(folder: Path) -> ExistingRun | None:
     if not is_file(folder / "run.toml"):
         return None if record is None else ExistingRun(folder, None, record)
     content = file_bytes(folder / "run.toml")
-    text, seal, digest = content.rpartition(SEAL.encode())
-    if not seal or digest != f"{digest_bytes(text)}\n".encode():
+    text, mark_complete, digest = content.rpartition(SEAL.encode())
+    if not mark_complete or digest != f"{digest_bytes(text)}\n".encode():
         return ExistingRun(folder, content, record)
     lines = text.decode().splitlines()
-    entries = (_as_first_asked(entry, lines) for entry in read_file(folder / "run.toml").entries)
+    entries = (_as_first_requested(entry, lines) for entry in read_file(folder / "run.toml").entries)
     return ExistingRun(folder, content, record, True, Settings(tuple(entries)))
 
 
-def _as_first_asked(entry: Setting, lines: Sequence[str]) -> Setting:
+def _as_first_requested(entry: Setting, lines: Sequence[str]) -> Setting:
     """``entry`` of a file with these ``lines``, its source that of the remark which stands behind it there."""
     _, mark, remark = lines[int(entry.source.rpartition(":")[2]) - 1].rpartition("  # ")
     return replace(entry, source=remark.strip()) if mark else entry
@@ -124,7 +124,7 @@ def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
             both = list(dict.fromkeys([*before, *map(str, given[-1].value)]))
             joined.append(replace(given[-1], value=both))
     names = {entry.path[0] for entry in joined}
-    old = [entry for entry in held.settings.entries if entry.path[0] not in {*names, *OF_THIS_CALL}]
+    old = [entry for entry in held.settings.entries if entry.path[0] not in {*names, *CALL_SETTINGS}]
     new = [entry for entry in asked.entries if entry.path[0] not in names]
     return Settings((*old, *new, *joined))
 
@@ -153,7 +153,7 @@ def _names(record: RunRecord, name: str) -> tuple[str, ...]:
 
 def _some(noun: str, names: Sequence[str]) -> str:
     """``scenes a, b, c and 2 more are``"""
-    shown_names = some([printable(name, 80) for name in names], MOST_NAMED)
+    shown_names = some([printable(name, 80) for name in names], MAX_NAMED)
     return f"{noun} {shown_names} is" if len(names) == 1 else f"{noun}s {shown_names} are"
 
 
@@ -163,7 +163,7 @@ def _changed_values(held: ExistingRun, now: Request) -> list[str]:
     parts = {path[:2] for path in old if len(path) > 2} & {path[:2] for path in new if len(path) > 2}
     clauses = []
     for path in dict.fromkeys([*new, *old]):
-        if len(path) == 1 and (path[0] in (*JOINED, "stride") or path[0] in MOVES_NO_NUMBER):
+        if len(path) == 1 and (path[0] in (*JOINED, "stride") or path[0] in NEUTRAL_SETTINGS):
             continue
         if path[0] in ("method", "dataset") and (path[:2] not in parts or path[2:] == ("stride",)):
             continue
@@ -180,7 +180,7 @@ def _changed_values(held: ExistingRun, now: Request) -> list[str]:
 def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
     """Whether what stands at ``path`` can move a number of the request that has these ``values``."""
     if path[:2] == ("perception", "language"):
-        return values.get(("solver",)) == "llm" and path[2:3] in [(name,) for name in MOVES_ANSWERS]
+        return values.get(("solver",)) == "llm" and path[2:3] in [(name,) for name in ANSWER_SETTINGS]
     return not ".".join(path).startswith(NOT_IN_KEY)
 
 
@@ -207,18 +207,18 @@ def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
     return values.get(("stride",)) or values.get(("method", method, "stride"), 1)
 
 
-def refuse_other_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
+def check_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
     """A ``StoreError`` that says how the run at ``where`` differs from ``now``, with the choices that there are."""
     names, values = differences(held, now)
     if into == "extend":  # what is new is what it is for
         names = [clause for clause in names if not clause.endswith(" new")]
     if into == "replace" or not (names or values):
         return
-    what, name = some([*names, *values], MOST_NAMED), printable(where, 300)
+    what, name = some([*names, *values], MAX_NAMED), printable(where, 300)
     if into == "extend":
-        raise StoreError(f"{name}: cannot be extended by this ({what}); {INSTEAD}")
+        raise StoreError(f"{name}: cannot be extended by this ({what}); {REPLACE_HINT}")
     join = "" if values else "--extend adds this one to it, "
-    raise StoreError(f"{name}: holds another run ({what}); {join}{INSTEAD}")
+    raise StoreError(f"{name}: holds another run ({what}); {join}{REPLACE_HINT}")
 
 
 def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
@@ -229,7 +229,7 @@ def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder
     kept = {at.path for at, key in keys if at.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None}
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
-    for stranger in folder.strangers():
+    for stranger in folder.foreign_files():
         if any(f"{stranger}/".startswith(f"{name}/") or name.startswith(f"{stranger}/") for name in names):
             raise StoreError(
                 f"{shown(folder.path / stranger)}: is of no run and would go with what --replace removes; move it"

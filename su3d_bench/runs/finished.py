@@ -31,8 +31,8 @@ from su3d_bench.core.files.atomic import is_file, read_json
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.costs import UpdateTimes
-from su3d_bench.metrics.fitness import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
 
 
-MOST_NAMED = 8  # scenes or methods of a run in a message
+MAX_NAMED = 8  # scenes or methods of a run in a message
 
 
-def made_elsewhere(formats: Sequence[str]) -> str:
+def external(formats: Sequence[str]) -> str:
     """What stands beneath every table of predictions that were not made here."""
     return f"predictions made elsewhere, read from files ({printable(', '.join(formats), 120)})"
 
@@ -134,10 +134,10 @@ class FinishedRun:
         """The dataset of ``scene``, whose data are those of the run; a ``DataError`` where they are others."""
         return self.data.dataset(scene)
 
-    def told_truth(self, method: str) -> Part | None:
+    def visible_truth(self, method: str) -> Part | None:
         """The method with its settings where it is one of the program's own that is told the truth."""
-        is_own = method in registry.METHODS and method not in self.made_elsewhere
-        is_told = is_own and hasattr(registry.load("method", method), "receive_truth")
+        is_own = method in registry.METHODS and method not in self.external
+        is_told = is_own and hasattr(registry.load("method", method), "receive_ground_truth")
         return part_of("method", method, self.data.settings) if is_told else None
 
     def encoder(self, device: str = "cpu") -> Encoder:
@@ -149,14 +149,14 @@ class FinishedRun:
         return printable(str(self.folder.path), 200)
 
     @cached_property
-    def made_elsewhere(self) -> Mapping[str, records.PredictionsRecord]:
+    def external(self) -> Mapping[str, records.PredictionsRecord]:
         """The predictions that were made elsewhere, by the method that they are called."""
         return {record.method: record for record in self.record.predictions}
 
     def elsewhere_lines(self) -> list[str]:
         """A line a method whose predictions were made elsewhere."""
-        of_methods = self.made_elsewhere.items()
-        return [f"{printable(method, 80)}: {made_elsewhere(record.formats)}" for method, record in of_methods]
+        of_methods = self.external.items()
+        return [f"{printable(method, 80)}: {external(record.formats)}" for method, record in of_methods]
 
     def labels(self, method: str, protocol: str, rules: ProtocolRules) -> str | None:
         """How many labels of a mask or point a result is of, see ``labels_counted``; None where no label counts."""
@@ -237,7 +237,7 @@ def read_run(path: Path) -> FinishedRun:
     """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
     shown = printable(str(path), 200)
     if not is_file(path / "run.json"):
-        raise StoreError(f"{shown}: {_why_no_run(path)}")
+        raise StoreError(f"{shown}: {_no_run_message(path)}")
     if not is_file(path / "metrics.json"):
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
     record = records.read_record(records.RunRecord, path / "run.json", shown)
@@ -266,9 +266,9 @@ def read_run(path: Path) -> FinishedRun:
     )
 
 
-def _why_no_run(path: Path) -> str:
+def _no_run_message(path: Path) -> str:
     """What is at ``path`` in place of a run, and what would be one."""
-    if is_file(path) and is_numbers_alone(path):
+    if is_file(path) and is_scores_file(path):
         return (
             "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out "
             "runs/mine, and name that folder"
@@ -281,7 +281,7 @@ def _why_no_run(path: Path) -> str:
     return "holds no run.json; name the folder of a run, such as runs/my-run"
 
 
-def is_numbers_alone(file: Path) -> bool:
+def is_scores_file(file: Path) -> bool:
     """Whether ``file`` is what ``evaluate --json`` writes."""
     try:
         value = read_json(file)
@@ -323,7 +323,7 @@ def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
         return StoreError(f"{shown(run.path)}: holds no run; name the folder of one: su3d-bench runs list")
     if scene not in record.scenes:
         known = [printable(name, 80) for name in record.scenes]
-        hint = nearest_scene(scene, record.scenes) or f"; the run has {some(known, MOST_NAMED)}"
+        hint = nearest_scene(scene, record.scenes) or f"; the run has {some(known, MAX_NAMED)}"
     elif method not in record.methods:
         hint = suggest(method, record.methods, "the run has")
     else:
@@ -340,8 +340,8 @@ def _request_of(run: RunFolder) -> records.RunRecord:
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
     """The data from which ``map_file`` was made, a sealed map of ``scene`` in the folder ``run``, finished or not."""
-    seal = JobFolder(map_file.parent).seals().get("predict")
-    digests = {} if seal is None else {scene: seal.key.get("data", "")}
+    mark_complete = JobFolder(map_file.parent).completion_records().get("predict")
+    digests = {} if mark_complete is None else {scene: mark_complete.key.get("data", "")}
     return RunData(read_file(run / "run.toml"), digests, _request_of(RunFolder(run)).truth_files)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from su3d_bench.core import interfaces, types
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Proposals, starts_of
-from su3d_bench.core.printing import one_line, plain_text
+from su3d_bench.core.safe_output import one_line, plain_text
 from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors import Event, Report
@@ -93,7 +93,7 @@ def warm_up(method: interfaces.Method) -> None:
     for _ in range(N_WARM_UP):
         method.update(frame, detections, Timer())
     method.finish()
-    if isinstance(method, interfaces.Closes):
+    if isinstance(method, interfaces.Closable):
         method.close()
 
 
@@ -163,7 +163,7 @@ CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates
 SIZES = ("n_points", "n_instances", "map_bytes")
 
 
-class Feeding:
+class MethodFeed:
     """One method on one scene: ``maps`` holds, for each map written, the updates before it and what it took."""
 
     def __init__(
@@ -184,7 +184,7 @@ class Feeding:
         """The median time of the calibrating piece of work between the updates; None where there was none."""
         return round(float(np.median(self._calibrations)), 4) if self._calibrations else None
 
-    def up_to(self, n_fed: int, frames: ReadAhead[types.Frame], n_frames: int) -> None:
+    def feed_until(self, n_fed: int, frames: ReadAhead[types.Frame], n_frames: int) -> None:
         """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come.
 
         Stage ``decode`` is what an update waited for its frame.

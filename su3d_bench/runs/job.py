@@ -12,19 +12,19 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import RunConfig, Settings, flatten, resolve
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import Method, TakesTruth
+from su3d_bench.core.interfaces import Method, UsesGroundTruth
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
-from su3d_bench.metrics.semantic.panoptic import told_truth
+from su3d_bench.metrics.semantic.panoptic import visible_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
 from su3d_bench.runs.plugins import checked_dataset, checked_method, made, settings_model, told
-from su3d_bench.store.records import SealRecord
+from su3d_bench.store.records import CompletionRecord
 from su3d_bench.store.run_folder import JobFolder
 
 
@@ -60,7 +60,7 @@ def build_method(part: Part) -> Any:
     return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
 
 
-def as_told(
+def as_configured(
     part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
 ) -> Prediction:
     """``prediction``, a map of the method ``part``; that of a method that is told the truth is made anew where it must
@@ -72,19 +72,19 @@ def as_told(
     method = build_method(part)
     if isinstance(truth, OpenLexTruth):
         truth = truth.by_first_synonym()
-    if not isinstance(method, TakesTruth) or not isinstance(truth, GroundTruth):
+    if not isinstance(method, UsesGroundTruth) or not isinstance(truth, GroundTruth):
         return prediction
-    told = told_truth(rules, truth)
+    told = visible_truth(rules, truth)
     if told is truth and truth.labels == first():
         return prediction
-    method.receive_truth(told)
-    made_anew: Prediction = method.finish()
-    return made_anew
+    method.receive_ground_truth(told)
+    recomputed: Prediction = method.finish()
+    return recomputed
 
 
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
-INSTEAD = "--replace puts this one in its place, or choose another folder with --out"
+REPLACE_HINT = "--replace puts this one in its place, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
 
@@ -163,7 +163,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
     key |= {f"input.{name}": digest for name, digest in told(method, "inputs", {}).items()}
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
-        if digest := own_code(target):
+        if digest := custom_code_key(target):
             key[f"code.{kind}"] = digest
     return (
         key
@@ -187,15 +187,15 @@ class ConfiguredMethods:
         return self._known[job.dataset, part]
 
 
-def own_code(target: str) -> str | None:
+def custom_code_key(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
     return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
-def refuse_other_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
+def check_same_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
     """A ``StoreError`` where ``folder`` was sealed under another key; ``is_early``: what is known later aside."""
     if changed := folder.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER if is_early else ()):
-        raise StoreError(f"{folder.path}: holds another run ({changed}); {INSTEAD}")
+        raise StoreError(f"{folder.path}: holds another run ({changed}); {REPLACE_HINT}")
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
@@ -232,13 +232,17 @@ class JobInputs:
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
         if self.job.config.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
-        return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
+        return key | refined_digest(folder) if any(protocol.uses_names for protocol in rules.values()) else key
 
-    def is_scored(self, folder: JobFolder, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``seal`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
-        if seal is not None and not self.job.config.pictures and seal.key.get("pictures") == str(True):
+    def is_scored(self, folder: JobFolder, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
+        """Whether ``mark_complete`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
+        if (
+            mark_complete is not None
+            and not self.job.config.pictures
+            and mark_complete.key.get("pictures") == str(True)
+        ):
             key = {**key, "pictures": str(True)}
-        return folder.is_whole(seal, key)
+        return folder.is_whole(mark_complete, key)
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are sealed; ``remarks`` stand beside the seal of the scores."""

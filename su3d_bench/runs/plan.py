@@ -13,7 +13,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import (
-    MOVES_NO_NUMBER,
+    NEUTRAL_SETTINGS,
     KeyPath,
     RunConfig,
     Setting,
@@ -30,7 +30,7 @@ from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
-from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
@@ -40,13 +40,21 @@ from su3d_bench.runs.existing import (
     Into,
     Request,
     Start,
+    check_request,
     differences,
     existing_run,
     extended,
-    refuse_other_request,
     replaced_jobs,
 )
-from su3d_bench.runs.job import ConfiguredMethods, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
+from su3d_bench.runs.job import (
+    ConfiguredMethods,
+    Part,
+    SceneJob,
+    check_same_run,
+    custom_code_key,
+    options_model,
+    part_of,
+)
 from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
@@ -67,8 +75,8 @@ def asked_settings(
     )
 
 
-MOST_NAMED = 4  # scenes and methods whose maps go
-MOST_CHARACTERS = 120  # the name is a folder's name too
+MAX_NAMED = 4  # scenes and methods whose maps go
+MAX_CHARACTERS = 120  # the name is a folder's name too
 COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 
 
@@ -101,7 +109,7 @@ def named_method(text: str) -> NamedMethod:
     if at < 0:
         return NamedMethod(target, base, base, ())
     name = f"{base}@{variant.replace(' ', '')}"
-    if not variant or "/" in variant or not variant.isprintable() or len(name) > MOST_CHARACTERS:
+    if not variant or "/" in variant or not variant.isprintable() or len(name) > MAX_CHARACTERS:
         raise ConfigError(f"--methods {text}: expected METHOD@PRESET or METHOD@KEY=VALUE, such as opensu3d@top_m=1")
     values = _assigned(text, variant) if "=" in variant else _preset(text, base, method, variant)
     entries = tuple(Setting(("method", name, *path), value, f"--methods {text}") for path, value in flatten(values))
@@ -211,10 +219,10 @@ def make_plan(
     if config.profile not in PROFILES:
         raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
     named_methods = [named_method(text) for text in _method_targets(config.methods)]
-    _check_one_a_name("--methods", [(method.name, method.essence) for method in named_methods])
+    _check_unique_names("--methods", [(method.name, method.essence) for method in named_methods])
     named = {method.name: method for method in named_methods}
     named_datasets = [(str(registry.load("dataset", target).name), target) for target in dataset_targets(config.scenes)]
-    _check_one_a_name("--scenes", named_datasets)
+    _check_unique_names("--scenes", named_datasets)
     targets = dict(named_datasets)
     settings += read_assignments(assignments, [*{method.base for method in named_methods}, *named], list(targets))
     _check_sections("method", settings, {method.base: method.target for method in named_methods}, list(named))
@@ -236,7 +244,7 @@ def make_plan(
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
         existing = existing_run(place.folder.path)
     if place.url is None:
-        place.folder.refuse_other_content()
+        place.folder.check_is_run_folder()
     root = os.environ.get("SU3D_DATA") or ""
     with data_place(root) if is_url(root) else nullcontext(DataPlace(data_root())) as data_root_here:
         chosen, notes = expand_scenes(config.scenes, datasets, data_root_here.root)
@@ -272,33 +280,33 @@ def _started(plan: Plan, into: Into) -> Plan:
     """``plan`` with what becomes of the run in its folder; a ``StoreError`` where that is another one."""
     existing = plan.existing
     if existing is not None:
-        refuse_other_request(existing, plan.request, into, plan.place.name)
+        check_request(existing, plan.request, into, plan.place.name)
     methods = ConfiguredMethods()
     for job in plan.jobs:
         for part in job.methods:
             folder = plan.folder.job(job.scene, part.name)
-            folder.refuse_links()
+            folder.check_no_links()
             if into != "replace":
-                refuse_other_run(folder, methods.of(job, part)[1], is_early=True)
+                check_same_run(folder, methods.of(job, part)[1], is_early=True)
     if into == "replace":
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
         if removes or (existing is not None and any(differences(existing, plan.request))):
-            return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
+            return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_removed_lines(plan, removes)))
         # else the run that replaced another is resumed
     return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")
 
 
-def _what_goes(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
+def _removed_lines(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
     if not removes:
         return []
     going = [job.path.parts[-2:] for job in removes]
     scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
-    which = f"{some([scene_of_folder(name) for name in scenes], MOST_NAMED)} by {some(methods, MOST_NAMED)}"
+    which = f"{some([scene_of_folder(name) for name in scenes], MAX_NAMED)} by {some(methods, MAX_NAMED)}"
     n_all = len(plan.folder.jobs())
     return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} go: {which}"]
 
 
-def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
+def _check_unique_names(flag: str, named: Iterable[tuple[str, Any]]) -> None:
     """A ``ConfigError`` where a name cannot be that of a folder, or two things that differ share one."""
     found: dict[str, Any] = {}
     for name, value in named:
@@ -309,7 +317,7 @@ def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
 
 def check_folder_name(flag: str, name: str) -> None:
     """A ``ConfigError`` where ``name``, which ``flag`` gave, cannot be that of a folder."""
-    is_plain = name.isprintable() and "/" not in name and len(name) <= MOST_CHARACTERS
+    is_plain = name.isprintable() and "/" not in name and len(name) <= MAX_CHARACTERS
     if not name or name.startswith(".") or not is_plain:
         raise ConfigError(
             f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
@@ -362,14 +370,16 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
         return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
     wanted = list(dict.fromkeys(wanted))
     rules = [load_protocol(name) for name in wanted]
-    _check_one_a_name("--protocols", [(rule.name, rule) for rule in rules])
+    _check_unique_names("--protocols", [(rule.name, rule) for rule in rules])
     truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
     for rule in rules:
-        reasons = [reason for truth in truths.values() if (reason := why_not_truth(rule, truth)) is not None]
+        reasons = [reason for truth in truths.values() if (reason := truth_incompatibility(rule, truth)) is not None]
         if len(reasons) == len(truths):
             raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(name for name, rule in zip(wanted, rules, strict=True) if why_not_truth(rule, truth) is None)
+        target: tuple(
+            name for name, rule in zip(wanted, rules, strict=True) if truth_incompatibility(rule, truth) is None
+        )
         for target, truth in truths.items()
     }
 
@@ -380,7 +390,7 @@ def _usual_protocols(dataset: Any) -> tuple[str, ...]:
         return tuple(own)
     truth = TruthFacts.of_dataset(dataset)
     known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
-    return tuple(rules.name for rules in known if truth.variants and why_not_truth(rules, truth) is None)
+    return tuple(rules.name for rules in known if truth.variants and truth_incompatibility(rules, truth) is None)
 
 
 def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
@@ -402,8 +412,8 @@ def asks_questions(protocols: Sequence[str]) -> bool:
 
 
 def _run_name(config: RunConfig, methods: Sequence[Part], datasets: Sequence[Part], perception: str) -> str:
-    request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
+    request = config.model_dump(mode="json", exclude=set(NEUTRAL_SETTINGS))
     options = [part.options for part in (*methods, *datasets)]
-    own = [digest for part in (*methods, *datasets) if (digest := own_code(part.target))]
+    own = [digest for part in (*methods, *datasets) if (digest := custom_code_key(part.target))]
     key = digest_json([request, options, perception, code_digest(), *own])[:8]
     return "-".join([*(part.name for part in datasets), config.profile, key])

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from su3d_bench.core import maps, types
-from su3d_bench.core.errors import PlugInError, Su3dError, own_line, printable
+from su3d_bench.core.errors import PlugInError, Su3dError, printable, user_code_line
 from su3d_bench.core.interfaces import ABILITIES, INTERFACES
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface
@@ -41,7 +41,7 @@ ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
 # ---- what is wrong with values of the right type: their dataclasses check shapes that must agree
 
 
-def fault_of(found: Any) -> str | None:
+def validation_error(found: Any) -> str | None:
     """What is wrong with an answer of the right type; None where nothing is."""
     match found:
         case SceneInfo():
@@ -152,7 +152,7 @@ def _answers(kind: str) -> dict[str, Any]:
     return {name: get_type_hints(one)["return"] for name, one in functions.items() if inspect.isfunction(one)}
 
 
-def is_ours(plug_in: type) -> bool:
+def is_built_in(plug_in: type) -> bool:
     return plug_in.__module__.startswith("su3d_bench.")
 
 
@@ -166,7 +166,7 @@ def settings_model(plug_in: type, name: str) -> type[BaseModel]:
 
 def made(plug_in: type, *words: Any) -> Any:
     """An object of the class; what its ``__init__`` does not take is told with its line."""
-    if is_ours(plug_in):
+    if is_built_in(plug_in):
         return plug_in(*words)
     function = plug_in.__init__  # type: ignore[misc]
     return _called(place_of(plug_in, "__init__", function), plug_in, words, {})
@@ -174,12 +174,12 @@ def made(plug_in: type, *words: Any) -> Any:
 
 def checked_dataset(dataset: Any) -> Any:
     """``dataset``; a user-defined one checks from now on what it gives."""
-    return dataset if is_ours(type(dataset)) else _watched(dataset, "dataset")
+    return dataset if is_built_in(type(dataset)) else _watched(dataset, "dataset")
 
 
 def checked_method(method: Any) -> Any:
     """``method``; a user-defined one checks from now on what it gives."""
-    if is_ours(type(method)):
+    if is_built_in(type(method)):
         return method
     told(method, "needs")
     return _watched(method, "method")
@@ -188,10 +188,10 @@ def checked_method(method: Any) -> Any:
 def told(method: Any, name: str, without: Any = None) -> Any:
     """The property ``name`` of a method; ``without`` where it has none."""
     value = getattr(method, name, without)
-    if not is_ours(type(method)) and hasattr(method, name):
+    if not is_built_in(type(method)) and hasattr(method, name):
         known = inspect.getattr_static(type(method), name, None)
         place = place_of(type(method), name, known.fget if isinstance(known, property) else known)
-        _sound(place, value, _answers("method")[name])
+        _validated(place, value, _answers("method")[name])
     return value
 
 
@@ -219,13 +219,13 @@ def _watched(plug_in: Any, kind: str) -> Any:
 
 def _asked(plug_in: Any, name: str, function: Callable[..., Any], answer: Any, *words: Any, **named: Any) -> Any:
     place = place_of(type(plug_in), name, function)
-    found = _sound(place, _called(place, function, words, named), answer)
+    found = _validated(place, _called(place, function, words, named), answer)
     if name == "frames":
         return _Frames(place, found)
     if name == "digest" and not found:
         raise PlugInError(f"{place} gave an empty text; expected a key that is equal only where the data are")
     for k, entry in enumerate(found if get_origin(answer) is Sequence else ()):
-        _sound(f"{place}(...)[{k}]", entry, get_args(answer)[0])
+        _validated(f"{place}(...)[{k}]", entry, get_args(answer)[0])
     return found
 
 
@@ -239,12 +239,12 @@ def _called(place: str, function: Callable[..., Any], words: Sequence[Any], name
         raise
     except Su3dError as error:
         is_of_types = traceback.extract_tb(error.__traceback__)[-1].filename in (types.__file__, maps.__file__)
-        if is_of_types and not isinstance(error, PlugInError) and (line := own_line(error)):
+        if is_of_types and not isinstance(error, PlugInError) and (line := user_code_line(error)):
             raise PlugInError(f"{line}: {error}") from error
         raise
 
 
-def _sound(place: str, found: Any, answer: Any) -> Any:
+def _validated(place: str, found: Any, answer: Any) -> Any:
     """``found`` in its stored form; a ``PlugInError`` where it is no ``answer`` or holds what cannot be."""
     if answer in (Any, NoneType):
         return found
@@ -255,7 +255,7 @@ def _sound(place: str, found: Any, answer: Any) -> Any:
         wanted = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
         raise PlugInError(f"{place} gave {_kind_of(found)}; expected {wanted}")
     found = in_stored_form(found)
-    if (fault := fault_of(found)) is not None:
+    if (fault := validation_error(found)) is not None:
         raise PlugInError(f"{place}: {fault}")
     return found
 
@@ -272,7 +272,7 @@ class _Frames(Sequence[Frame]):
 
     def __getitem__(self, k: Any) -> Any:
         place = f"{self._place}(...)[{k}]"
-        return _sound(place, _called(place, self._frames.__getitem__, (k,), {}), Frame)
+        return _validated(place, _called(place, self._frames.__getitem__, (k,), {}), Frame)
 
 
 def _kind_of(value: Any) -> str:

@@ -14,13 +14,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from su3d_bench.core.errors import DataError, error_line
-from su3d_bench.core.interfaces import SaysUp
+from su3d_bench.core.interfaces import ProvidesUpAxis
 from su3d_bench.core.registry import DATASETS
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.runs.job import SceneJob, build_dataset, build_method
 from su3d_bench.store.run_folder import RunFolder
 
-ALL_THE_SAME = "--accept-poses runs it all the same"
+ACCEPT_POSES_HINT = "--accept-poses runs it all the same"
 REMARK = "doubts"  # beside the seal of a prediction
 
 
@@ -40,7 +40,7 @@ def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
     wrong = [lines[0] for job, (lines, is_wrong) in pairs if is_wrong and not job.config.accept_poses]
     if wrong:
         others = f" (and {len(wrong) - 1} more of {len(jobs)} scenes)" if len(wrong) > 1 else ""
-        raise PosesContradicted(f"{wrong[0]}{others}; {ALL_THE_SAME}")
+        raise PosesContradicted(f"{wrong[0]}{others}; {ACCEPT_POSES_HINT}")
     return tuple(replace(job, doubts=lines) for job, (lines, _) in pairs)
 
 
@@ -64,7 +64,7 @@ def _remarks(job: SceneJob) -> Remarks:
             return NOTHING
         verdict = judge_scene(dataset, job.scene_name)
         lines = [] if verdict is None else [verdict.line]
-        if isinstance(dataset, SaysUp) and (doubt := dataset.up(job.scene_name).doubt) is not None:
+        if isinstance(dataset, ProvidesUpAxis) and (doubt := dataset.up(job.scene_name).doubt) is not None:
             lines.append(f"{job.scene}: {doubt}")
         return tuple(lines), verdict is not None and verdict.is_wrong
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; a scene that cannot be read fails later

@@ -28,7 +28,7 @@ from su3d_bench.store.run_folder import JOBS, RECORDS, JobFolder, RunFolder
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
 BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
-MOST_NAME_CHARACTERS = 1024  # the longest key of an S3 object
+MAX_NAME_CHARACTERS = 1024  # the longest key of an S3 object
 
 
 def is_url(text: str) -> bool:
@@ -58,7 +58,7 @@ class RemoteFolder:
     def files(self, below: str = "") -> dict[str, int]:
         """Size in bytes of every file in the folder ``below``, by name; empty where there is none."""
         start = f"{self._root}/{below}".rstrip("/")
-        with self._telling("cannot be listed"):
+        with self._with_context("cannot be listed"):
             self._driver.invalidate_cache()
             try:
                 entries = self._driver.find(start, detail=True)
@@ -75,7 +75,7 @@ class RemoteFolder:
         """A name from a store may not lead out of the folder that it is copied to."""
         parts = name.split("/")
         is_plain = name.isprintable() and "\\" not in name and not {"", ".", ".."} & set(parts)
-        if not is_plain or len(name) > MOST_NAME_CHARACTERS:
+        if not is_plain or len(name) > MAX_NAME_CHARACTERS:
             raise StoreError(f"{self.url}: holds '{printable(name, 120)}', which is no name of a file; remove it")
 
     def fetch(self, sizes: Mapping[str, int], into: Path) -> None:
@@ -83,7 +83,7 @@ class RemoteFolder:
         for name, size in sizes.items():
             target = into / name
             make_folder(target.parent)
-            with replacing(target) as stream, self._telling(f"{name} cannot be copied to {into}"):
+            with replacing(target) as stream, self._with_context(f"{name} cannot be copied to {into}"):
                 self._driver.get_file(f"{self._root}/{name}", str(stream.name))
             if target.stat().st_size != size:
                 raise StoreError(
@@ -95,14 +95,14 @@ class RemoteFolder:
         wanted = list(names)
         for start in range(0, len(wanted), AT_ONCE):
             paths = {f"{self._root}/{name}": name for name in wanted[start : start + AT_ONCE]}
-            with self._telling("cannot be read"):
+            with self._with_context("cannot be read"):
                 contents = self._driver.cat(list(paths), on_error="omit")
             yield from ((paths[path], content) for path, content in contents.items())
 
     def send(self, folder: Path, names: Sequence[str]) -> None:
         """Copy the files ``names`` of ``folder`` here, one after the other, in this order."""
         for name in names:
-            with self._telling(f"{name} cannot be written"):
+            with self._with_context(f"{name} cannot be written"):
                 path = f"{self._root}/{name}"
                 if not self._has_buckets:
                     self._driver.makedirs(path.rpartition("/")[0], exist_ok=True)
@@ -111,12 +111,12 @@ class RemoteFolder:
     def remove(self, names: Iterable[str]) -> None:
         """Remove the files ``names`` where they exist."""
         for name in names:
-            with self._telling(f"{name} cannot be removed"):
+            with self._with_context(f"{name} cannot be removed"):
                 if self._driver.exists(f"{self._root}/{name}"):
                     self._driver.rm_file(f"{self._root}/{name}")
 
     @contextmanager
-    def _telling(self, what: str) -> Iterator[Any]:
+    def _with_context(self, what: str) -> Iterator[Any]:
         try:
             yield
         except Exception as error:  # each driver has errors of its own (botocore's, gcsfs's), with no class in common
@@ -124,7 +124,7 @@ class RemoteFolder:
             raise StoreError(f"{self.url}: {what}: {reason}") from error
 
 
-MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
+MAX_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str
     shared = {
         name: sizes[name]
         for name, owner in owners.items()
-        if owner is None and _top(name) in tops and sizes[name] <= MOST_SHARED_BYTES
+        if owner is None and _top(name) in tops and sizes[name] <= MAX_SHARED_BYTES
     }
     files: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
     for name, owner in owners.items():
@@ -258,8 +258,8 @@ class StoredRun:
         """The run at ``url``; the mirror then holds its records and seals, and no others."""
         place = cls(url, RunFolder(mirror_of(url, cache_root)))
         mirror, store = place.folder.path, RemoteFolder(url)
-        seal = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
-        names = [name for name in store.files() if name in RECORDS or seal.fullmatch(name)]
+        mark_complete = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
+        names = [name for name in store.files() if name in RECORDS or mark_complete.fullmatch(name)]
         if names or mirror.exists():
             with place.folder.locked():
                 for path in (*mirror.glob(f"{JOBS}/*/*/{SEAL}"), *(mirror / name for name in RECORDS)):

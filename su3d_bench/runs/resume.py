@@ -10,10 +10,10 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig, resolve
 from su3d_bench.runs.job import ConfiguredMethods, JobInputs, MethodOutcome, Part, SceneJob, build_dataset, stride_of
 from su3d_bench.runs.poses import silent
 from su3d_bench.runs.scene import perception_of
-from su3d_bench.store.records import SealRecord
+from su3d_bench.store.records import CompletionRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
-SAME_EVERYWHERE = ("embedded", "paper")  # profiles whose digest does not depend on the scene
+SCENE_INDEPENDENT_PROFILES = ("embedded", "paper")  # profiles whose digest does not depend on the scene
 
 
 class FinishedScenes:
@@ -33,27 +33,29 @@ class FinishedScenes:
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
         """The outcomes of a scene, that of the ceiling last; None where a worker is needed, be it to say an error."""
         folders = [RunFolder(job.folder).job(job.scene, part.name) for part in job.parts]
-        seals = [folder.seals() for folder in folders]
-        if any("predict" not in seal or "score" not in seal for seal in seals):
+        completion_records = [folder.completion_records() for folder in folders]
+        if any("predict" not in mark_complete or "score" not in mark_complete for mark_complete in completion_records):
             return None
         try:
             with silent():
-                outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, seals, strict=True)]
+                outcomes = [
+                    self._outcome(job, *each) for each in zip(job.parts, folders, completion_records, strict=True)
+                ]
         except Exception:  # noqa: BLE001 - a plug-in may raise anything; the worker reports it
             return None
         return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 
     def _outcome(
-        self, job: SceneJob, part: Part, folder: JobFolder, seals: Mapping[str, SealRecord]
+        self, job: SceneJob, part: Part, folder: JobFolder, completion_records: Mapping[str, CompletionRecord]
     ) -> MethodOutcome | None:
         inputs = self.inputs(job, part)
         if inputs is None:
             return None
         key = inputs.predict_key()
-        is_done = folder.is_whole(seals["predict"], key)
-        if not is_done or not inputs.is_scored(folder, seals["score"], inputs.score_key(key, folder)):
+        is_done = folder.is_whole(completion_records["predict"], key)
+        if not is_done or not inputs.is_scored(folder, completion_records["score"], inputs.score_key(key, folder)):
             return None
-        return inputs.outcome(seals["score"].remarks, was_resumed=True)
+        return inputs.outcome(completion_records["score"].remarks, was_resumed=True)
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """What decides the numbers of a job; None where only a worker can tell."""
@@ -71,6 +73,6 @@ class FinishedScenes:
         if info.image_domain not in self._perceptions:
             config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
             profile = resolve_profile(job.config.profile, info.image_domain, config)
-            is_same = profile in SAME_EVERYWHERE and config.models.device == "cpu"
+            is_same = profile in SCENE_INDEPENDENT_PROFILES and config.models.device == "cpu"
             self._perceptions[info.image_domain] = perception_of(job, info) if is_same else None
         return self._perceptions[info.image_domain]

@@ -21,12 +21,12 @@ from su3d_bench.core.files.atomic import is_file, read_json, remove_abandoned, r
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.reports.tables.run import Found
 from su3d_bench.runs.clusters import RunUnits, executor_for
-from su3d_bench.runs.distant import distant_jobs, failed_distant, run_distant_scene
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
-from su3d_bench.runs.existing import differences, sealed
+from su3d_bench.runs.existing import differences, with_end_marker
 from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.poses import judged_where_read_here
+from su3d_bench.runs.remote_jobs import distant_jobs, failed_distant, run_distant_scene
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.runs.summary import found_in, outcomes_without_score, record, remarks_of, summarise
@@ -64,7 +64,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         if plan.start != "kept":
             _write_request(plan)
         outcomes = _execute(plan, report, run)
-        report(Event("", SCENE_DONE, doing="adding up"))
+        report(Event("", SCENE_DONE, activity="adding up"))
         metrics = plain(summarise(plan, outcomes))
         if not _is_unchanged(plan, outcomes, metrics):
             _write_results(plan, outcomes, metrics)
@@ -89,13 +89,13 @@ def _prepared(plan: Plan) -> Iterator[None]:
             if plan.start == "replaced":
                 _remove_replaced(plan)
             else:
-                _refuse_what_came_meanwhile(plan)
+                _check_still_empty(plan)
             yield
         finally:
             remove_abandoned()
 
 
-def _refuse_what_came_meanwhile(plan: Plan) -> None:
+def _check_still_empty(plan: Plan) -> None:
     """A ``StoreError`` where another command has written its request here since this one was planned."""
     file = plan.folder.path / "run.toml"
     planned = None if plan.existing is None else plan.existing.content
@@ -123,7 +123,7 @@ def _write_request(plan: Plan) -> None:
 
 
 def _write_request_records(plan: Plan) -> None:
-    write_text(plan.folder.path / "run.toml", sealed(write_toml(resolved_values(plan))))
+    write_text(plan.folder.path / "run.toml", with_end_marker(write_toml(resolved_values(plan))))
     write_json(plan.folder.path / "run.json", plain(record(plan, (), "running")))
 
 

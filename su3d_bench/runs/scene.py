@@ -1,7 +1,7 @@
 """One scene under all methods of a run: predict, score, draw; the unit of work that executors run.
 
 The ground truth stays here: methods get frames and detections alone, except a method that asks for the truth by
-having ``receive_truth`` (the oracle, from which ceilings come).
+having ``receive_ground_truth`` (the oracle, from which ceilings come).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable
 from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.maps import Prediction, Proposals
-from su3d_bench.core.printing import one_line
+from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -30,9 +30,9 @@ from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
 from su3d_bench.perception.language.chat import ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.questions.ground_truths import question_truth
 from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.solver import MapSolver, by_language_model
-from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs import frame_loop
@@ -72,7 +72,7 @@ def failed_outcomes(job: jobs.SceneJob, reason: str) -> tuple[jobs.MethodOutcome
     for part in job.methods:
         folder = RunFolder(job.folder).job(job.scene, part.name)
         folder.prepare()
-        if "score" not in folder.seals():
+        if "score" not in folder.completion_records():
             write_text(folder.log, f"failed: {one_line(line)}\n")
     return tuple(jobs.MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
@@ -154,9 +154,9 @@ class _Scene:
                     return boxes
             raise
 
-    def says(self, part: jobs.Part, doing: str) -> None:
+    def report_activity(self, part: jobs.Part, activity: str) -> None:
         """What is done now, where no frame is fed."""
-        self.report(Event(self.job.scene, part.name, doing=doing))
+        self.report(Event(self.job.scene, part.name, activity=activity))
 
     @cached_property
     def is_rendered(self) -> bool:
@@ -194,7 +194,7 @@ class _Scene:
 
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
-        self.says(part, self.opening)
+        self.report_activity(part, self.opening)
         method = jobs.build_method(part)
         info = self.dataset.info(self.job.scene_name, jobs.stride_of(self.job, part))
         info = replace(info, seed=self.job.config.seed)
@@ -205,14 +205,14 @@ class _Scene:
         if self.job.replaces and folder.changed_field("predict", key) is not None:
             folder.remove()
             folder.prepare()
-        jobs.refuse_other_run(folder, key)
+        jobs.check_same_run(folder, key)
         was_resumed = folder.is_done("predict", key)
         if was_resumed:
             log.recall(folder.remarks("predict"))
         else:
             self._predict(part, inputs, folder, key, log)
         score_key = inputs.score_key(key, folder)
-        if not inputs.is_scored(folder, folder.seals().get("score"), score_key):
+        if not inputs.is_scored(folder, folder.completion_records().get("score"), score_key):
             self._score(part, perception, folder, score_key, log)
             was_resumed = False
         return inputs.outcome(folder.remarks("score"), was_resumed=was_resumed)
@@ -232,7 +232,7 @@ class _Scene:
             n = min(len(frames), self.job.config.limit or len(frames))
         for line in doubts:
             logger.warning("%s", line)
-        if isinstance(method, interfaces.TakesTools):
+        if isinstance(method, interfaces.UsesSceneTools):
             tools = interfaces.SceneTools(
                 frames=frame_loop.FirstFrames(frames, n),
                 regions=frame_loop.TimedRegions(inputs.perception.regions(), clock),
@@ -241,17 +241,17 @@ class _Scene:
             )
             with clock.running("start"):
                 method.receive_tools(tools)
-        if isinstance(method, interfaces.TakesTruth):
+        if isinstance(method, interfaces.UsesGroundTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             truth = self.first_truth
             with clock.running("start"):
-                method.receive_truth(truth)
-        self.says(part, "compiling the method")
+                method.receive_ground_truth(truth)
+        self.report_activity(part, "compiling the method")
         _warm_up(part)
-        self.says(part, self.opening)
+        self.report_activity(part, self.opening)
         start_memory_watch()
-        feeding = frame_loop.Feeding(
+        feeding = frame_loop.MethodFeed(
             self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)), clock
         )
         try:
@@ -259,13 +259,13 @@ class _Scene:
                 method.start(inputs.info)
             with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
                 for share in shares:
-                    feeding.up_to(math.ceil(share * n), ahead, n)
+                    feeding.feed_until(math.ceil(share * n), ahead, n)
                     feeding.write_map(folder.anytime(share))
-                feeding.up_to(n, ahead, n)
-            self.says(part, "finishing the map")
+                feeding.feed_until(n, ahead, n)
+            self.report_activity(part, "finishing the map")
             feeding.write_map(folder.prediction)
         finally:
-            if isinstance(method, interfaces.Closes):
+            if isinstance(method, interfaces.Closable):
                 with clock.running("close"):
                     method.close()
         write_text(folder.updates, feeding.updates_text())
@@ -278,7 +278,7 @@ class _Scene:
             "start_ms": round(clock.take("start").method_ms, 3),
             "close_ms": round(clock.take("close").method_ms, 3),
         }
-        folder.seal("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
+        folder.mark_complete("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
 
     def _true_proposals(self) -> Proposals:
         if not self.dataset.variants:
@@ -298,14 +298,14 @@ class _Scene:
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
         if self.job.config.pictures:
-            self.says(part, "drawing the map")
+            self.report_activity(part, "drawing the map")
             truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         reasons = [UnscoredRecord(self.job.scene, part.name, *pair) for pair in unscored.items()]
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
         doubts = folder.remarks("predict").get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
-        folder.seal("score", key, [*files, folder.log], remarks)
+        folder.mark_complete("score", key, [*files, folder.log], remarks)
 
     def scores(
         self, part: jobs.Part, encoder: interfaces.Encoder, prediction: Prediction, refined_in: JobFolder | None
@@ -315,17 +315,17 @@ class _Scene:
         unscored: dict[str, str] = {}
         for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
             if rules.ground_truth not in self._truths:
-                self.says(part, "making the truth" if self.is_rendered else "reading the truth")
+                self.report_activity(part, "making the truth" if self.is_rendered else "reading the truth")
             try:
                 truth = self.truth(rules.ground_truth)
             except GroundTruthMissing as error:
                 unscored[rules.name] = error_line(error)
                 continue
-            if (reason := why_not_scorable(rules, prediction)) is not None:
+            if (reason := kind_incompatibility(rules, prediction)) is not None:
                 unscored[rules.name] = reason
                 continue
-            self.says(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
-            told = jobs.as_told(part, rules, truth, prediction, lambda: self.first_truth.labels)
+            self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
+            told = jobs.as_configured(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
             scores[rules.name] = score_scene(rules, known, told, encoder)
         return scores, unscored

@@ -23,7 +23,7 @@ from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import hardware_line, processor_digest
-from su3d_bench.metrics.fitness import labels_counted
+from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.metric import SceneScore, n_predictions
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -40,7 +40,7 @@ from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
 Outcomes = Sequence[MethodOutcome]
-BY_THE_METHOD = "computed by the method"
+COMPUTED_BY_METHOD = "computed by the method"
 
 
 def summarise(plan: Plan, outcomes: Outcomes) -> records.MetricsRecord:
@@ -142,7 +142,7 @@ def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str 
         return f"{what}, by the protocol"
     said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
     are_equal = EVERY_SCENE in said or said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
-    return "the same for all instances of a scene" if are_equal else BY_THE_METHOD
+    return "the same for all instances of a scene" if are_equal else COMPUTED_BY_METHOD
 
 
 def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
@@ -231,7 +231,7 @@ def outcomes_without_score(plan: Plan, outcomes: Outcomes) -> list[tuple[str, st
 # ---- maps that nothing scores
 
 
-MOST_OF_A_NAME = 60  # characters
+MAX_NAME_CHARACTERS = 60  # characters
 
 
 def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Found]:
@@ -267,7 +267,9 @@ def without_score(run: FinishedRun) -> list[tuple[str, str]]:
 
 def _names(prediction: Instances) -> tuple[tuple[str, int], ...]:
     labels = prediction.labels or ("",) * len(prediction)
-    names = (printable(label or name, MOST_OF_A_NAME) for label, name in zip(labels, prediction.names, strict=True))
+    names = (
+        printable(label or name, MAX_NAME_CHARACTERS) for label, name in zip(labels, prediction.names, strict=True)
+    )
     return tuple(Counter(names).most_common())
 
 

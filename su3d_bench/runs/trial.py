@@ -12,10 +12,10 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, Setting, Settings
 from su3d_bench.core.errors import ConfigError, DataError, PlugInError
 from su3d_bench.core.maps import DenseFeatures
-from su3d_bench.datasets.checks_of_frames import check_frames, facts_of
+from su3d_bench.datasets.frame_checks import check_frames, facts_of
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.runs.plan import make_plan
-from su3d_bench.runs.plugins import is_ours, place_of
+from su3d_bench.runs.plugins import is_built_in, place_of
 from su3d_bench.runs.runner import run_plan
 from su3d_bench.store.predictions import read_prediction
 
@@ -70,7 +70,7 @@ def try_dataset(dataset: Any, scene: str) -> None:
     A ``PlugInError`` at the first answer that is not as it must be, and whatever its own code raises; what merely is
     not there, such as a file or a truth, is left to whoever checks the whole scene.
     """
-    if is_ours(type(dataset)):
+    if is_built_in(type(dataset)):
         return
     asked = [partial(_try_frames, dataset), dataset.files, dataset.digest]
     asked += [partial(_try_truth, dataset, variant) for variant in dataset.variants]

@@ -11,14 +11,14 @@ from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine
-from su3d_bench.predictions.own_runs import read_stored
+from su3d_bench.predictions.run_predictions import read_stored
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
 from su3d_bench.store.run_folder import JobFolder
 
 # What metrics.json says that must follow from the counts; how intervals are formed may change without a new version.
-SAID = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
+CHECKED_FIELDS = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
 
 
 def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
@@ -33,7 +33,7 @@ def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
     if set(said.scenes) != set(counted.scenes):
         return f"it has {len(said.scenes)} scenes, the counts {len(counted.scenes)}"
     record, numbers = plain(said), counted.to_json()
-    for table in SAID:
+    for table in CHECKED_FIELDS:
         known = dict(flatten(numbers[table]))
         for where, value in flatten(record[table]):
             if where not in known or not _agree(value, known[where]):
@@ -55,7 +55,7 @@ def _shown(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.12g}"
 
 
-def why_not_counted(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
+def count_mismatch(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
     """Why the numbers of a method under a protocol do not follow from ``scores``, its counts; None where they do."""
     record = run.results.get((method, protocol))
     if record is None or record.result is None:
@@ -80,16 +80,16 @@ def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
 
 
 def _damage(job: JobFolder) -> str | None:
-    sealed: dict[str, str] = {}
-    for seal in job.seals().values():
-        sealed |= seal.files
+    completed: dict[str, str] = {}
+    for mark_complete in job.completion_records().values():
+        completed |= mark_complete.files
     for file in (job.prediction, features_beside(job.prediction), job.updates, job.counts):
-        if file.name not in sealed:
+        if file.name not in completed:
             if file != features_beside(job.prediction):
                 return f"done.json does not vouch for {file.name}"
         elif not is_file(file):
             return f"{file.name} is missing"
-        elif digest_file(file) != sealed[file.name]:
+        elif digest_file(file) != completed[file.name]:
             return f"{file.name} is not the file that the run wrote"
     try:
         read_stored(job.prediction)
@@ -109,6 +109,6 @@ def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
             continue
         for (name, protocol), record in run.results.items():
             if name == method and record.result is not None:
-                fault = why_not_counted(run, method, protocol, scores.get(protocol, {}))
+                fault = count_mismatch(run, method, protocol, scores.get(protocol, {}))
                 if fault is not None:
                     yield f"{printable(method, 80)} / {printable(protocol, 80)}", printable(fault, 300)

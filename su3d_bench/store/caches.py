@@ -15,7 +15,7 @@ from pathlib import Path
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
 from su3d_bench.core.files.atomic import remove_file
-from su3d_bench.core.files.locks import is_held
+from su3d_bench.core.files.locks import is_locked
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 _HEX = "[0-9a-f]"
@@ -32,7 +32,7 @@ def kernel_folders() -> tuple[Path, ...]:
     return (*([Path(told)] if told else []), PACKAGE_ROOT / "numerics" / "__pycache__", own)
 
 
-def why_slow() -> str | None:
+def cache_warning() -> str | None:
     """A line that says that no kernel can be kept, and what to do; None where one can."""
     folders = kernel_folders()
     if any(map(_takes_files, folders)):
@@ -112,7 +112,7 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
     for entry in cache_entries(root, kind):
         run = entry.name.partition("/")[0]
         if kind.name == "runs" and run not in held:
-            held[run] = is_held(top / run)
+            held[run] = is_locked(top / run)
         if entry.written >= before or held.get(run, False):
             continue
         remove_file(top / entry.name)

@@ -14,7 +14,7 @@ from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacin
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.files import regular
 
-MOST_TEXTS = 1 << 20  # of one field; each becomes an object of its own
+MAX_TEXTS = 1 << 20  # of one field; each becomes an object of its own
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
 # Kind of values and shape of each field of a stored prediction, None for any length, in the order of the file.
 FIELDS: dict[str, tuple[str, tuple[int | None, ...]]] = {
@@ -72,7 +72,7 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     if fault := array_fault(arrays):
         raise PredictionError(f"{where}: {fault}; run the scene again")
     for name in (name for name in FIELDS if name in arrays):
-        if arrays[name].dtype.kind == "U" and arrays[name].size > MOST_TEXTS:
+        if arrays[name].dtype.kind == "U" and arrays[name].size > MAX_TEXTS:
             raise PredictionError(f"{where}: '{name}' holds {arrays[name].size} texts; is it damaged?")
     values: dict[str, Any] = {}
     for name in _fields_of(kind):

@@ -22,13 +22,13 @@ from su3d_bench.core.system.files import opened_text
 from su3d_bench.core.types import Float64Array
 
 SCHEMA = 1
-MOST_UPDATES = 10_000_000
+MAX_UPDATES = 10_000_000
 Kind = TypeVar("Kind")
 ROUNDING = 1e-9  # by how much a mean of shares may pass 1
-MOST = 1e18  # milliseconds, bytes or things: more than there are
+MAX_VALUE = 1e18  # milliseconds, bytes or things: more than there are
 Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass every comparison
-Amount = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=0, le=int(MOST))]
+Amount = Annotated[float, Field(ge=0, le=MAX_VALUE, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=int(MAX_VALUE))]
 Share = Annotated[float, Field(ge=0, le=1 + ROUNDING, allow_inf_nan=False)]
 
 
@@ -40,7 +40,7 @@ def impossible_value(name: str, value: float) -> str | None:
     ("'mAcc' is 7e+300, a fraction lies from 0 to 1", None)
     """
     if name.startswith("n_"):
-        return None if 0 <= value <= MOST else f"'{name}' is {value:g}, of which there are none or more"
+        return None if 0 <= value <= MAX_VALUE else f"'{name}' is {value:g}, of which there are none or more"
     return None if 0 <= value <= 1 + ROUNDING else f"'{name}' is {value:g}, a fraction lies from 0 to 1"
 
 
@@ -257,7 +257,7 @@ class CostsRecord:
 
 
 @dataclass(frozen=True)
-class SealRecord:
+class CompletionRecord:
     """A step of ``done.json``: the key of its inputs, the SHA-256 of the files that it vouches for, and remarks."""
 
     key: Mapping[str, str]
@@ -266,7 +266,7 @@ class SealRecord:
 
 
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
-    kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, SealRecord)
+    kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, CompletionRecord)
 }
 
 
@@ -319,7 +319,7 @@ def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
         with opened_text(file, newline="") as stream:
             reader = csv.reader(stream)
             header = next(reader, [])
-            rows = [row for row, _ in zip(reader, range(MOST_UPDATES), strict=False)]
+            rows = [row for row, _ in zip(reader, range(MAX_UPDATES), strict=False)]
             if "total_ms" not in header:
                 return {}
             table = np.array(rows, np.float64).reshape(len(rows), len(header))
@@ -327,8 +327,10 @@ def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
         raise DataError(f"{where}: is not a table of numbers; run the same command again to mend it") from error
     if not np.isfinite(table).all():
         raise DataError(f"{where}: holds a number that is not finite; run the same command again to mend it")
-    if table.size and not 0 <= table.min() <= table.max() <= MOST:
-        raise DataError(f"{where}: holds {table.min():g} and {table.max():g}; times and sizes lie from 0 to {MOST:g}")
+    if table.size and not 0 <= table.min() <= table.max() <= MAX_VALUE:
+        raise DataError(
+            f"{where}: holds {table.min():g} and {table.max():g}; times and sizes lie from 0 to {MAX_VALUE:g}"
+        )
     if len(set(header)) != len(header):
         raise DataError(f"{where}: has two columns of one name; run the same command again to mend it")
     return {name: table[:, column] for column, name in enumerate(header)}

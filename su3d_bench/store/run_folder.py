@@ -21,17 +21,17 @@ from pydantic import ValidationError
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, shown
 from su3d_bench.core.files.atomic import make_folder, read_json, write_error, write_json
-from su3d_bench.core.files.locks import LOCK_FILE, beside, clear_unfinished, hold_folder, is_unfinished
+from su3d_bench.core.files.locks import LOCK_FILE, clear_unfinished, hold_folder, is_unfinished, temporary_path
 from su3d_bench.store.predictions import features_beside
-from su3d_bench.store.records import SCHEMA, SealRecord, checked, plain
+from su3d_bench.store.records import SCHEMA, CompletionRecord, checked, plain
 
 JOBS = "scenes"
-WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
+SHARED_FOLDERS = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
 MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
 RECORDS = (*MARKS, "metrics.json", "ablation.json")
 FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run whose files have names of many forms
 # The files that a run, or a verb beside its map, writes; "refined_names.json" is what the verb refine leaves.
-_OF_A_RUN = re.compile(
+_RUN_OPTIONS = re.compile(
     r"run\.toml|(run|metrics|ablation)\.json|\.lock|(language|slurm|\.cache)/.+|scenes/[^/]+/[^/]+/("
     r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|updates\.csv"
     r"|log\.txt|done\.json|refined_names\.json|pictures/[^/]+\.png)",
@@ -67,7 +67,7 @@ def _escaped(text: str, characters: str) -> str:
     return "".join(_ESCAPES[one] if one in characters else one for one in text)
 
 
-def refuse_links(top: Path, place: Path) -> None:
+def check_no_links(top: Path, place: Path) -> None:
     """A ``StoreError`` where a folder below ``top`` on the way to ``place``, or that itself, is a link elsewhere."""
     for folder in (place, *place.parents):
         if folder == top:
@@ -76,7 +76,7 @@ def refuse_links(top: Path, place: Path) -> None:
             raise StoreError(f"{shown(folder)}: is a link, and a run writes into folders of its own alone; remove it")
 
 
-def refuse_records(place: Path) -> None:
+def check_not_run_file(place: Path) -> None:
     """A ``StoreError`` where a verb would write into the place of what a run itself has written."""
     above = place.absolute().parents
     is_record = place.name in RECORDS and is_run(above[0])
@@ -100,29 +100,29 @@ class RunFolder:
         """The folder of one scene (``<dataset>/<scene>``) under one method."""
         return JobFolder(self.path / JOBS / folder_of_scene(scene) / method)
 
-    def refuse_other_content(self) -> None:
+    def check_is_run_folder(self) -> None:
         """A ``StoreError`` where the folder holds something and is no run's."""
         try:
             names = sorted(os.listdir(self.path))
         except OSError:  # whoever writes there says more
             return
-        strangers = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
-        if strangers and not any(name in MARKS for name in names):
+        foreign_files = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
+        if foreign_files and not any(name in MARKS for name in names):
             raise StoreError(
-                f"{shown(self.path)}: holds '{strangers[0]}' and is no folder of a run; choose a new folder with --out"
+                f"{shown(self.path)}: holds '{foreign_files[0]}' and is no folder of a run; choose a new folder with --out"
             )
 
     def jobs(self) -> list[JobFolder]:
         """The folder of each job that is there, of this run's request or not."""
         return [JobFolder(path) for path in sorted(self.path.glob(f"{JOBS}/*/*")) if path.is_dir()]
 
-    def strangers(self) -> Iterator[str]:
+    def foreign_files(self) -> Iterator[str]:
         """What stands in the folder and was written by no run, nor by a verb beside its map; links count among it."""
         for above, folders, files in os.walk(self.path):
             where = Path(above).relative_to(self.path)
             links = [name for name in folders if Path(above, name).is_symlink()]
             for place in (where / name for name in sorted((*files, *links))):
-                is_known = any(map(is_unfinished, place.parts)) or _OF_A_RUN.fullmatch(place.as_posix())
+                is_known = any(map(is_unfinished, place.parts)) or _RUN_OPTIONS.fullmatch(place.as_posix())
                 if not is_known or (self.path / place).is_symlink():
                     yield place.as_posix()
             if not where.parts:
@@ -132,7 +132,7 @@ class RunFolder:
     def remove(self) -> None:
         """Remove the folder with all that it holds, at once or not at all; ``StoreError`` where a run writes there."""
         with self.locked():
-            place = beside(self.path)
+            place = temporary_path(self.path)
             try:
                 os.rename(self.path, place)
             except OSError as error:
@@ -154,8 +154,8 @@ class RunFolder:
         except OSError as error:
             raise write_error(self.path, error) from error
         try:
-            for folder in (self.path / name for name in WRITTEN_BY_ALL):
-                refuse_links(self.path, folder)
+            for folder in (self.path / name for name in SHARED_FOLDERS):
+                check_no_links(self.path, folder)
                 clear_unfinished(folder)
             yield
         finally:
@@ -200,69 +200,72 @@ class JobFolder:
     def done(self) -> Path:
         return self.path / "done.json"
 
-    def refuse_links(self) -> None:
+    def check_no_links(self) -> None:
         """A ``StoreError`` where writing into the job's folders would write elsewhere."""
-        refuse_links(self.path.parents[2], self.pictures)
+        check_no_links(self.path.parents[2], self.pictures)
 
     def picture(self, name: str) -> Path:
         """Where a picture of this name goes."""
-        self.refuse_links()
+        self.check_no_links()
         return self.pictures / name
 
     def prepare(self) -> None:
         """Make the folder and clear what a killed run left unfinished."""
-        self.refuse_links()
+        self.check_no_links()
         make_folder(self.path)
         clear_unfinished(self.pictures)
 
     def remove(self) -> None:
         """Remove the folder, and that of its scene where it was the last there."""
-        self.refuse_links()
-        place = beside(self.path)
+        self.check_no_links()
+        place = temporary_path(self.path)
         with suppress(FileNotFoundError):
             os.rename(self.path, place)
             shutil.rmtree(place, ignore_errors=True)
         with suppress(OSError):
             self.path.parent.rmdir()
 
-    def seals(self) -> dict[str, SealRecord]:
+    def completion_records(self) -> dict[str, CompletionRecord]:
         """The sealed steps; nothing where ``done.json`` is missing or damaged."""
         try:
             record = read_json(self.done)
         except StoreError:
             return {}
         steps = record.get("steps") if isinstance(record, dict) and record.get("schema") == SCHEMA else None
-        seals = {}
-        for step, seal in steps.items() if isinstance(steps, dict) else ():
+        completion_records = {}
+        for step, mark_complete in steps.items() if isinstance(steps, dict) else ():
             with suppress(ValidationError, RecursionError):
-                seals[step] = checked(SealRecord, seal)
-        return seals
+                completion_records[step] = checked(CompletionRecord, mark_complete)
+        return completion_records
 
-    def seal(
+    def mark_complete(
         self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, Any] | None = None
     ) -> None:
         """Vouch for ``files`` as the outcome of ``step`` under ``key``; sealing ``predict`` breaks the other seal.
 
         The features beside a dense prediction go with it. ``remarks`` are kept beside them for whoever resumes.
         """
-        steps = {} if step == "predict" else self.seals()
-        beside = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
-        digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in [*files, *beside]}
-        steps[step] = SealRecord(key, digests, remarks or {})
-        write_json(self.done, {"schema": SCHEMA, "steps": {name: plain(seal) for name, seal in steps.items()}})
+        steps = {} if step == "predict" else self.completion_records()
+        temporary_path = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
+        digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in [*files, *temporary_path]}
+        steps[step] = CompletionRecord(key, digests, remarks or {})
+        write_json(
+            self.done,
+            {"schema": SCHEMA, "steps": {name: plain(mark_complete) for name, mark_complete in steps.items()}},
+        )
 
     def remarks(self, step: str) -> Mapping[str, Any]:
         """What was kept beside the seal of ``step``."""
-        seal = self.seals().get(step)
-        return {} if seal is None else seal.remarks
+        mark_complete = self.completion_records().get(step)
+        return {} if mark_complete is None else mark_complete.remarks
 
     def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
         """A clause that names the first field in which the sealed key differs from ``key``; None where none does.
 
         Fields in ``known_later`` are not compared.
         """
-        seal = self.seals().get(step)
-        sealed = {} if seal is None else seal.key
+        mark_complete = self.completion_records().get(step)
+        sealed = {} if mark_complete is None else mark_complete.key
         if not sealed or (key.items() <= sealed.items() and sealed.keys() - key.keys() <= set(known_later)):
             return None
         for name in [*key, *(name for name in sealed if name not in key)]:
@@ -272,11 +275,11 @@ class JobFolder:
 
     def is_done(self, step: str, key: Mapping[str, str]) -> bool:
         """Whether ``step`` is sealed under exactly ``key`` and every file that it vouches for is whole."""
-        return self.is_whole(self.seals().get(step), key)
+        return self.is_whole(self.completion_records().get(step), key)
 
-    def is_whole(self, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``seal``, one of ``seals``, is of exactly ``key`` and every file that it vouches for is whole."""
-        if seal is None or seal.key != dict(key):
+    def is_whole(self, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
+        """Whether ``mark_complete``, one of ``completion_records``, is of exactly ``key`` and every file that it vouches for is whole."""
+        if mark_complete is None or mark_complete.key != dict(key):
             return False
-        files = {self.path / name: digest for name, digest in seal.files.items()}
+        files = {self.path / name: digest for name, digest in mark_complete.files.items()}
         return all(file.is_file() and digest_file(file) == digest for file, digest in files.items())

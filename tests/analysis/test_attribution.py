@@ -15,10 +15,10 @@ from su3d_bench.metrics.attribution.masks import (
     KINDS,
     LabelledPoints,
     causes_of,
+    correct_points,
+    correct_scene,
     count_masks,
     find_errors,
-    mend_points,
-    mend_scene,
     repaired,
     with_true_labels,
 )
@@ -66,13 +66,13 @@ def labelled(masks: list[Int32Array], classes: list[int], scores: list[float]) -
 
 def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> tuple[dict[str, float], dict[str, int]]:
     """The gain in AP50 of each kind, after checks that hold always."""
-    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
-    base = instance_ap.combine([mended.as_is])
-    found = {kind: instance_ap.combine([counts]) for kind, counts in mended.alone.items()}
+    corrected = correct_scene(truth(), labelled(masks, classes, scores), RULES)
+    base = instance_ap.combine([corrected.as_is])
+    found = {kind: instance_ap.combine([counts]) for kind, counts in corrected.alone.items()}
     assert list(found) == list(KINDS)
     for kind, ap in found.items():
-        assert (ap.ap != base.ap) <= (mended.n[kind] > 0)
-    return {kind: ap.ap50 - base.ap50 for kind, ap in found.items()}, dict(mended.n)
+        assert (ap.ap != base.ap) <= (corrected.n[kind] > 0)
+    return {kind: ap.ap50 - base.ap50 for kind, ap in found.items()}, dict(corrected.n)
 
 
 def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
@@ -80,10 +80,10 @@ def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
     on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150, dtype=np.int32)], [*classes, 3], [*scores, 0.95])
     for forgives, n in ((True, 0), (False, 1)):
         rules = ScoringRules((3, 4, 5), forgives_void=forgives)
-        mended = mend_scene(truth(), on_void, rules)
-        assert mended.n["background"] == n
-        assert (instance_ap.combine([mended.as_is]).ap50 < 1) == (not forgives)
-        assert instance_ap.combine([mended.all]).ap50 == 1
+        corrected = correct_scene(truth(), on_void, rules)
+        assert corrected.n["background"] == n
+        assert (instance_ap.combine([corrected.as_is]).ap50 < 1) == (not forgives)
+        assert instance_ap.combine([corrected.all]).ap50 == 1
 
 
 def test_a_perfect_prediction_loses_nothing() -> None:
@@ -117,8 +117,8 @@ def test_an_error_made_on_purpose_is_found_alone_and_mending_it_gives_a_perfect_
     assert n == {name: int(name == kind) for name in KINDS}
     assert gain.pop(kind) > 0
     assert set(gain.values()) == {0.0}
-    mended = mend_scene(truth(), labelled(*with_error(kind)), RULES)
-    assert instance_ap.combine([mended.alone[kind]]).ap == instance_ap.combine([mended.all]).ap == 1
+    corrected = correct_scene(truth(), labelled(*with_error(kind)), RULES)
+    assert instance_ap.combine([corrected.alone[kind]]).ap == instance_ap.combine([corrected.all]).ap == 1
 
 
 def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
@@ -168,9 +168,9 @@ def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_wit
 def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> None:
     masks, classes, scores = perfect()
     masks, classes, scores = [*masks, points(0, 0.7)], [*classes, 3], [*scores, 0.99]
-    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
-    assert mended.n["duplicate"] == 1
-    after = mended.alone["duplicate"]
+    corrected = correct_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert corrected.n["duplicate"] == 1
+    after = corrected.alone["duplicate"]
     at_half = (after.class_index == 0) & (after.threshold_index == 0)
     assert sorted(after.score[at_half]) == [0.9, 0.9, 0.99]
     assert instance_ap.combine([after]).ap == 1
@@ -217,11 +217,11 @@ def made_scene(seed: int) -> tuple[Int64Array, LabelledMasks]:
 @pytest.mark.parametrize("seed", range(40))
 def test_single_mendings_never_lower_ap50_and_change_nothing_where_there_is_no_error(seed: int) -> None:
     truth, predicted = made_scene(seed)
-    mended = mend_scene(truth, predicted, scoring(MASK_RULES))
-    base = instance_ap.combine([mended.as_is])
+    corrected = correct_scene(truth, predicted, scoring(MASK_RULES))
+    base = instance_ap.combine([corrected.as_is])
     for kind in KINDS:
-        after = instance_ap.combine([mended.alone[kind]])
-        assert mended.n[kind] or after.ap == base.ap
+        after = instance_ap.combine([corrected.alone[kind]])
+        assert corrected.n[kind] or after.ap == base.ap
         assert after.ap50 >= base.ap50 - 1e-12, kind
 
 
@@ -248,8 +248,8 @@ def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: st
         assert len(found) == len(errors)
         for single, error in zip(found, errors, strict=True):
             kinds[error.kind] += 1
-            mended = count_masks(truth, repaired(overlaps, [error]).labelled(), scored)
-            after = reported(rules, [mended, *counts[1:]])
+            corrected = count_masks(truth, repaired(overlaps, [error]).labelled(), scored)
+            after = reported(rules, [corrected, *counts[1:]])
             assert single.gains == pytest.approx({name: after[name] - before[name] for name in before}, abs=1e-12)
     assert all(n >= 2 for n in kinds.values()), kinds
 
@@ -271,7 +271,7 @@ def test_an_error_is_told_by_its_masks_and_objects() -> None:
     assert missed.gains["AP"] == pytest.approx(0.375)  # its class: recall 1, (1 + precision 1/2) / 2
 
 
-def made_points(seed: int) -> LabelledPoints:
+def synthetic_points(seed: int) -> LabelledPoints:
     rng = np.random.default_rng(seed)
     objects = rng.integers(1, 8, 400)
     true = objects % 5 - (objects == 7) * 3
@@ -287,8 +287,8 @@ def test_the_gain_of_mended_points_is_that_of_the_whole_evaluation(aggregate: st
     metric, n_classes = metric_of(rules), len(rules.classes)
     is_counted = np.arange(n_classes) < 5
     for seed in range(4):
-        scenes = [made_points(3 * seed + k) for k in range(3)]
-        counts = [mend_points(points, is_counted).as_is for points in scenes]
+        scenes = [synthetic_points(3 * seed + k) for k in range(3)]
+        counts = [correct_points(points, is_counted).as_is for points in scenes]
         pool = Pool(metric, counts[0], counts[1:])
         n, found = single_point_errors(scenes[0], is_counted, pool, has_masks=True, most=10_000)
         assert n == len(found) > 20
@@ -302,8 +302,8 @@ def test_the_gain_of_mended_points_is_that_of_the_whole_evaluation(aggregate: st
             assert set(scenes[0].object_id[wrong]) == set(scenes[0].object_id[thing])
             called = scenes[0].predicted.copy()
             called[wrong] = error.true[0]
-            mended = semantic.per_scene(scenes[0].true_class, called, is_counted)
-            after = metric.reported([mended, *counts[1:]])
+            corrected = semantic.per_scene(scenes[0].true_class, called, is_counted)
+            after = metric.reported([corrected, *counts[1:]])
             gain = {name: after[name] - before[name] for name in rules.headline}
             assert error.gains == pytest.approx(gain, abs=1e-12)
         assert n_told == (cause >= 0).sum()

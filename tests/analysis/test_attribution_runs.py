@@ -24,8 +24,8 @@ from su3d_bench.metrics.attribution.masks import (
     CAUSES,
     LabelledPoints,
     causes_of,
+    correct_points,
     count_masks,
-    mend_points,
     object_of_mask,
 )
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
@@ -82,7 +82,7 @@ def test_the_counts_as_they_are_are_those_of_scoring(name: str, sort: str) -> No
         formed: Any = count_masks(*scored_masks(rules, truth, prediction, ENCODER))
     else:
         found = scored_points(rules, truth, prediction, ENCODER)
-        formed = mend_points(found.points, found.is_counted, has_masks=found.has_masks).as_is
+        formed = correct_points(found.points, found.is_counted, has_masks=found.has_masks).as_is
     for each in fields(formed):
         np.testing.assert_array_equal(getattr(scored, each.name), getattr(formed, each.name))
 
@@ -93,16 +93,16 @@ def test_the_counts_as_they_are_are_those_of_scoring(name: str, sort: str) -> No
 def causes(prediction: Prediction) -> dict[str, int]:
     """Points of each cause that has any, after the checks that hold always."""
     found = scored_points(ROOM_RULES, room(), prediction, ENCODER)
-    mended = mend_points(found.points, found.is_counted, has_masks=found.has_masks)
+    corrected = correct_points(found.points, found.is_counted, has_masks=found.has_masks)
     cause = causes_of(found.points, has_masks=found.has_masks)
     n_right = int((cause == attribution_semantic.RIGHT).sum())
-    assert n_right + sum(mended.n.values()) == mended.n_scored == found.points.is_scored.sum()
+    assert n_right + sum(corrected.n.values()) == corrected.n_scored == found.points.is_scored.sum()
     perfect = semantic.per_scene(found.points.true_class, found.points.true_class, found.is_counted)
-    np.testing.assert_array_equal(mended.all.confusion, perfect.confusion)
+    np.testing.assert_array_equal(corrected.all.confusion, perfect.confusion)
     for name in CAUSES:
-        gained = int(np.trace(mended.alone[name].confusion) - np.trace(mended.as_is.confusion))
-        assert gained == mended.n[name]
-    return {name: n for name, n in mended.n.items() if n}
+        gained = int(np.trace(corrected.alone[name].confusion) - np.trace(corrected.as_is.confusion))
+        assert gained == corrected.n[name]
+    return {name: n for name, n in corrected.n.items() if n}
 
 
 def test_the_cause_of_points_that_are_wrong_is_told() -> None:
@@ -137,9 +137,9 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
         *[-2] * 2,
         "background",
     ]
-    mended = mend_points(found, np.ones(4, bool)).with_true_labels
-    assert mended is not None
-    assert mended.confusion[:3, :3].tolist() == [
+    corrected = correct_points(found, np.ones(4, bool)).with_true_labels
+    assert corrected is not None
+    assert corrected.confusion[:3, :3].tolist() == [
         [0, 0, 0],
         [0, 1, 0],
         [1, 2, 0],

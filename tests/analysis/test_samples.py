@@ -20,7 +20,7 @@ from su3d_bench.analysis.samples import _OfPoints, samples
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledPoints, count_masks, errors_of, mend_scene
+from su3d_bench.metrics.attribution.masks import KINDS, LabelledPoints, correct_scene, count_masks, errors_of
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
 from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -56,8 +56,8 @@ def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: 
             assert sorted(masks.scores[at.is_hit]) == sorted(counts.score[is_true])
     errors = errors_of(measure_overlaps(true_instances(values, scoring), masks, scoring))
     named = Counter(errors.of_mask) + Counter(errors.of_instance)
-    mended = mend_scene(values, masks, scoring)
-    assert {kind: named[kind] for kind in KINDS} == dict(mended.n)
+    corrected = correct_scene(values, masks, scoring)
+    assert {kind: named[kind] for kind in KINDS} == dict(corrected.n)
 
 
 def test_the_rows_of_points_add_up_to_the_matrix_and_the_causes_of_the_run(run: Path) -> None:

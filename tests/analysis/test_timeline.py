@@ -18,7 +18,7 @@ from painted_runs import painted_run, see_painted
 
 from su3d_bench.analysis import timeline as places
 from su3d_bench.analysis.page.maps import Spaces
-from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, Recording, SceneTimeline, in_view
+from su3d_bench.analysis.timeline import MAX_POINTS, SEEN_M, Recording, SceneTimeline, in_view
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
 from su3d_bench.runs.finished import read_run
@@ -116,7 +116,7 @@ def test_the_map_grows_and_each_point_of_it_comes_once(run: Path, kind: str) -> 
     assert len({logged.values[0] for logged in grown}) == len(grown), "what comes later hides nothing"
     assert all(logged.frame is not None for logged in grown)
     points = np.concatenate([logged.values[1] for logged in grown])
-    assert 0 < len(points) <= MOST_POINTS
+    assert 0 < len(points) <= MAX_POINTS
     assert len(np.unique(points, axis=0)) == len(points)
     (names,) = [logged.values[1] for logged in notes.of("AnnotationContext") if logged.values[0] == own]
     used = {int(number) for logged in grown for number in logged.values[2]} - {0}

@@ -30,7 +30,7 @@ def documented() -> Iterator[tuple[str, Any]]:
     for name in su3d.__all__:
         value = getattr(su3d, name)
         yield name, value
-        if inspect.isclass(value) and value.__module__ == "su3d_bench.api.results":
+        if inspect.isclass(value) and value.__module__ == "su3d_bench.api.tables":
             for inner, member in vars(value).items():
                 if not inner.startswith("_") and (callable(member) or isinstance(member, property)):
                     yield f"{name}.{inner}", member

@@ -312,10 +312,10 @@ class TestVariants:
         assert (config.stride, config.top_k, config.vis_threshold) == (10, 5, 0.2)
         assert (config.num_random_rounds, config.num_selected_points) == (10, 5)
         assert (config.num_of_levels, config.multi_level_expansion_ratio) == (3, 0.1)
-        assert (config.part_eps_m, config.part_min_points, config.part_most_dropped) == (0.95, 1, 0)
+        assert (config.part_eps_m, config.part_min_points, config.part_max_dropped) == (0.95, 1, 0)
         other = OpenMask3DSegment3DConfig()
-        assert (other.part_eps_m, other.part_min_points, other.part_most_dropped) == (0.05, 5, 15)
-        assert (other.part_kept_share, other.surface_most, config.surface_most) == (0.8, 400, 150)
+        assert (other.part_eps_m, other.part_min_points, other.part_max_dropped) == (0.05, 5, 15)
+        assert (other.part_kept_share, other.surface_max, config.surface_max) == (0.8, 400, 150)
 
     def test_segment3d_splits_parts_by_density_and_openmask3d_by_gaps(self) -> None:
         """Two rows of points 30 cm apart, and a lone point: one part, but for Segment3D two and noise."""

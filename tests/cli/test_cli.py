@@ -283,7 +283,7 @@ def test_files_of_a_run_are_never_replaced_by_an_answer(name: str, capsys: pytes
     for words in (
         ["query", "text", "rooms/living0", "plant", "--out", str(file)],
         ["report", "tables", "runs/demo", "--out", str(file)],
-        ["check", "--learn", "runs/demo", "--out", str(file)],
+        ["check", "--build-from", "runs/demo", "--out", str(file)],
         *([["protocols", "list", "--json", str(file)]] if file.suffix == ".json" else []),
     ):
         assert main(words) == 2

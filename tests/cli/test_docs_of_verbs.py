@@ -6,15 +6,15 @@ import re
 import runpy
 import shlex
 import subprocess
-from argparse import ArgumentParser
+from argparse import SUPPRESS, ArgumentParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from command_pages import COMMON_OPTIONS, MORE, command_pages, place_of_command
 from fuzz_words import verbs
 from places import ROOT
-from verbs_page import MORE, PAGE, page
 
 from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
 from su3d_bench.cli.main import build_parser
@@ -26,8 +26,14 @@ LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 MADE_UP = {"SU3D_TEST_KEY"}  # by a test, for itself
 
 
-def test_the_page_of_verbs_is_what_the_parser_says() -> None:
-    assert PAGE.read_text() == page(), "run make architecture"
+def test_every_command_has_a_page_with_every_option() -> None:
+    pages = command_pages()
+    assert len(pages) == 1 + len(list(verbs()))
+    for words, parser in verbs():
+        page = pages[place_of_command(" ".join(words))]
+        assert page.startswith(f"# su3d-bench {' '.join(words)}\n")
+        shown = {option for action in parser._actions if action.help != SUPPRESS for option in action.option_strings}
+        assert shown - COMMON_OPTIONS - {"-h"} <= set(re.findall(r"(?<=[` ])--[\w-]+", page))
 
 
 def test_what_is_said_beside_the_help_is_of_verbs_that_exist() -> None:

@@ -84,10 +84,10 @@ def test_maps_of_an_interrupted_run_are_exported_too(run_folder: str, capsys: py
 def test_a_map_is_not_labelled_by_data_from_which_it_was_not_made(
     run_folder: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seal = Path("r/scenes/painted.b/oracle/done.json")
-    record = json.loads(seal.read_text())
+    mark_complete = Path("r/scenes/painted.b/oracle/done.json")
+    record = json.loads(mark_complete.read_text())
     record["steps"]["predict"]["key"]["data"] = "another"
-    seal.write_text(json.dumps(record))
+    mark_complete.write_text(json.dumps(record))
     words = ("--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle")
     assert "painted/b: its data are not those of the run; run it again" in error_of(capsys, run_folder, *words)
 

@@ -37,7 +37,7 @@ CASES: dict[str, list[list[str]]] = {
                   "--protocol", "scannet-instance", "--out", "out/both"],
                  ["--name", f"{HOSTILE}=predictions", "b=predictions", "--ground-truth", "truth"]],
     "check": [["RUN", "--against", "reference.json", "--github", "--markdown", "out/c.md", "--junit", "out/c.xml"],
-              ["RUN", "--against", "reference.json", "--json"], ["--learn", "RUN", "--out", "out/reference.json"]],
+              ["RUN", "--against", "reference.json", "--json"], ["--build-from", "RUN", "--out", "out/reference.json"]],
     "compare": [["RUN:METHOD", "RUN:oracle", "--per-class"], ["RUN", HOSTILE]],
     "report attribution": [["RUN", "--method", "METHOD"]],
     "report tables": [
@@ -53,13 +53,13 @@ CASES: dict[str, list[list[str]]] = {
     "report verify": [["out/t.latex"], ["hostile.tex"], [f"out/{IN_A_PATH}.zip"]],
     "dev registry add": [[f"out/{IN_A_PATH}.zip", "--to", "out"], ["out/run.zip", "--name", HOSTILE]],
     "dev registry build": [["out", "--out", f"out/site{IN_A_PATH}", "--title", HOSTILE],
-                           ["out", "--bundles-at", HOSTILE]],
+                           ["out", "--bundle-url", HOSTILE]],
     "runs list": [["."]],
     "runs show": [["RUN"], ["RUN", "--json"]],
     "sheets make": [["RUN", "--kind", "retrieval", "--per-kind", "1", "--jobs", "1", "--out", "out/sheets"],
                     ["RUN", "--kind", "annotation", "--per-kind", "1", "--jobs", "1", "--out", "out/marks"]],
     "sheets score": [["answers.csv", "--key", "out/marks-key"]],
-    "sheets pictures": [["RUN", "--what", "labels", "--out", "out/labels.svg"]],
+    "sheets pictures": [["RUN", "--draw", "labels", "--out", "out/labels.svg"]],
     "query text": [["SCENE", "plant", "--run", "RUN", "--method", "METHOD"]],
     "query show": [["questions.toml"]],
     "query audit": [["--score", "audit.csv"]],
@@ -150,7 +150,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
         made = ["--layout", "replica", "--scenes", "bathroom0", "--jobs", "1", "--out", "data", "--quiet"]
         assert main(["datasets", "make", "rooms", *made, "--set", "n_frames=2", "mesh_spacing_m=0.05"]) == 0
         (folder / "data" / "Replica" / "bathroom0").rename(folder / "data" / "Replica" / IN_A_PATH)
-        assert main(["check", "--learn", "run", "--out", "reference.json"]) == 0
+        assert main(["check", "--build-from", "run", "--out", "reference.json"]) == 0
     return folder
 
 

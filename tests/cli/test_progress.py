@@ -45,7 +45,7 @@ def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkey
     with bars_on(80, monkeypatch) as bars:
         board = _Board(bars, 4, "")
         assert "starting" in plain_lines(bars)[0]
-        board.report(Event(scene, "opensu3d", doing="making the scene"))
+        board.report(Event(scene, "opensu3d", activity="making the scene"))
         assert "making the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
         board.report(Event(scene, "opensu3d", 0, 160))
         assert "making the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
@@ -53,7 +53,7 @@ def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkey
         first, second = plain_lines(bars)
         assert "12 instances" in second and "making" not in second and "starting" not in first
         assert max(map(len, (first, second))) <= 80 and second.count("━") == NARROW_BAR
-        board.report(Event(scene, "opensu3d", doing="scoring 2 of 4 protocols"))
+        board.report(Event(scene, "opensu3d", activity="scoring 2 of 4 protocols"))
         assert "scoring 2 of 4 protocols" in plain_lines(bars)[1] and "160/160" in plain_lines(bars)[1]
 
 
@@ -65,6 +65,6 @@ def test_a_scene_has_one_bar_which_is_its_current_method_s(monkeypatch: pytest.M
         board.report(Event("rooms/a", "two", 1, 3, 1))
         assert len(bars.tasks) == 2 and "rooms/a two" in plain_lines(bars)[1] and "1 instance " in plain_lines(bars)[1]
         board.report(Event("rooms/a", SCENE_DONE, 1, 2))
-        board.report(Event("", SCENE_DONE, doing="adding up"))
+        board.report(Event("", SCENE_DONE, activity="adding up"))
         (line,) = plain_lines(bars)
         assert "1/2" in line and "adding up" in line

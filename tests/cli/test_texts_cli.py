@@ -10,7 +10,7 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.evaluation.result import KEYS
-from su3d_bench.evaluation.texts import GivenTexts, candidate_names, read_text_features
+from su3d_bench.evaluation.texts import GivenTextEncoder, candidate_names, read_text_features
 from su3d_bench.metrics.matching.labelling import text_features
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
@@ -59,7 +59,7 @@ def test_the_mean_over_several_prompts_is_formed_as_with_the_encoder_itself() ->
     names, features = candidate_names(rules), np.ones((1, encoder.dim), np.float32)
     assert len(given.names) == 2 * len(names)
     expected = text_features(rules, names, features, encoder)
-    assert np.array_equal(text_features(rules, names, features, GivenTexts(given, rules)), expected)
+    assert np.array_equal(text_features(rules, names, features, GivenTextEncoder(given, rules)), expected)
     assert given.encoder == encoder.name
 
 

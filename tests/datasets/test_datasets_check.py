@@ -20,7 +20,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, printable, printable_json
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.checks import SAMPLED_FRAMES, Inspection, inspect
-from su3d_bench.datasets.checks_of_frames import Finding, check_frames, facts_of
+from su3d_bench.datasets.frame_checks import Finding, check_frames, facts_of
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 

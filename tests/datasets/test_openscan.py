@@ -13,7 +13,7 @@ from scannet_scan import SCAN, dataset, write_floor_truth, write_scan
 from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
 from su3d_bench.datasets.scannet.dataset import ScanNet
-from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 # A record as in README.md of the release.
@@ -78,8 +78,8 @@ def test_ground_truth_of_a_scan_has_the_attributes_of_its_objects(scan: Path) ->
     assert np.array_equal(truth.instance, plain.instance) and np.array_equal(truth.points, plain.points)
     assert set(truth.semantic[truth.instance == 1].tolist()) == {1} and not truth.semantic[truth.instance != 1].any()
     facts = TruthFacts.of_dataset(ScanNet)
-    assert why_not_truth(load_protocol("openscan-material"), facts) is None
-    assert why_not_truth(load_protocol("rooms-instance"), facts) is not None
+    assert truth_incompatibility(load_protocol("openscan-material"), facts) is None
+    assert truth_incompatibility(load_protocol("rooms-instance"), facts) is not None
 
 
 def test_object_without_a_word_is_void(tmp_path: Path) -> None:

@@ -80,11 +80,11 @@ FORMS: tuple[tuple[ValuesForm, float], ...] = (("classes", 0.5), ("instances", 0
 def test_low_values_are_what_they_are_said_to_be(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt", values=np.repeat([1001, 1357, 0], 200))
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [1, 1]))
-    either = r"may be class ids alone, or class id \* 1000 \+ instance of class 1; say which with --truth-values"
+    either = r"may be class ids alone, or class id \* 1000 \+ instance of class 1; say which with --ground-truth-values"
     with pytest.raises(ConfigError, match=rf"1001 to 1357, {either}"):
         numbers(tmp_path, "class-agnostic-segment3d")
     named = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
-    found = evaluate(replace(named, truth_values="instances")).to_json()["protocols"]["class-agnostic-segment3d"]
+    found = evaluate(replace(named, ground_truth_values="instances")).to_json()["protocols"]["class-agnostic-segment3d"]
     assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
     write_truth(tmp_path / "labels", values=np.repeat([1163, 1170, 0], 200))  # object, bottle: ids of ScanNet200
     (tmp_path / "points").mkdir()
@@ -93,7 +93,7 @@ def test_low_values_are_what_they_are_said_to_be(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=rf"1163 to 1170, {either}"):
         evaluate(request)
     for form, recall in FORMS:
-        scored = evaluate(replace(request, truth_values=form)).to_json()["protocols"]["scannet200-semantic"]
+        scored = evaluate(replace(request, ground_truth_values=form)).to_json()["protocols"]["scannet200-semantic"]
         assert scored["metrics"]["macc"] == recall
     write_truth(tmp_path / "labels", values=np.repeat([2, 1163, 0], 200))  # as instances, 2 would be of no class
     assert evaluate(request).to_json()["protocols"]["scannet200-semantic"]["metrics"]["macc"] == 0.5

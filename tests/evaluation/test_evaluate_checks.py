@@ -13,7 +13,7 @@ from prediction_files import write_scannet_text
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Masks
-from su3d_bench.evaluation.text_truth import read_values
+from su3d_bench.evaluation.text_ground_truth import read_values
 from su3d_bench.metrics.matching.checks import check_cloud, mask_facts
 
 # ---- checks

@@ -102,7 +102,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
         explained = json.loads(answered(capsys, "report", "attribution", RUN, "--method", method, "--json"))
         assert explained["protocols"][0]["values"]["AP"] == ap[method]
         assert f"{method}: {line}" in explained["remarks"]
-    latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--truth-scores", "--intervals")
+    latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--ceiling", "--intervals")
     assert f"value={ap['mine']!r}" in latex and "predictions made elsewhere" in latex
     Path("paper.tex").write_text(latex)
     assert " 0 differ" in answered(capsys, "report", "verify", "paper.tex")
@@ -112,7 +112,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     entries = {entry["method"]: entry for entry in board["boards"][0]}
     assert {method: entry["values"][0] for method, entry in entries.items()} == ap
     assert {entry["profile"] for entry in entries.values()} == {"made elsewhere"} and not board["refused"]
-    answered(capsys, "check", "--learn", RUN, "--out", "reference.json")
+    answered(capsys, "check", "--build-from", RUN, "--out", "reference.json")
     assert answered(capsys, "check", RUN, "--against", "reference.json").startswith("passed")
     assert "imported predictions have no timings" in answered(capsys, "report", "timing", RUN, code=2)
     words = ("sheets", "make", RUN, "--kind", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")

@@ -18,12 +18,12 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.evaluation.evaluate import Scoring
-from su3d_bench.metrics.fitness import ContentFacts, labels_counted, under_several_labels
+from su3d_bench.metrics.compatibility import ContentFacts, labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import ScenePrediction
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.truth import SceneTruths
+    from su3d_bench.evaluation.ground_truth import SceneTruths
 
 ONE = scene([CHAIR, TABLE], [5, 7])
 PAIRS = scene([CHAIR, CHAIR, TABLE, TABLE], [5, 6, 7, 4], [0.9, 0.4, 0.8, 0.3])
@@ -122,7 +122,7 @@ def test_own_rules_may_take_one_of_the_two_alone(
 
 def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = load_protocol("openlex3d-topn")
-    truths = cast("SceneTruths", SimpleNamespace(has_points=True, why_not=lambda *_, **__: None))
+    truths = cast("SceneTruths", SimpleNamespace(has_points=True, incompatibility=lambda *_, **__: None))
     scoring = Scoring(truths, [rules.name], None, file_confidences=False)
     monkeypatch.setattr(scoring, "_score_content", lambda *_: None)
     monkeypatch.setattr(su3d_bench.evaluation.evaluate, "encoder_for", lambda *_, **__: WordEncoder())

@@ -77,7 +77,7 @@ def test_the_truth_may_be_said_to_hold_class_and_instance(tmp_path: Path) -> Non
         values = np.loadtxt(file, dtype=int)
         file.write_text("".join(f"{5000 + value if value else 0}\n" for value in values % 1000))
     assert numbers(tmp_path)["metrics"]["ap"] is None  # as the script: no object from 2000 up
-    metrics = numbers(tmp_path, truth_values="instances")["metrics"]
+    metrics = numbers(tmp_path, ground_truth_values="instances")["metrics"]
     assert [metrics[name] for name in NAMES] == [PROBLEMS[0][name] for name in NAMES]
 
 
@@ -107,11 +107,15 @@ def test_values_that_may_be_classes_or_instances_are_not_guessed(tmp_path: Path)
     write_truth(tmp_path / "gt", values=np.repeat([1000, 1001, 1067], 200))
     write_scannet_text(tmp_path / "pred", scene([np.arange(200, 400)], [3]))
     request = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
-    with pytest.raises(ConfigError, match=r"1000 to 1067, may be class ids alone, .* say which with --truth-values"):
+    with pytest.raises(
+        ConfigError, match=r"1000 to 1067, may be class ids alone, .* say which with --ground-truth-values"
+    ):
         evaluate(request)
-    with pytest.raises(ConfigError, match=r"1000 to 1067, are said to be class ids alone: .* --truth-values numbers"):
-        evaluate(replace(request, truth_values="classes"))
+    with pytest.raises(
+        ConfigError, match=r"1000 to 1067, are said to be class ids alone: .* --ground-truth-values numbers"
+    ):
+        evaluate(replace(request, ground_truth_values="classes"))
     forms: tuple[tuple[ValuesForm, float], ...] = (("instances", 1 / 2), ("numbers", 1 / 3))  # there 1000 is an object
     for form, recall in forms:
-        found = evaluate(replace(request, truth_values=form)).to_json()["protocols"]["class-agnostic-segment3d"]
+        found = evaluate(replace(request, ground_truth_values=form)).to_json()["protocols"]["class-agnostic-segment3d"]
         assert found["metrics"]["ap50"] == recall

@@ -14,13 +14,13 @@ from file_server import FileServer, Served
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.fetching import download
-from su3d_bench.fetching.download import Stated, Wanted, bring, part_of
+from su3d_bench.fetching.download import Download, ExpectedContent, download_file, part_of
 
 CONTENT = np.random.default_rng(0).bytes(900_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 OTHER = np.random.default_rng(1).bytes(900_000)
 NAME = "weights.pth"
-UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": Stated()}
+UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": ExpectedContent()}
 
 
 @pytest.fixture
@@ -32,9 +32,9 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
 
 
 def fetched(server: FileServer, place: Path, n_retries: int = 0, **changes: Any) -> str:
-    known: dict[str, Any] = {"n_bytes": len(CONTENT), "stated": Stated(sha256=SHA256)}
-    wanted = Wanted(NAME, f"{server.url}/{NAME}", changes.pop("hosts", ("127.0.0.1",)), **(known | changes))
-    return bring(wanted, place, lambda *words: None, n_retries)
+    known: dict[str, Any] = {"n_bytes": len(CONTENT), "stated": ExpectedContent(sha256=SHA256)}
+    wanted = Download(NAME, f"{server.url}/{NAME}", changes.pop("hosts", ("127.0.0.1",)), **(known | changes))
+    return download_file(wanted, place, lambda *words: None, n_retries)
 
 
 def test_a_broken_download_is_resumed_where_it_ended_and_leaves_nothing_beside_it(
@@ -76,9 +76,16 @@ def test_parts_of_two_files_are_never_joined(server: FileServer, tmp_path: Path,
 
 @pytest.mark.parametrize(
     "stated",
-    [Stated(sha256="0" * 64), Stated(md5_prefix="4b8939"), Stated(git_blob="1" * 40), Stated(recorded="2" * 64)],
+    [
+        ExpectedContent(sha256="0" * 64),
+        ExpectedContent(md5_prefix="4b8939"),
+        ExpectedContent(git_blob="1" * 40),
+        ExpectedContent(recorded="2" * 64),
+    ],
 )
-def test_a_file_with_a_wrong_checksum_is_thrown_away(server: FileServer, tmp_path: Path, stated: Stated) -> None:
+def test_a_file_with_a_wrong_checksum_is_thrown_away(
+    server: FileServer, tmp_path: Path, stated: ExpectedContent
+) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
     with pytest.raises(DataError, match="it was thrown away"):
         fetched(server, tmp_path / NAME, stated=stated)
@@ -87,7 +94,7 @@ def test_a_file_with_a_wrong_checksum_is_thrown_away(server: FileServer, tmp_pat
 
 def test_the_beginning_of_an_md5_is_compared_with_the_whole(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
-    fetched(server, tmp_path / NAME, stated=Stated(md5_prefix=hashlib.md5(CONTENT).hexdigest()[:6]))
+    fetched(server, tmp_path / NAME, stated=ExpectedContent(md5_prefix=hashlib.md5(CONTENT).hexdigest()[:6]))
     assert (tmp_path / NAME).is_file()
 
 

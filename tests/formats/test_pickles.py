@@ -17,7 +17,7 @@ from damage import assert_same, traced
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import pickles
-from su3d_bench.formats.pickles import Forgotten, Inert, read_pickle_file
+from su3d_bench.formats.pickles import Opaque, Skipped, read_pickle_file
 
 PROTOCOLS = range(2, 6)
 
@@ -66,12 +66,12 @@ def test_plain_values_arrays_and_scalars_come_back(tmp_path: Path, protocol: int
     assert shared[0] is shared[1] and shared[2] is shared[3]
     special = [OrderedDict(a=1), defaultdict(list, {1: [2]}), PosixPath("/etc/passwd")]
     ordered, default, path = read(tmp_path, pickle.dumps(special, protocol))
-    assert (ordered, default) == ({"a": 1}, {1: [2]}) and type(path) is Inert and not vars(path)
+    assert (ordered, default) == ({"a": 1}, {1: [2]}) and type(path) is Opaque and not vars(path)
 
 
 def test_settings_become_one_inert_place_and_gzip_is_unpacked(tmp_path: Path) -> None:
     tree = b"\x80\x04comegaconf.dictconfig\nDictConfig\n)\x81}(X\x01\x00\x00\x00acomegaconf.base\nMetadata\n)\x81ub."
-    assert type(read(tmp_path, tree)) is Inert
+    assert type(read(tmp_path, tree)) is Opaque
     for content in (pickle.dumps(a_map()), gzip.compress(pickle.dumps(a_map()))):
         assert_same(read(tmp_path, content), a_map())
 
@@ -83,7 +83,7 @@ def test_payloads_below_a_key_to_forget_are_not_kept(tmp_path: Path, protocol: i
     content = pickle.dumps({"objects": [one]}, protocol)
     with traced(1_300_000):
         found = read(tmp_path, content, forget=("mask", "colours"))["objects"][0]
-    assert [type(mask) for mask in (*found["mask"], found["colours"])] == [Forgotten] * 6
+    assert [type(mask) for mask in (*found["mask"], found["colours"])] == [Skipped] * 6
     assert found["pcd"].shape == (1000, 3) and found["after"].shape == (2000,)
 
 

@@ -28,7 +28,7 @@ POSSIBLE: dict[str, dict[str, Any]] = {
         "class_index": [0], "score": [1.0], "is_true": [[True, True]], "n_truth": [1, 0], "n_centred": [1, 0],
         "n_located": [1, 0], "n_named": [1, 0],
     },
-    "presence": {"sampling": [0], "is_there": [True], "says_yes": [True], "similarity": [1.0]},
+    "presence": {"sampling": [0], "is_there": [True], "is_yes": [True], "similarity": [1.0]},
     "relations": {
         "n_objects": [1], "n_objects_found": [1], "n_relations": [1], "n_predicates_found": [1],
         "n_triplets_found": [1],

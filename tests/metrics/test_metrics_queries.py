@@ -13,7 +13,7 @@ from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -202,7 +202,7 @@ def test_overlapping_masks_are_all_ranked() -> None:
 def test_dense_features_and_masks_without_features_cannot_be_ranked() -> None:
     truth = query_truth()
     dense = DenseFeatures(truth.points, np.zeros((len(truth.points), 4), np.float16))
-    assert why_not_scorable(OPENLEX, dense) == (
+    assert kind_incompatibility(OPENLEX, dense) == (
         "openlex3d-queries: needs instances, and the method gives one feature a point"
     )
     with pytest.raises(PredictionError, match="openlex3d-queries: needs features to compare with texts"):

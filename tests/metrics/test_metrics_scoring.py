@@ -22,7 +22,7 @@ from scored_room import (
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.core.types import GroundTruth, LabelSet
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
@@ -116,7 +116,7 @@ def test_dense_features_score_as_the_same_instances_under_a_semantic_protocol() 
         assert headline(name, truth, prediction) == [1.0, 1.0]
     rules = load_protocol("rooms-instance")
     assert (
-        why_not_scorable(rules, prediction)
+        kind_incompatibility(rules, prediction)
         == "rooms-instance: needs instances, and the method gives one feature a point"
     )
     with pytest.raises(PredictionError, match="needs instances"):

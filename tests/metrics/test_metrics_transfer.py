@@ -41,7 +41,7 @@ def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(
         candidates, queries = rng.random((n, 3)), rng.random((50, 3))
     with pytest.MonkeyPatch.context() as patch:
         if is_ordered:  # as large clouds are
-            patch.setattr(transfer, "WORTH_ORDERING", 0)
+            patch.setattr(transfer, "MIN_SORTED_CANDIDATES", 0)
         distance, index = nearest(candidates, queries)
         capped = nearest(candidates, queries, cap_m=0.2)[1]
     assert np.array_equal(index, brute_force(candidates, queries))

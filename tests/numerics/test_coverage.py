@@ -24,7 +24,7 @@ def test_the_page_holds_what_the_program_writes_with_enough_simulations_and_no_c
     n_simulations = int(re.findall(r"(\d+) simulations per cell", shown)[0])
     assert n_simulations >= 2000
     over_scenes = cells(shown.strip().partition("\n\n")[0])
-    header = over_scenes.pop("coverage of 95 % intervals, per cent")
+    header = over_scenes.pop("coverage, %")
     assert {"4 scenes", "8 scenes", "20 scenes", "100 scenes"} <= set(header)
     worlds = [name for make in coverage.WORLDS for name in make().names]
     assert set(over_scenes) == {*worlds, *(f"{name}, difference" for name in worlds)}

@@ -8,8 +8,8 @@ import scipy.stats
 
 from su3d_bench.numerics.statistics import (
     ALPHA,
-    LEAST_SCENES,
-    MOST_SCENES,
+    MAX_SCENES,
+    MIN_SCENES,
     Variance,
     crossed_interval,
     power_of,
@@ -57,14 +57,14 @@ def test_one_scene_fewer_has_not_the_power() -> None:
     for n_seeds in (3, 5, 10):
         n_scenes = scenes_needed(variance, 0.1, n_seeds) or 0
         assert power_of(variance, 0.1, n_scenes, n_seeds) >= 0.8
-        assert n_scenes == LEAST_SCENES or power_of(variance, 0.1, n_scenes - 1, n_seeds) < 0.8
+        assert n_scenes == MIN_SCENES or power_of(variance, 0.1, n_scenes - 1, n_seeds) < 0.8
 
 
 def test_no_number_of_scenes_averages_out_what_one_seed_moves() -> None:
     assert scenes_needed(Variance(0.01, 0.001, 0.0, 8, 3), 0.1, 1) is None
     assert scenes_needed(Variance(0.01, 0.0, 0.0, 8, 3), 0.1, 1) == scenes_needed(Variance(0.01, None, 0, 8, 1), 0.1, 1)
     assert scenes_needed(Variance(100.0, None, 0.0, 8, 1), 0.01, 1) is None
-    assert scenes_needed(Variance(0.5**2, None, 0.0, 8, 1), 0.005, 1) in range(LEAST_SCENES, MOST_SCENES)
+    assert scenes_needed(Variance(0.5**2, None, 0.0, 8, 1), 0.005, 1) in range(MIN_SCENES, MAX_SCENES)
 
 
 def test_the_range_of_the_variance_is_that_of_chi_squared() -> None:

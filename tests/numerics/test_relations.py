@@ -219,7 +219,7 @@ def test_no_two_answers_differ_for_a_pair(scene: str, rooms_data: Path) -> None:
                     continue
                 is_so = (a.id, relation, b.id) in of_truth
                 assert objects.holds(relation, a, b) is is_so
-                assert solver._stands(a, relation, b) is is_so
+                assert solver._relation_holds(a, relation, b) is is_so
 
 
 @pytest.mark.parametrize("scene", DEFAULT_SCENES[:2])

@@ -15,8 +15,8 @@ import su3d_bench.numerics.statistics
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import (
     EXACT_STEPS,
+    MAX_GROUPS,
     MIN_FIT,
-    MOST_GROUPS,
     N_ORDERS,
     choices,
     growth_exponent,
@@ -88,7 +88,7 @@ def test_very_many_scenes_are_left_out_in_groups_and_give_nearly_the_same() -> N
     rng = np.random.default_rng(4)
     values = rng.random(1700)
     weights = leave_one_out(1700)
-    assert weights.shape == (1 + MOST_GROUPS, 1700)
+    assert weights.shape == (1 + MAX_GROUPS, 1700)
     assert ((weights == 0).sum(axis=0) == 1).all()  # each scene is left out once
     found = jackknife_interval(weights @ values / weights.sum(axis=1), np.ones(1700, bool))
     np.testing.assert_allclose(found or (0, 0), mean_interval(values) or (1, 1), atol=0.002)

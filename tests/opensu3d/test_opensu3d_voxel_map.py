@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.opensu3d.config import Density
-from su3d_bench.opensu3d.voxel_map import ROWS_OF_A_THREAD, VoxelMap
+from su3d_bench.opensu3d.voxel_map import ROWS_PER_THREAD, VoxelMap
 
 EPS = 0.02
 
@@ -63,7 +63,7 @@ def test_matching_gives_the_pairs_of_a_kd_tree_on_lattices(
 def test_matching_is_the_same_on_any_number_of_threads(n_threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(6)
     filled = map_of(rng.uniform(0, 2, (50_000, 3)) * [1, 1, 0.01])
-    queries = rng.uniform(0, 2, (4 * ROWS_OF_A_THREAD + 1, 3)) * [1, 1, 0.01]
+    queries = rng.uniform(0, 2, (4 * ROWS_PER_THREAD + 1, 3)) * [1, 1, 0.01]
     monkeypatch.setattr("numba.config.NUMBA_NUM_THREADS", 1)
     found, visited = filled.nearest_counted(queries)
     assert 0 < np.count_nonzero(found < 0) < len(queries)

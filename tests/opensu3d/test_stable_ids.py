@@ -58,7 +58,7 @@ def marks_in(rows: NDArray[Any]) -> Marks:
     return frozenset(map(tuple, rows.tolist()))
 
 
-def strangers(answers: Sequence[Instances]) -> list[int]:
+def foreign_files(answers: Sequence[Instances]) -> list[int]:
     """The ids that name, in two of ``answers``, things that share no place, or no view: a view is of one segment."""
     shown: dict[int, list[tuple[Marks, Marks]]] = {}
     for found in answers:
@@ -81,7 +81,7 @@ def test_no_id_names_two_objects_however_often_the_map_is_asked_for(first: int) 
         problem = sequence(seed)
         answers = maps(problem, range(len(problem.images)))
         assert all(len({*found.ids.tolist()}) == len(found) and (found.ids > 0).all() for found in answers)
-        assert (seed, strangers(answers)) == (seed, [])
+        assert (seed, foreign_files(answers)) == (seed, [])
         n_parts += sum(len(found.views) - len(marks_in(found.views)) for found in answers[:-1])
         assert contents(answers[-1]) == contents(answers[-2])
     assert n_parts > OF_ONE_TEST  # views that several parts of an object share

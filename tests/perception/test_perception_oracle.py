@@ -11,7 +11,7 @@ from perception_fakes import INTRINSICS, CountingEncoder, still_life
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleNoise, OracleSegmenter, disturb
+from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleNoise, OracleSegmenter, apply_noise
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
@@ -116,7 +116,7 @@ def noisy(index: int = 0, **values: float) -> tuple[list[np.typing.NDArray[np.bo
     frame = still_life()
     masks = [frame.depth_m == value for value in (2.0, 2.5, 3.0)]
     noise = OracleNoise.model_validate(values)
-    return disturb(masks, ["chair", "cup", "wall"], ["chair", "cup", "wall"], noise, index)
+    return apply_noise(masks, ["chair", "cup", "wall"], ["chair", "cup", "wall"], noise, index)
 
 
 def test_noise_depends_only_on_seed_and_frame() -> None:
@@ -152,7 +152,7 @@ def test_oracle_method_returns_all_ground_truth_instances() -> None:
     instance = np.array([4, 1, 0, 4, 1, 7], np.int32)
     labels = LabelSet("replica", (20, 28), ("chair", "cup"))
     method = Oracle(Oracle.Config())
-    method.receive_truth(GroundTruth(points, semantic, instance, labels, "mesh-vertices", "test"))
+    method.receive_ground_truth(GroundTruth(points, semantic, instance, labels, "mesh-vertices", "test"))
     method.start(SCENE)
     found = method.finish()
     assert method.needs.frames is False

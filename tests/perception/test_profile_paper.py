@@ -135,15 +135,15 @@ def test_profile_reports_exactly_the_deviations_from_the_paper() -> None:
     ram = SimpleNamespace(tagger=SimpleNamespace(caveat=None))
     encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
-    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
-    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
+    assert profile_paper.paper_deviations(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
+    assert profile_paper.paper_deviations(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
         "names and captions: the tagger's names and a template replace the paper's vision model"
     ]
     other = PaperConfig.model_validate(
         {"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}, "stop_words": ["room"]}}
     )
     encoder.name, captioner.vision_model = "ViT-L-14/openai", "some-model"
-    assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
+    assert profile_paper.paper_deviations(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
         "masks: sam-vit-b replaces the paper's sam-vit-h",
         "named masks: boxes.box_threshold, stop_words differ from OpenSU3D's settings",
         "features: ViT-L-14/openai replaces the paper's clip-vit-h-14",

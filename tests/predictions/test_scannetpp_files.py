@@ -19,7 +19,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions import export
 from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.predictions.own_runs import read_stored, write_content
+from su3d_bench.predictions.run_predictions import read_stored, write_content
 
 ENCODER = OneHotEncoder()
 ROOMS, TOP_K = load_protocol("rooms-instance"), load_protocol("rooms-top-k")

@@ -18,10 +18,10 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
+from su3d_bench.human_eval.audit import COLUMNS, make_audit, read_verdicts
 from su3d_bench.questions.audit import AuditedQuestion, audited_questions, sample
-from su3d_bench.questions.model import MADE_KINDS, Question, new_question
+from su3d_bench.questions.model import GENERATED_KINDS, Question, new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
-from su3d_bench.sheets.audit import COLUMNS, make_audit, read_verdicts
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 HOSTILE = '<script>alert("x")</script>\x1b[2J'
@@ -66,14 +66,14 @@ def test_relation_reference_is_the_related_object_of_its_name(monkeypatch: pytes
 
 def test_answers_of_templates_are_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     every = audited(monkeypatch)
-    said = {one.text: one for one in every}
-    assert said["How many vases are there?"].answer == "2: vase #3, vase #4"
-    far = said["What is the distance between the centres of the coffee table and the lamp?"]
+    as_value = {one.text: one for one in every}
+    assert as_value["How many vases are there?"].answer == "2: vase #3, vase #4"
+    far = as_value["What is the distance between the centres of the coffee table and the lamp?"]
     assert far.answer == "0.45 m: coffee table #5, lamp #6"
     assert ids(far.others) == []  # a coffee table mentions no table
-    no = said["Is there a cup on the coffee table?"]
+    no = as_value["Is there a cup on the coffee table?"]
     assert (no.answer, ids(no.right), ids(no.held), ids(no.others)) == ("no", [], [5], [8])
-    yes = said["Is there a lamp on the coffee table?"]
+    yes = as_value["Is there a lamp on the coffee table?"]
     assert (yes.answer, ids(yes.right), ids(yes.held)) == ("yes: lamp #6", [6], [5])
 
 
@@ -96,7 +96,10 @@ def test_sampling_is_balanced_and_deterministic() -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An audit of two painted scenes."""
     out = tmp_path_factory.mktemp("audit") / "audit"
-    assert main(["query", "audit", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--n", "14", "--out", str(out)]) == 0
+    assert (
+        main(["query", "audit", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--n-questions", "14", "--out", str(out)])
+        == 0
+    )
     return out
 
 
@@ -110,7 +113,7 @@ def judged(folder: Path, path: Path, verdicts: Sequence[str]) -> Path:
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS)
         writer.writeheader()
-        writer.writerows(row | {"verdict": said} for row, said in zip(rows, verdicts, strict=True))
+        writer.writerows(row | {"verdict": as_value} for row, as_value in zip(rows, verdicts, strict=True))
     return path
 
 
@@ -120,7 +123,7 @@ def test_audit_command_writes_pictures_page_and_table(folder: Path) -> None:
     assert [row["number"] for row in rows] == [str(k) for k in range(1, 15)]
     assert {row["verdict"] for row in rows} == {""}
     assert Counter(row["scene"] for row in rows) == {"painted/a": 7, "painted/b": 7}
-    assert {row["kind"] for row in rows} & {*MADE_KINDS} and {row["kind"] for row in rows} - {*MADE_KINDS}
+    assert {row["kind"] for row in rows} & {*GENERATED_KINDS} and {row["kind"] for row in rows} - {*GENERATED_KINDS}
     page = (folder / "index.html").read_text(encoding="utf-8")
     pictures = re.findall(r'src="([^"]*)"', page)
     assert len(pictures) == 14 and all((folder / name).is_file() for name in pictures)

@@ -17,7 +17,7 @@ from su3d_bench.metrics.questions import grounding as counting
 from su3d_bench.metrics.questions.grounding import ChainedText, Place
 from su3d_bench.questions import beacon3d, chains
 from su3d_bench.questions.beacon3d import Number, answered_file
-from su3d_bench.questions.question_files import read_foreign_queries, read_questions
+from su3d_bench.questions.question_files import read_external_queries, read_questions
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())
 FINE = {"text": "The large box", "obj_id": ["27"], "tag": "class-geometry"}
@@ -69,7 +69,7 @@ def test_object_score_uses_most_specific_texts_and_merges_spellings(tmp_path: Pa
 
 def test_file_texts_are_chained_queries_and_questions(tmp_path: Path) -> None:
     asked, _ = written(tmp_path, GROUNDING, [])
-    (scene, cases), *rest = read_foreign_queries(asked).items()
+    (scene, cases), *rest = read_external_queries(asked).items()
     assert scene == "scene0025_00" and not rest and len(cases) == 4
     assert isinstance(cases[1], ChainedText) and cases[1].object_ids == (30, 28)  # one more than in the file
     assert cases[1].places == tuple(Place(0, k, 1) for k in range(3))

@@ -11,7 +11,7 @@ from scored_room import ID, LABELS, room
 
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.questions.generated import generate_questions
-from su3d_bench.questions.generator import generate, right_by_name
+from su3d_bench.questions.generator import accuracy_by_name, generate
 from su3d_bench.questions.model import new_question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, known_objects
 
@@ -103,7 +103,7 @@ def test_positions_of_cut_objects_are_not_asked() -> None:
 def test_invisible_objects_are_not_in_questions_or_answers() -> None:
     table, cup = placed(1, "table", (0, 0, 0), (1, 1, 0.7)), placed(2, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1))
     assert ("instance", "cup") in row_of(table, cup)
-    hidden = row_of(table, replace(cup, is_asked=False))
+    hidden = row_of(table, replace(cup, is_query_target=False))
     assert not any("cup" in text for _, text in hidden)
     assert ("instance", "table") in hidden
 
@@ -123,10 +123,10 @@ def test_colour_or_material_is_asked_if_known_for_all_of_a_name() -> None:
 
 def test_name_only_baseline_equals_share_of_the_name() -> None:
     chairs = SceneMap(tuple(placed(k, "chair", (4.0 * k, 0, 0), (0.5, 0.5, 0.9)) for k in range(1, 5)))
-    assert right_by_name(new_question("a/b", "property", "red chair", (1,), "x"), chairs) == 0.25
-    assert right_by_name(new_question("a/b", "property by name", "old chair", (1, 2, 3, 4), "x"), chairs) == 1.0
-    assert right_by_name(new_question("a/b", "instance", "chair", (1, 2, 3, 4), "x"), chairs) == 1.0
-    assert right_by_name(new_question("a/b", "relative", "chair on a table", None, "x"), chairs) == 0.0
+    assert accuracy_by_name(new_question("a/b", "property", "red chair", (1,), "x"), chairs) == 0.25
+    assert accuracy_by_name(new_question("a/b", "property by name", "old chair", (1, 2, 3, 4), "x"), chairs) == 1.0
+    assert accuracy_by_name(new_question("a/b", "instance", "chair", (1, 2, 3, 4), "x"), chairs) == 1.0
+    assert accuracy_by_name(new_question("a/b", "relative", "chair on a table", None, "x"), chairs) == 0.0
 
 
 def test_questions_answered_by_over_a_third_are_dropped() -> None:

@@ -71,7 +71,7 @@ def test_geometric_questions_are_answered(
     solver: Solver, question: str, ids: tuple[int, ...], value: float | None
 ) -> None:
     found = solver.answer(question)
-    assert found.is_settled, found.text
+    assert found.is_decided, found.text
     assert (found.object_ids, found.value) == (ids, value)
 
 
@@ -87,7 +87,7 @@ def test_geometric_questions_are_answered(
 )
 def test_unsettled_questions_are_reported(solver: Solver, question: str, reason: str) -> None:
     found = solver.answer(question)
-    assert not found.is_settled
+    assert not found.is_decided
     assert found.text.startswith("I cannot settle this: ")
     assert reason in found.text
     assert found.object_ids == ()
@@ -116,16 +116,16 @@ def test_unknown_noun_falls_back_to_encoder_with_a_note() -> None:
     assert found.notes[0] == (
         "the map has no 'bunk'; taken for 'bed', the nearest name by the text encoder (cosine 0.90)"
     )
-    assert not asked.answer("Which sink is closer to the harp?").is_settled
+    assert not asked.answer("Which sink is closer to the harp?").is_decided
 
 
 def test_yes_no_and_numbers_are_parsed_from_text_answers() -> None:
-    assert Answer("There are 2 cups (ID #7 and #8)").said(2) == 2
-    assert Answer("There are 3").said(2) == 3
-    assert Answer("No, there is none").said(True) is False
-    assert Answer("perhaps").said(True) is None
-    assert Answer("about 3.7 m").said(3.68) == 3.7
-    assert Answer("3", value=4).said(2) == 4
+    assert Answer("There are 2 cups (ID #7 and #8)").as_value(2) == 2
+    assert Answer("There are 3").as_value(2) == 3
+    assert Answer("No, there is none").as_value(True) is False
+    assert Answer("perhaps").as_value(True) is None
+    assert Answer("about 3.7 m").as_value(3.68) == 3.7
+    assert Answer("3", value=4).as_value(2) == 4
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def test_a_model_that_refuses_leaves_the_question_unsettled() -> None:
     found = LanguageSolver(bedroom(), Said("I'm sorry, I can't help with that."), LanguageConfig()).answer(
         "Which sink is closer to bed?"
     )
-    assert not found.is_settled
+    assert not found.is_decided
     assert found.text.startswith("I cannot settle this: gpt-4-1106-preview: ")
 
 
@@ -265,8 +265,8 @@ def test_seven_paper_questions_belong_to_paper_scenes() -> None:
 def test_builtin_solver_gives_published_answer_or_none(case: Any) -> None:
     scene = shown_map(case)
     found = Solver(scene).answer(case["question"])
-    assert found.is_settled is case["is_settled_by_geometry"]
-    if found.is_settled:
+    assert found.is_decided is case["is_settled_by_geometry"]
+    if found.is_decided:
         given, true = given_answer(truth_of(case), found, scene), truth_of(case)
         assert RULES is not None and is_answer_right(RULES, true, given, objects_of_rows(scene))
         assert are_objects_right(true, given, objects_of_rows(scene))

@@ -11,8 +11,8 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.questions import model as questions_model
-from su3d_bench.questions.model import points_found, rank, rank_all
-from su3d_bench.questions.refining import FilterConfig, undesired
+from su3d_bench.questions.model import rank, rank_all, retrieved_points
+from su3d_bench.questions.refining import FilterConfig, exclusion_reasons
 
 
 class TwoWords:
@@ -64,7 +64,7 @@ def test_feature_only_retrieval_matches_original_program(rows_at_once: int, monk
     features[::9] = 0  # no feature, no part
     dense = DenseFeatures(random.normal(size=(60, 3)).astype(np.float32), features)
     has = np.flatnonzero(features.any(axis=1))
-    found = points_found(dense, ["east", "north"], TwoWords())
+    found = retrieved_points(dense, ["east", "north"], TwoWords())
     for k in range(2):
         similarity = features[has, k].astype(np.float64) / np.linalg.norm(features[has].astype(np.float64), axis=1)
         assert found.mask(k).tolist() == has[as_the_program_of_conceptfusion_shows(similarity)].tolist()
@@ -74,7 +74,7 @@ def test_feature_only_retrieval_matches_original_program(rows_at_once: int, monk
 def test_equal_similarities_retrieve_no_points() -> None:
     for n, features in ((0, np.zeros((0, 2))), (3, np.zeros((3, 2))), (3, np.ones((3, 2)))):
         dense = DenseFeatures(np.zeros((n, 3), np.float32), features.astype(np.float16))
-        assert points_found(dense, ["east"], TwoWords()).sizes.tolist() == [0]
+        assert retrieved_points(dense, ["east"], TwoWords()).sizes.tolist() == [0]
 
 
 def plan_of(*sides_m: tuple[float, float]) -> Instances:
@@ -87,17 +87,21 @@ def plan_of(*sides_m: tuple[float, float]) -> Instances:
 
 @pytest.mark.parametrize("name", ["walls", "Wall", "hardwood floor", "the ground"])
 def test_names_of_background_are_left_out(name: str) -> None:
-    assert undesired(plan_of((1, 1)), (name,), FilterConfig()) == (f"'{name}' is background",)
-    assert undesired(plan_of((1, 1)), (name,), FilterConfig(background_names=())) == ("",)
+    assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig()) == (f"'{name}' is background",)
+    assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig(background_names=())) == ("",)
 
 
 @pytest.mark.parametrize("name", ["wall lamp", "floor mat", "ceiling fan", "wall-mounted shelf", "sofa", "", "<wall>x"])
 def test_objects_on_walls_and_floors_are_retained(name: str) -> None:
-    assert undesired(plan_of((1, 1)), (name,), FilterConfig()) == ("",)
+    assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig()) == ("",)
 
 
 def test_a_box_that_covers_the_map_from_above_is_left_out() -> None:
     made = plan_of((9.8, 9.8), (9.7, 9.7), (1, 10))  # 96 %, 94 %, 10 %
-    assert undesired(made, ("rug",) * 3, FilterConfig()) == ("its box has 96 % of the map's area from above", "", "")
-    assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=1.0)) == ("", "", "")
-    assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=0.05))[2] != ""
+    assert exclusion_reasons(made, ("rug",) * 3, FilterConfig()) == (
+        "its box has 96 % of the map's area from above",
+        "",
+        "",
+    )
+    assert exclusion_reasons(made, ("rug",) * 3, FilterConfig(max_map_fraction=1.0)) == ("", "", "")
+    assert exclusion_reasons(made, ("rug",) * 3, FilterConfig(max_map_fraction=0.05))[2] != ""

@@ -13,12 +13,12 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
+from su3d_bench.human_eval.answers import check_answers
+from su3d_bench.human_eval.scores import score, write_scores
 from su3d_bench.reports.tables.judged import judged_table
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
-from su3d_bench.sheets.answers import check_answers
-from su3d_bench.sheets.scores import score, write_scores
 
 LABELS = [
     ("right", "right", "well-merged"),

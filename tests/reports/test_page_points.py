@@ -13,7 +13,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page.maps import (
-    NO_TRUTH_NEAR,
+    NO_GROUND_TRUTH_NEAR,
     NOT_SCORED,
     index_plane,
     nearest_classes,
@@ -74,5 +74,9 @@ def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
 def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
     truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
     points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
-    assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
-    assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
+    assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [
+        7,
+        NO_GROUND_TRUTH_NEAR,
+        NOT_SCORED,
+    ]
+    assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_GROUND_TRUTH_NEAR] * 3

@@ -21,7 +21,7 @@ from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.reports.page.maps import (
-    NO_TRUTH_NEAR,
+    NO_GROUND_TRUTH_NEAR,
     NOT_SCORED,
 )
 from su3d_bench.reports.page.page import page_html
@@ -220,4 +220,4 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
     assert called == [("sofa", "table", "sofa", "none")[k] for k in order]
     assert about["instances"] == []
     assert planes["owner"].tolist() == [0xFFFF] * 4
-    assert planes["truth"][order.tolist().index(2)] == NO_TRUTH_NEAR
+    assert planes["truth"][order.tolist().index(2)] == NO_GROUND_TRUTH_NEAR

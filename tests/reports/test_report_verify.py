@@ -61,7 +61,7 @@ def test_verify_finds_every_cell_that_was_changed_by_hand(
 ) -> None:
     monkeypatch.chdir(sweep.parent.parent)
     paper = tmp_path / "paper.tex"
-    words = ["--format", "latex", "--intervals", "--truth-scores", "--scenes-count", "--out", str(paper), "--table"]
+    words = ["--format", "latex", "--intervals", "--ceiling", "--scenes-count", "--out", str(paper), "--table"]
     told(capsys, "tables", "runs/a run", *words, "I", "III")
     assert re.search(r"^(\d+) cells checked, 0 differ$", told(capsys, "verify", str(paper)), re.MULTILINE)
     told(capsys, "tables", "runs/a run", *words, "II")

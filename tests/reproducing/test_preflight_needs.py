@@ -9,13 +9,13 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.reproducing.preflight import Need, preflight
-from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe
+from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe
 
 ROOM = ["--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 
 
 def missing_meshes(methods: tuple[str, ...]) -> list[Need]:
-    asked = Asked("embedded", "embedded", scenes={"replica": ("replica/bedroom0",)}, values={})
+    asked = RecipeRequest("embedded", "embedded", scenes={"replica": ("replica/bedroom0",)}, values={})
     (run,) = asked_runs(load_recipe("openmask3d"), load_recipe("openmask3d").chosen(["replica"]), asked)
     return [need for need in preflight([replace(run, methods=methods)]).needs if need.kind == "mesh"]
 
@@ -31,7 +31,7 @@ def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
     assert missing_meshes(both) == []
     (tmp_path / "data/Replica/bedroom0_mesh.ply").unlink()
     (need,) = missing_meshes((*both, "sam3d@ensemble"))
-    assert need.is_required and not need.is_here and need.how == "su3d-bench datasets fetch replica"
+    assert need.is_required and not need.is_available and need.how == "su3d-bench datasets fetch replica"
     assert need.name == "replica/bedroom0: the scan's mesh"
     assert "bedroom0_mesh.ply is missing" in need.remark
     assert need.remark.endswith("openmask3d, sam3d@ensemble cannot do without")

@@ -12,7 +12,7 @@ import pytest
 from registry_bundles import Files, edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
-from su3d_bench.reproducing.registry import Weights, read_registry, rows_of_bundle, why_not_beside
+from su3d_bench.reproducing.registry import ModelWeights, conflict_with, read_registry, rows_of_bundle
 
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
 
@@ -95,24 +95,24 @@ def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(regist
     one = replace(rows[0], protocol="replica-openmask3d", method="other", encoder="ViT-L-14-336/openai")
     other = replace(one, method="mine", encoder="su3d-embedded")
     assert "its features are of the encoder su3d-embedded, those of other in ann.zip of" in (
-        why_not_beside(other, [one]) or ""
+        conflict_with(other, [one]) or ""
     )
-    assert why_not_beside(replace(other, encoder=None), [one]) is None, "it names its instances itself"
+    assert conflict_with(replace(other, encoder=None), [one]) is None, "it names its instances itself"
     free = [replace(row, protocol="rooms-instance") for row in (other, one)]
-    assert why_not_beside(free[0], free[1:]) is None, "a protocol that names none leaves it open"
-    weights = [(Weights("clip-vit-l-14-336", "", (("model.safetensors", sha * 64),)),) for sha in "ab"]
+    assert conflict_with(free[0], free[1:]) is None, "a protocol that names none leaves it open"
+    weights = [(ModelWeights("clip-vit-l-14-336", "", (("model.safetensors", sha * 64),)),) for sha in "ab"]
     same = replace(other, encoder=one.encoder, weights=weights[0])
     assert "its weights of clip-vit-l-14-336 are not those of" in (
-        why_not_beside(same, [replace(one, weights=weights[1])]) or ""
+        conflict_with(same, [replace(one, weights=weights[1])]) or ""
     )
-    assert why_not_beside(same, [replace(one, weights=weights[0])]) is None
+    assert conflict_with(same, [replace(one, weights=weights[0])]) is None
 
 
 def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_markup(
     registry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["dev", "registry", "build", str(registry), "--out", str(tmp_path / "site"), "--title", STRUCK]
-    assert main([*words, "--bundles-at", "https://example.org/b"]) == 0
+    assert main([*words, "--bundle-url", "https://example.org/b"]) == 0
     pages = sorted(path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html"))
     assert len(pages) == 1 + 3 + 3
     for page in pages:
@@ -122,7 +122,7 @@ def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_mar
     bundle = value["boards"][0]["rows"][0]["bundle"]
     assert bundle["address"] == f"https://example.org/b/{bundle['file']}" and len(bundle["sha256"]) == 64
     before = {page: (tmp_path / "site" / page).read_bytes() for page in pages}
-    assert main([*words, "--bundles-at", "https://example.org/b"]) == 0
+    assert main([*words, "--bundle-url", "https://example.org/b"]) == 0
     assert {page: (tmp_path / "site" / page).read_bytes() for page in pages} == before, "the same bytes again"
     (registry / "bundles" / "ann.zip").unlink()
     assert main(words) == 0

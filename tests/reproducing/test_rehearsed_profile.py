@@ -10,7 +10,7 @@ from tiny_models import write_fetched
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import Su3dError
-from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe, plan_of
+from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe, plan_of
 
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 WORDS = ["reproduce", "opensu3d", "--table", "III", "--rehearse", *ROOM, "--dry-run"]
@@ -38,7 +38,7 @@ def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
 
 def test_the_device_reaches_every_run_and_the_preflight(out: Path) -> None:
     recipe = load_recipe("opensu3d")
-    asked = Asked("embedded", "embedded", device="cuda:99", values={})
+    asked = RecipeRequest("embedded", "embedded", device="cuda:99", values={})
     runs = asked_runs(recipe, recipe.experiments, asked)
     assert {run.dataset for run in runs} == {"replica", "scannet"}
     for run in runs:

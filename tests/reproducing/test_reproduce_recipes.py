@@ -8,7 +8,7 @@ import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.paper import figures_of, published
-from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe, method_of_row, recipe_names
+from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe, method_of_row, recipe_names
 
 OWN = """
 schema = 1
@@ -27,7 +27,7 @@ figures = [{ table = "III" }]
 @pytest.mark.parametrize("name", recipe_names())
 def test_each_recipe_of_the_program_asks_for_runs_of_methods_scenes_and_protocols_that_there_are(name: str) -> None:
     recipe = load_recipe(name)
-    runs = asked_runs(recipe, recipe.experiments, Asked())
+    runs = asked_runs(recipe, recipe.experiments, RecipeRequest())
     assert {one for run in runs for one in run.experiments} == {one.name for one in recipe.experiments}
     assert all(run.methods and run.scenes and run.protocols for run in runs)
 
@@ -36,7 +36,7 @@ def test_each_recipe_of_the_program_asks_for_runs_of_methods_scenes_and_protocol
 def test_each_printed_row_is_of_a_method_that_is_run_or_of_predictions_that_are_taken(name: str) -> None:
     recipe = load_recipe(name)
     for experiment in recipe.experiments:
-        (*_, methods) = (run.methods for run in asked_runs(recipe, [experiment], Asked()))
+        (*_, methods) = (run.methods for run in asked_runs(recipe, [experiment], RecipeRequest()))
         for figure in experiment.printed():
             method = method_of_row(experiment, figure.method, figure.row)
             assert method in methods or figure.method in experiment.predictions, figure

@@ -129,7 +129,10 @@ def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
     assert "(perception was colours-1, now colours-2); --replace puts this one in its place" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in before} == before
     assert run("a", "--replace") == 0
-    assert RunFolder(Path("out")).job("painted/a", "collector").seals()["predict"].key["perception"] == "colours-2"
+    assert (
+        RunFolder(Path("out")).job("painted/a", "collector").completion_records()["predict"].key["perception"]
+        == "colours-2"
+    )
 
 
 def test_files_of_others_are_not_removed_with_a_run_that_is_replaced(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ from waiting import wait_until
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import TakesTools
+from su3d_bench.core.interfaces import UsesSceneTools
 from su3d_bench.runs.frame_loop import ReadAhead, warm_up
 
 N_FRAMES = 40
@@ -96,4 +96,4 @@ def test_a_made_up_frame_goes_through_every_step(name: str) -> None:
     method = type("Kept", (registry.load("method", name),), {"close": lambda self: None})()
     warm_up(method)
     assert method.n_points > 0
-    assert not isinstance(method, TakesTools) or vars(method)["_tools"] is None
+    assert not isinstance(method, UsesSceneTools) or vars(method)["_tools"] is None

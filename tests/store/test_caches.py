@@ -18,10 +18,10 @@ def test_where_no_kernel_can_be_kept_the_reason_and_what_to_do_are_said(
     (tmp_path / "file").touch()
     closed = tmp_path / "file" / "numba"
     monkeypatch.setattr(caches, "kernel_folders", lambda: (closed, Path("/dev/null/numba")))
-    line = caches.why_slow()
+    line = caches.cache_warning()
     assert line is not None and line.startswith(f"compiled code cannot be kept in any of {closed}, /dev/null/numba: ")
     monkeypatch.setattr(caches, "kernel_folders", lambda: (closed, tmp_path))
-    assert caches.why_slow() is None
+    assert caches.cache_warning() is None
 
 
 def test_the_folders_are_those_that_numba_tries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

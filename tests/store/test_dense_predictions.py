@@ -18,7 +18,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
-from su3d_bench.predictions.own_runs import OWN_RUNS
+from su3d_bench.predictions.run_predictions import OWN_RUNS
 from su3d_bench.store import predictions
 from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
 
@@ -111,15 +111,15 @@ def test_features_written_in_blocks_are_the_file_that_numpy_saves(
 def test_features_that_are_missing_or_damaged_are_one_line_for_both_readers(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "prediction.npz"
     write_prediction(path, DenseFeatures(POINTS, ROWS))
-    beside = features_beside(path)
+    temporary_path = features_beside(path)
     if damage == "missing":
-        beside.unlink()
+        temporary_path.unlink()
     elif damage == "cut":
-        beside.write_bytes(beside.read_bytes()[:-3])
+        temporary_path.write_bytes(temporary_path.read_bytes()[:-3])
     elif damage == "text":
-        beside.write_text("not numbers")
+        temporary_path.write_text("not numbers")
     else:
-        np.save(beside, ROWS[:3] if damage == "rows" else ROWS.astype(np.int16))
+        np.save(temporary_path, ROWS[:3] if damage == "rows" else ROWS.astype(np.int16))
     with pytest.raises(StoreError, match=r"prediction\.features\.npy: .*run again$"):
         read_prediction(path)
     with pytest.raises(PredictionError, match=r"prediction(\.features)?\.npy?z?: "):

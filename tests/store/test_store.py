@@ -43,7 +43,7 @@ def sealed_job(tmp_path: Path) -> JobFolder:
     job.prepare()
     write_bytes(job.prediction, b"prediction")
     write_bytes(job.updates, b"update\n")
-    job.seal("predict", KEY, [job.prediction, job.updates])
+    job.mark_complete("predict", KEY, [job.prediction, job.updates])
     return job
 
 
@@ -139,10 +139,10 @@ def test_a_damaged_file_means_that_the_step_runs_anew(tmp_path: Path, damage: st
 def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
     job = sealed_job(tmp_path)
     write_bytes(job.counts, b"counts")
-    job.seal("score", {"protocol": "1"}, [job.counts], {"unscored": {"rooms-semantic": "no truth"}})
+    job.mark_complete("score", {"protocol": "1"}, [job.counts], {"unscored": {"rooms-semantic": "no truth"}})
     assert job.is_done("score", {"protocol": "1"})
     assert job.remarks("score") == {"unscored": {"rooms-semantic": "no truth"}}
-    job.seal("predict", KEY, [job.prediction])
+    job.mark_complete("predict", KEY, [job.prediction])
     assert not job.is_done("score", {"protocol": "1"})
 
 

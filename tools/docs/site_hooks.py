@@ -7,7 +7,8 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from pages_of_code import PROTOCOLS, made_pages
+from code_pages import PROTOCOLS, made_pages
+from command_pages import command_names, place_of_command
 from site_text import DOCS, ROOT, ROOT_PAGES, for_site
 
 from su3d_bench.metrics.protocols.loading import protocol_names
@@ -37,9 +38,10 @@ def on_page_markdown(markdown: str, page: Any, **rest: Any) -> str:
     if place in _made and place not in ROOT_PAGES.values():
         return markdown
     path = next((name for name, root in ROOT_PAGES.items() if root == place), f"docs/{place}")
-    protocols = {name: f"{PROTOCOLS}/{name}.md" for name in protocol_names()}
+    names = {name: f"{PROTOCOLS}/{name}.md" for name in protocol_names()}
+    names |= {f"su3d-bench {name}": place_of_command(name) for name in command_names()}
     repository = repository_of(ROOT / "pyproject.toml")
-    return for_site(markdown, path, lambda name: (ROOT / name).exists(), repository, protocols)
+    return for_site(markdown, path, lambda name: (ROOT / name).exists(), repository, names)
 
 
 def on_post_template(output: str, template_name: str, **rest: Any) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from posixpath import normpath, relpath
 from types import MappingProxyType
 
-from su3d_bench.core.printing import escaped
+from su3d_bench.core.safe_output import escaped
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

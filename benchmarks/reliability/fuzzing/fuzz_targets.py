@@ -310,7 +310,7 @@ def _answers(name: str) -> Make:
     def make(folder: Path) -> Read:
         from simulated_annotators import answered, as_csv, retrieval_set, workbook
 
-        from su3d_bench.sheets.answers import check_answers, read_answers
+        from su3d_bench.human_eval.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
@@ -367,7 +367,7 @@ def _archive(name: str) -> Make:
 def _truth(folder: Path) -> Read:
     from evaluated_text import write_texts, write_truth
 
-    from su3d_bench.evaluation.text_truth import read_values
+    from su3d_bench.evaluation.text_ground_truth import read_values
     from su3d_bench.evaluation.texts import read_text_features
 
     write_truth(folder, values=[0, 5001, 1163002, 39001, 7])

@@ -20,10 +20,10 @@ from mutations import mutated
 
 from su3d_bench.core.errors import GroundTruthMissing, Su3dError
 
-MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine
-MOST_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may rise during a read
-MOST_ADDRESSES_BYTES = 2 << 30  # how much address space a read may reserve
-MOST_CHARACTERS = 1000  # of a message including file names
+MAX_SECONDS = 20.0  # one read of a small file; generous, for a busy machine
+MAX_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may rise during a read
+MAX_ADDRESSES_BYTES = 2 << 30  # how much address space a read may reserve
+MAX_CHARACTERS = 1000  # of a message including file names
 ENDLESS = {"pipe": "a pipe", "device": "a device"}  # one blocks, one is endless
 SHAPES = ("missing", "folder", "loop", *ENDLESS)  # a missing file, or not a file
 Read = Callable[[], object]
@@ -123,19 +123,19 @@ class Sample:
         started = time.monotonic()
         is_read, fault = False, None
         try:
-            with alarm(MOST_SECONDS), warnings.catch_warnings():
+            with alarm(MAX_SECONDS), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self.read()
             is_read = True
         except Su3dError as error:
             fault = fault_of_message(str(error))
         except TooSlow:
-            fault = f"slow: more than {MOST_SECONDS:g} s"
+            fault = f"slow: more than {MAX_SECONDS:g} s"
         except Exception as error:  # noqa: BLE001 - what a reader must not raise
             fault = f"{type(error).__name__}: {error}"[:500]
         seconds = time.monotonic() - started
         grown = max(0, peak_bytes() - before)
-        if fault is None and grown > MOST_GROWN_BYTES:
+        if fault is None and grown > MAX_GROWN_BYTES:
             fault = f"memory: grew by {grown >> 20} MiB"
         return Outcome(is_read and fault is None, fault, seconds, grown)
 
@@ -159,7 +159,7 @@ def fault_of_message(message: str) -> str | None:
     odd = {c for c in message if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
     if odd:
         return f"message: holds {sorted(map(ascii, odd))}: {message!r:.300}"
-    if len(message) > MOST_CHARACTERS:
+    if len(message) > MAX_CHARACTERS:
         return f"message: {len(message)} characters long: {message[:200]!r}"
     return None if message.strip() else "message: is empty"
 

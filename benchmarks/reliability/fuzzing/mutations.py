@@ -10,12 +10,12 @@ import warnings
 import zipfile
 import zlib
 
-from bombs import MIB, Member, deflated, gzip_of, whole_member, zip_of
+from decompression_bombs import MIB, Member, deflated, gzip_of, whole_member, zip_of
 
 from su3d_bench.core.files.atomic import DAMAGE
 
-MOST_BYTES = 4 << 20  # of a copy
-MOST_INSIDE = 64 << 20  # bytes of a packed sample to unpack for damaging
+MAX_BYTES = 4 << 20  # of a copy
+MAX_INSIDE = 64 << 20  # bytes of a packed sample to unpack for damaging
 BOMBS = (1, 40, 2500)  # mebibytes that few bytes unpack to: allowed and excessive
 NUMBERS = (
     *("0", "-0", "1", "-1", "2", "0.5", "1e-320", "1e308", "1e999", "nan", "NaN", "-inf", "Infinity", "127", "256"),
@@ -37,7 +37,7 @@ SNIPPETS = (  # of pickles
 
 
 def mutated(content: bytes, rng: random.Random) -> bytes:
-    """A damaged copy of ``content``, at most ``MOST_BYTES`` long if ``content`` is."""
+    """A damaged copy of ``content``, at most ``MAX_BYTES`` long if ``content`` is."""
     damaged = content
     if rng.random() < 0.04:
         damaged = rng.choice((b"", b"\xef\xbb\xbf" + content, bytes(1000), b"1" * 1_000_000, rng.randbytes(500)))
@@ -53,7 +53,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
             damaged = damaged[:at] + rng.choice(SNIPPETS) + damaged[at + rng.choice((0, 1, 2)) :]
         else:
             damaged = _text(damaged, rng)
-    return damaged[: max(MOST_BYTES, len(content))]
+    return damaged[: max(MAX_BYTES, len(content))]
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:
@@ -104,7 +104,7 @@ def _text(content: bytes, rng: random.Random) -> bytes:
         if kind == 5:
             lines[at], lines[other] = lines[other], lines[at]
         elif kind == 6:
-            lines[at:at] = [lines[other]] * min(rng.choice((1, 1, 500)), 1 + MOST_BYTES // len(lines[other]))
+            lines[at:at] = [lines[other]] * min(rng.choice((1, 1, 500)), 1 + MAX_BYTES // len(lines[other]))
         else:
             del lines[at : at + rng.choice((1, 1, 5))]
         text = "".join(lines)
@@ -114,7 +114,7 @@ def _text(content: bytes, rng: random.Random) -> bytes:
 def _gzip(content: bytes, rng: random.Random) -> bytes:
     unpacking = zlib.decompressobj(31)
     try:
-        inside = unpacking.decompress(content, MOST_INSIDE)
+        inside = unpacking.decompress(content, MAX_INSIDE)
     except zlib.error:
         return _bytes(content, rng)
     if not unpacking.eof:
@@ -129,7 +129,7 @@ def _zip(content: bytes, rng: random.Random) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             sizes = [max(info.file_size, info.compress_size * 64) for info in archive.filelist]
-            if sum(sizes) > MOST_INSIDE:
+            if sum(sizes) > MAX_INSIDE:
                 return _bytes(content, rng)  # a bomb already
             members = [(info.filename, archive.read(info), info.compress_type) for info in archive.filelist]
         at = rng.randrange(len(members))

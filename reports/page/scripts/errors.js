@@ -1,6 +1,6 @@
 // The sections of what goes wrong: confusion of classes, and what each kind of error costs.
 
-const MOST_CONFUSED = 18, MOST_PAIRS = 200; // that are shown until more are asked for
+const MAX_CONFUSED = 18, MAX_PAIRS = 200; // that are shown until more are asked for
 
 function confusionSection() {
   const usable = DATA.confusions;
@@ -9,8 +9,8 @@ function confusionSection() {
     + 'row. The classes with most points come first.', (section) => {
     const names = [...new Set(usable.map((one) => one.protocol))], place = h('div');
     const protocols = protocolField(names), side = select('Method', [], null, draw);
-    const amounts = [[MOST_CONFUSED, `the ${MOST_CONFUSED} largest`], [Infinity, 'all']];
-    const amount = select('Classes', amounts, MOST_CONFUSED, draw);
+    const amounts = [[MAX_CONFUSED, `the ${MAX_CONFUSED} largest`], [Infinity, 'all']];
+    const amount = select('Classes', amounts, MAX_CONFUSED, draw);
     section.append(h('div', { class: 'toolbar' }, protocols, side, amount), place);
     chosen.listeners.push(refresh);
     function refresh() {
@@ -63,7 +63,7 @@ function confusionTables(one, most) {
     h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Confusion matrix' }, table),
     h('h3', null, 'Largest confusions'),
     dataTable({ caption: 'True class, what it is called instead, and how many points', rows: wrong,
-      filter: 'classes', tall: wrong.length > 10, most: MOST_PAIRS,
+      filter: 'classes', tall: wrong.length > 10, most: MAX_PAIRS,
       columns: [{ label: 'True class', value: (row) => row.truth, show: (row) => toGallery(row.truth, row.wish,
         `The worst errors: ${row.truth} called ${row.called}`) }, { label: 'Called', value: (row) => row.called },
         { label: 'Points', num: true, value: (row) => row.n, show: (row) => countText(row.n) },

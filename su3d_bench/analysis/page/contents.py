@@ -15,16 +15,16 @@ import numpy as np
 
 from su3d_bench.analysis.attribution import Explained, explained_of
 from su3d_bench.analysis.comparison import compare
-from su3d_bench.analysis.page import kept
+from su3d_bench.analysis.page import page_cache
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
-from su3d_bench.analysis.page.kept import Job, Made
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
+from su3d_bench.analysis.page.page_cache import Job, SceneContent
 from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.analysis.sides import Side, SideNumbers
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, printable_json
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.metrics.attribution.arrays import LookedAt
+from su3d_bench.metrics.attribution.arrays import EvaluatedScene
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
@@ -34,7 +34,7 @@ from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
-MOST_BINS = 160  # points of a line: more than a plot has room for
+MAX_BINS = 160  # points of a line: more than a plot has room for
 DIGITS = 4  # of a time
 
 
@@ -53,7 +53,7 @@ def confusion_cells(confusion: Int64Array) -> list[list[int]]:
 
 def series_of(times: UpdateTimes) -> dict[str, Any]:
     """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
-    per = max(1, -(-len(times) // MOST_BINS))
+    per = max(1, -(-len(times) // MAX_BINS))
     starts = np.arange(0, len(times), per)
 
     def binned(values: Float64Array) -> list[float]:
@@ -93,14 +93,14 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else short(value)
 
 
-MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
+MAX_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
 # Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
 # are no more to be looked at one by one.
-MOST_JOBS = 500
-MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
+MAX_JOBS = 500
+MAX_MAPS = 16  # of a page of more jobs: two scenes under eight methods
 LEFT_OUT = (
     "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
-    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MAX_MAPS}"
 )
 # Of a record of results: what the page says elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")
@@ -110,7 +110,7 @@ NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean"
 def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Plain values for the page of ``runs``, every text in them on one line and printable.
 
-    Of more than ``MOST_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
+    Of more than ``MAX_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
     """
     reads_all = are_all_read(runs)
     results: list[dict[str, Any]] = []
@@ -123,7 +123,7 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
             confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
     told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
     numbers = {
-        "left_out": None if reads_all else f"{_n_jobs(runs)} jobs, more than {MOST_JOBS}: {LEFT_OUT}",
+        "left_out": None if reads_all else f"{_n_jobs(runs)} jobs, more than {MAX_JOBS}: {LEFT_OUT}",
         "runs": [_about(run) for run in runs],
         "results": [result for result in results if result["protocol"] in told],
         "found": [
@@ -142,7 +142,7 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
 
 def are_all_read(runs: Sequence[FinishedRun]) -> bool:
     """Whether the files of each job are read, or there are too many."""
-    return _n_jobs(runs) <= MOST_JOBS
+    return _n_jobs(runs) <= MAX_JOBS
 
 
 def is_scored(run: FinishedRun) -> bool:
@@ -205,14 +205,14 @@ def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
 
 
 def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
-    """The first ``MOST_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
+    """The first ``MAX_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
     pairs: list[tuple[Side, Side]] = []
     for first, second in itertools.combinations(runs, 2):
         pairs += [(Side(first, method), Side(second, method)) for method in first.methods if method in second.methods]
     for run in runs:
         pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
     numbers, compared = SideNumbers(), []
-    for pair in pairs[:MOST_PAIRS]:
+    for pair in pairs[:MAX_PAIRS]:
         left, right = ([runs.index(side.run), side.method] for side in pair)
         found: dict[str, Any] = {"left": left, "right": right, "protocols": [], "remarks": [], "reason": None}
         try:
@@ -231,7 +231,7 @@ def _n_jobs(runs: Sequence[FinishedRun]) -> int:
 def scored_maps(runs: Sequence[FinishedRun]) -> list[tuple[int, FinishedRun, str, str]]:
     """Index of the run, run, scene and method of every map there is, all methods of a scene together.
 
-    Of more than ``MOST_JOBS`` jobs only the maps of the first scenes, at most ``MOST_MAPS``.
+    Of more than ``MAX_JOBS`` jobs only the maps of the first scenes, at most ``MAX_MAPS``.
     """
     maps = (
         (index, run, scene, method)
@@ -240,7 +240,7 @@ def scored_maps(runs: Sequence[FinishedRun]) -> list[tuple[int, FinishedRun, str
         for method in run.methods
         if run.folder.job(scene, method).prediction.is_file()
     )
-    return list(maps if are_all_read(runs) else itertools.islice(maps, MOST_MAPS))
+    return list(maps if are_all_read(runs) else itertools.islice(maps, MAX_MAPS))
 
 
 QUERIES = (
@@ -256,15 +256,15 @@ QUERIES = (
 
 
 @dataclass(frozen=True)
-class Wishes:
-    """What a page shall hold: ``queries`` are texts that instances are compared with; ``most_bytes`` is about its size.
+class PageOptions:
+    """What a page shall hold: ``queries`` are texts that instances are compared with; ``max_bytes`` is about its size.
 
     There is a gallery of single errors only where errors are explained at all.
     ``jobs`` scenes are made side by side, 0: as many as there are cores.
     """
 
     queries: tuple[str, ...] = QUERIES
-    most_bytes: int = 30_000_000
+    max_bytes: int = 30_000_000
     with_maps: bool = True
     with_errors: bool = True
     with_gallery: bool = True
@@ -273,12 +273,12 @@ class Wishes:
 
 @dataclass(frozen=True)
 class Contents:
-    """Plain ``numbers``, the ``scenes`` with their maps, none of more than ``most_points``, and their ``galleries``."""
+    """Plain ``numbers``, the ``scenes`` with their maps, none of more than ``max_points``, and their ``galleries``."""
 
     numbers: Mapping[str, Any]
     scenes: tuple[PageScene, ...]
     galleries: tuple[SceneGallery, ...]
-    most_points: int
+    max_points: int
 
     @property
     def maps(self) -> list[PageMap]:
@@ -286,13 +286,13 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Asked:
+class SceneRequest:
     """What is needed of one scene: the maps of some jobs, the errors of some, and where all of it is kept."""
 
     scene: str
     maps: tuple[Job, ...]
     explained: tuple[Job, ...]
-    place: kept.Piece
+    place: page_cache.CacheFile
 
     @property
     def n_steps(self) -> int:
@@ -304,15 +304,15 @@ class Batch:
     """The scenes that one process makes."""
 
     folders: tuple[Path, ...]
-    wishes: Wishes
-    most_points: int
-    most_photos: int
-    scenes: tuple[Asked, ...]
+    options: PageOptions
+    max_points: int
+    max_photos: int
+    scenes: tuple[SceneRequest, ...]
 
 
 def page_contents(
     folders: Sequence[Path],
-    wishes: Wishes,
+    options: PageOptions,
     *,
     begin: Callable[[int], None] = lambda n_steps: None,
     report: Report = lambda event: None,
@@ -324,26 +324,26 @@ def page_contents(
     """
     folders = tuple(dict.fromkeys(folders))
     runs = [read_run(folder) for folder in folders]
-    maps = scored_maps(runs) if wishes.with_maps else []
-    most_points = points_of_each(len(maps), wishes.most_bytes)
-    explained = _explained(runs) if wishes.with_errors and are_all_read(runs) else {}
+    maps = scored_maps(runs) if options.with_maps else []
+    max_points = points_of_each(len(maps), options.max_bytes)
+    explained = _explained(runs) if options.with_errors and are_all_read(runs) else {}
     told = [job for job, one in explained.items() if isinstance(one, Explained)]
-    most_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
-    wanted = _wanted(runs, maps, told, [wishes.queries, most_points, most_photos, wishes.with_gallery])
+    max_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
+    wanted = _wanted(runs, maps, told, [options.queries, max_points, max_photos, options.with_gallery])
     made = {one.scene: found for one in wanted if (found := one.place.load(runs)) is not None}
     asked = [one for one in wanted if one.scene not in made]
     begin(sum(one.n_steps for one in asked))
-    batch = Batch(folders, wishes, most_points, most_photos, tuple(asked))
+    batch = Batch(folders, options, max_points, max_photos, tuple(asked))
     made |= {one.scene: one for one in _all_made(batch, report)}
     made = {one.scene: made[one.scene] for one in wanted}
     errors = []
     for (index, method), one in explained.items():
         job = index, method
         of_scenes = {scene: made[scene].errors[job] for scene in made if job in made[scene].errors}
-        errors.append({**kept.errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
+        errors.append({**page_cache.errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
     shown = tuple(one.page for one in made.values() if one.page is not None)
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
-    return Contents(page_numbers(runs, errors), shown, galleries, most_points)
+    return Contents(page_numbers(runs, errors), shown, galleries, max_points)
 
 
 def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
@@ -359,8 +359,8 @@ def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
 
 
 def _wanted(
-    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], wishes: Sequence[Any]
-) -> list[Asked]:
+    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], options: Sequence[Any]
+) -> list[SceneRequest]:
     """What is needed of each scene; those with maps first."""
     shown: dict[str, list[Job]] = {}
     for index, _, scene, method in maps:
@@ -375,16 +375,16 @@ def _wanted(
         of_maps, of_errors = shown.get(scene, []), counted_jobs.get(scene, [])
         jobs = dict.fromkeys([*of_maps, *of_errors])
         # what an error costs depends on the counts of every scene
-        counts = [kept.state_of_counts(runs[index], method) for index, method in of_errors]
-        states = [[index, *kept.state_of_scene(runs[index], scene, method)] for index, method in jobs]
-        place = kept.piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *wishes])
-        asked.append(Asked(scene, tuple(of_maps), tuple(of_errors), place))
+        counts = [page_cache.state_of_counts(runs[index], method) for index, method in of_errors]
+        states = [[index, *page_cache.state_of_scene(runs[index], scene, method)] for index, method in jobs]
+        place = page_cache.piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *options])
+        asked.append(SceneRequest(scene, tuple(of_maps), tuple(of_errors), place))
     return asked
 
 
-def _all_made(batch: Batch, report: Report) -> list[Made]:
+def _all_made(batch: Batch, report: Report) -> list[SceneContent]:
     """The scenes of ``batch``, dealt out to processes where there is more than one."""
-    n_workers = min(batch.wishes.jobs or os.cpu_count() or 1, len(batch.scenes))
+    n_workers = min(batch.options.jobs or os.cpu_count() or 1, len(batch.scenes))
     dealt = [replace(batch, scenes=batch.scenes[k::n_workers]) for k in range(n_workers)]
     if n_workers > 1:
         outcomes = run_processes(_make, dealt, report, jobs=n_workers, lost=_lost)
@@ -393,51 +393,51 @@ def _all_made(batch: Batch, report: Report) -> list[Made]:
     return [made for of_batch in outcomes for made in of_batch]
 
 
-def _lost(batch: Batch, cause: str) -> list[Made]:
+def _lost(batch: Batch, cause: str) -> list[SceneContent]:
     scenes = printable(", ".join(asked.scene for asked in batch.scenes), 200)
     raise DataError(f"{scenes}: {cause}; scenes that were made are kept")
 
 
-def _make(batch: Batch, report: Report) -> list[Made]:
+def _make(batch: Batch, report: Report) -> list[SceneContent]:
     """The scenes of ``batch``, each kept as soon as it is made."""
     runs = [read_run(folder) for folder in batch.folders]
-    spaces = Spaces(batch.wishes.queries)
+    spaces = Spaces(batch.options.queries)
     explained = cache(lambda index, method: explained_of(runs[index], method))
     return [_make_scene(asked, runs, spaces, explained, batch, report) for asked in batch.scenes]
 
 
 def _make_scene(
-    asked: Asked,
+    asked: SceneRequest,
     runs: Sequence[FinishedRun],
     spaces: Spaces,
     explained: Callable[[int, str], Explained],
     batch: Batch,
     report: Report,
-) -> Made:
-    made, data, n_done = Made(asked.scene), SceneData(asked.scene), 0
+) -> SceneContent:
+    made, data, n_done = SceneContent(asked.scene), SceneData(asked.scene), 0
 
-    def tell(doing: str) -> None:
+    def report_activity(doing: str) -> None:
         nonlocal n_done
         report(Event(asked.scene, doing, n_done, asked.n_steps))
         n_done += 1
 
-    gallery = GalleryOfScene(asked.scene, batch.most_photos)
-    seen: dict[Job, Mapping[str, LookedAt]] = {}
+    gallery = GalleryOfScene(asked.scene, batch.max_photos)
+    seen: dict[Job, Mapping[str, EvaluatedScene]] = {}
     for index, method in asked.explained:
-        tell(f"errors of {printable(method, 60)}")
+        report_activity(f"errors of {printable(method, 60)}")
         run, of_job = runs[index], explained(index, method)
         try:
             found = of_job.matched(asked.scene, partial(data.truth_of_run, run), partial(spaces.encoder, run))
-            looked_at = {one.rules.name: one.looked_at for one in found}
-            seen[index, method] = looked_at
-            made.errors[index, method] = of_job.mended(asked.scene, looked_at)
-            if batch.wishes.with_gallery:
-                gallery.add(index, of_job, looked_at)
+            evaluated = {one.rules.name: one.evaluated for one in found}
+            seen[index, method] = evaluated
+            made.errors[index, method] = of_job.corrected(asked.scene, evaluated)
+            if batch.options.with_gallery:
+                gallery.add(index, of_job, evaluated)
         except Su3dError as error:
             made.errors[index, method] = str(error)
             gallery.lacks = True
-    if asked.explained and batch.wishes.with_gallery:
-        tell("photos of errors")
+    if asked.explained and batch.options.with_gallery:
+        report_activity("photos of errors")
         try:
             dataset = runs[asked.explained[0][0]].dataset(asked.scene)
         except Su3dError as error:
@@ -445,7 +445,7 @@ def _make_scene(
         made.gallery = gallery.finish(dataset, data)
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
-        made.page = page_scene(asked.scene, maps, spaces, data, batch.most_points, tell, seen)
+        made.page = page_scene(asked.scene, maps, spaces, data, batch.max_points, report_activity, seen)
     if made.is_whole:
         asked.place.save(made, runs)
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))

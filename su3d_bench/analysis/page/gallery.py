@@ -13,7 +13,7 @@ from su3d_bench.analysis.attribution import Explained
 from su3d_bench.analysis.page.scene import SKETCH_WIDTH, SceneData, fed_frames
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, UInt8Array
-from su3d_bench.metrics.attribution.arrays import LookedAt, SingleError
+from su3d_bench.metrics.attribution.arrays import EvaluatedScene, SingleError
 from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.reports.page.maps import frame_cover, jpeg_text
 from su3d_bench.reports.pictures.items import PIXEL_STEP, best_view, draw_outline, fitted, seen_in, window_around
@@ -21,14 +21,14 @@ from su3d_bench.reports.pictures.items import PIXEL_STEP, best_view, draw_outlin
 PHOTO = (256, 192)  # width and height
 PREDICTED, TRUTH = (255, 64, 200), (0, 96, 255)  # an area and a line: told apart without colours, too
 SHADE = 0.45  # of the area over the photo
-LEAST_ROWS = 48.0  # of a mask, which has a row for every second one of the frame
-MOST_POINTS = 20_000  # of a mask that are looked for in a frame
+MIN_ROWS = 48.0  # of a mask, which has a row for every second one of the frame
+MAX_POINTS = 20_000  # of a mask that are looked for in a frame
 PROBES = 16  # points of a mask by which its spacing is told
 JPEG_QUALITY = 60
 
 
 @dataclass(frozen=True)
-class SeenError:
+class ErrorView:
     """The points (N, 3) m of each mask that is ``predicted`` and of each object of the ``truth``."""
 
     predicted: tuple[Float32Array, ...]
@@ -39,7 +39,7 @@ class SeenError:
         return np.concatenate([np.zeros((0, 3), np.float32), *self.predicted, *self.truth])
 
 
-def error_photo(frame: Frame, error: SeenError) -> UInt8Array | None:
+def error_photo(frame: Frame, error: ErrorView) -> UInt8Array | None:
     """A photo (192, 256, 3): what is predicted as an area, each object of the truth with a line around it.
 
     None where the frame shows nothing of either. Of several masks each has a thin line of its own.
@@ -49,7 +49,7 @@ def error_photo(frame: Frame, error: SeenError) -> UInt8Array | None:
     seen = np.any([*areas, *objects], axis=0)
     if not seen.any():
         return None
-    rows, columns = window_around(seen, PHOTO[0] / PHOTO[1], LEAST_ROWS)
+    rows, columns = window_around(seen, PHOTO[0] / PHOTO[1], MIN_ROWS)
     part = tuple(slice(one.start * PIXEL_STEP, one.stop * PIXEL_STEP) for one in (rows, columns))
     shown = fitted(np.ascontiguousarray(frame.rgb[part]), PHOTO)
     area = np.any([np.zeros_like(seen), *areas], axis=0)[rows, columns]
@@ -68,7 +68,7 @@ def seen_mask(frame: Frame, points: Float32Array) -> BoolArray:
 
     height, width = frame.depth_m.shape
     mask = np.zeros((-(-height // PIXEL_STEP), -(-width // PIXEL_STEP)), np.uint8)
-    looked_for = points[:: -(-len(points) // MOST_POINTS) or 1].astype(np.float64)
+    looked_for = points[:: -(-len(points) // MAX_POINTS) or 1].astype(np.float64)
     columns, rows, is_seen = seen_in(frame, looked_for)
     if not is_seen.any():
         return mask.astype(bool)
@@ -91,14 +91,14 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(np.sqrt(np.partition(squared, 1, axis=1)[:, 1])))
 
 
-MOST_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
-MOST_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
+MAX_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
+MAX_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
 CANDIDATES = 24  # frames of a scene in which objects are looked for
-MOST_FRAMES = 6  # of a scene from which photos are taken
+MAX_FRAMES = 6  # of a scene from which photos are taken
 PHOTO_WIDTH = 320  # of a frame for photos, where that saves time
 AS_GOOD = 0.7  # of the best view of an object: a frame that several share is taken for it
-MOST_NAMES, MOST_TEXT = 6, 60  # classes that a card names, characters of a name
-NOT_AMONG = "only the worst errors of a scene have one"
+MAX_NAMES, MAX_TEXT = 6, 60  # classes that a card names, characters of a name
+ONLY_WORST_NOTE = "only the worst errors of a scene have one"
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Card:
     gains: tuple[float | None, ...]
     photo: int | None = None
     frame: int | None = None
-    why: str | None = NOT_AMONG
+    why: str | None = ONLY_WORST_NOTE
 
 
 @dataclass(frozen=True)
@@ -158,14 +158,14 @@ class SceneGallery:
         return {name: value for name, value in asdict(self).items() if name != "is_whole"}
 
 
-def told_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
+def summary_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
     """What the galleries hold by method and protocol: how many errors of each scene, which classes, kinds and pairs."""
-    told: dict[tuple[int, str, str], dict[str, Any]] = {}
+    summary: dict[tuple[int, str, str], dict[str, Any]] = {}
     for gallery in galleries:
         for one in gallery.of_methods:
             about = {"run": one.run, "method": one.method, "protocol": one.protocol}
             empty: dict[str, Any] = {"scenes": [], "n": [], "told": [], "kinds": {}, "classes": {}, "pairs": {}}
-            of = told.setdefault((one.run, one.method, one.protocol), about | empty)
+            of = summary.setdefault((one.run, one.method, one.protocol), about | empty)
             if one.cards:
                 of["scenes"].append(gallery.scene)
                 of["n"].append(one.n)
@@ -175,7 +175,7 @@ def told_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
                 of["classes"] |= dict.fromkeys((*card.true, *card.called))
                 of["pairs"] |= dict.fromkeys((true, called) for true in card.true for called in card.called)
     lists = ("kinds", "classes", "pairs")
-    return [{name: list(value) if name in lists else value for name, value in one.items()} for one in told.values()]
+    return [{name: list(value) if name in lists else value for name, value in one.items()} for one in summary.values()]
 
 
 def photos_of_each(n_scenes: int, n_methods: int) -> int:
@@ -184,39 +184,39 @@ def photos_of_each(n_scenes: int, n_methods: int) -> int:
     >>> photos_of_each(4, 2), photos_of_each(20, 8)
     (16, 8)
     """
-    return max(n_methods, MOST_PHOTOS // max(1, n_scenes))
+    return max(n_methods, MAX_PHOTOS // max(1, n_scenes))
 
 
 class GalleryOfScene:
     """Gathers the errors of a scene, method after method, and takes the photos when all are there."""
 
-    def __init__(self, scene: str, most_photos: int) -> None:
-        self._scene, self._most_photos = scene, most_photos
-        self._cards: list[tuple[Cards, list[SeenError]]] = []
+    def __init__(self, scene: str, max_photos: int) -> None:
+        self._scene, self._max_photos = scene, max_photos
+        self._cards: list[tuple[Cards, list[ErrorView]]] = []
         self._fed: list[int] = []
         self.lacks = False  # whether a method's errors, or frames, could not be had
 
-    def add(self, index: int, explained: Explained, looked_at: Mapping[str, LookedAt]) -> None:
+    def add(self, index: int, explained: Explained, evaluated: Mapping[str, EvaluatedScene]) -> None:
         """The errors of the method of ``explained``, which is one of run ``index``, under each protocol."""
         self._fed += fed_frames(explained.run, self._scene, explained.method)
         ids, method = explained.instance_ids(self._scene), printable(explained.method, 200)
-        for protocol, scene in looked_at.items():
-            n, errors = explained.errors(self._scene, protocol, scene, MOST_ERRORS)
+        for protocol, scene in evaluated.items():
+            n, errors = explained.errors(self._scene, protocol, scene, MAX_ERRORS)
             rules, metrics = explained.run.rules(protocol), tuple(explained.rules(protocol).headline)
             cards = tuple(_card(error, scene, metrics, ids) for error in errors)
             points = scene.points
             seen = [
-                SeenError(_places(points, one.predicted), _places(points, one.truth))
-                for one in errors[: self._most_photos]
+                ErrorView(_places(points, one.predicted), _places(points, one.truth))
+                for one in errors[: self._max_photos]
             ]
-            told = Cards(index, method, protocol, rules.kind, rules.ground_truth, metrics, n, cards)
-            self._cards.append((told, seen))
+            summary = Cards(index, method, protocol, rules.kind, rules.ground_truth, metrics, n, cards)
+            self._cards.append((summary, seen))
 
     def finish(self, dataset: Any, data: SceneData) -> SceneGallery:
         """The gallery with photos of the worst errors; ``dataset`` is a text where there is none, the reason."""
         # the first error of every method, then the second of each, and so on
         places = sorted((k, of) for of, (_, seen) in enumerate(self._cards) for k in range(len(seen)))
-        places = places[: self._most_photos]
+        places = places[: self._max_photos]
         taken: Sequence[tuple[int, str] | str] = [str(dataset)] * len(places)
         self.lacks |= isinstance(dataset, str)
         if places and not isinstance(dataset, str):
@@ -224,29 +224,31 @@ class GalleryOfScene:
                 taken = _photos([self._cards[of][1][k] for k, of in places], dataset, data, self._fed)
             except Su3dError as error:
                 self.lacks, taken = True, [str(error)] * len(places)
-        cards, photos = [list(told.cards) for told, _ in self._cards], list[str]()
+        cards, photos = [list(summary.cards) for summary, _ in self._cards], list[str]()
         for (k, of), photo in zip(places, taken, strict=True):
             if isinstance(photo, str):
                 cards[of][k] = replace(cards[of][k], why=printable(photo, 200))
             else:
                 cards[of][k] = replace(cards[of][k], photo=len(photos), frame=photo[0], why=None)
                 photos.append(photo[1])
-        of_methods = tuple(replace(told, cards=tuple(own)) for (told, _), own in zip(self._cards, cards, strict=True))
+        of_methods = tuple(
+            replace(summary, cards=tuple(own)) for (summary, _), own in zip(self._cards, cards, strict=True)
+        )
         return SceneGallery(printable(self._scene, 200), of_methods, tuple(photos), not self.lacks)
 
 
-def _card(error: SingleError, scene: LookedAt, metrics: Sequence[str], ids: Sequence[int]) -> Card:
+def _card(error: SingleError, scene: EvaluatedScene, metrics: Sequence[str], ids: Sequence[int]) -> Card:
     def names(classes: Sequence[int]) -> tuple[str, ...]:
-        return tuple(printable(scene.class_name(one), MOST_TEXT) for one in classes[:MOST_NAMES])
+        return tuple(printable(scene.class_name(one), MAX_TEXT) for one in classes[:MAX_NAMES])
 
     gains = (error.gains[name] for name in metrics)
-    numbers = (int(scene.instance[points[0]]) for points in error.truth[:MOST_NAMES] if len(points))
+    numbers = (int(scene.instance[points[0]]) for points in error.truth[:MAX_NAMES] if len(points))
     return Card(
         kind=error.kind,
         true=names(error.true),
         called=names(error.called),
-        ids=tuple(ids[k] if k < len(ids) else k for k in error.masks[:MOST_NAMES]),
-        rows=tuple(error.masks[:MOST_NAMES]),
+        ids=tuple(ids[k] if k < len(ids) else k for k in error.masks[:MAX_NAMES]),
+        rows=tuple(error.masks[:MAX_NAMES]),
         objects=tuple(number for number in numbers if number > 0),
         score=None if error.score is None else round(error.score, 4),
         iou=None if error.iou is None else round(error.iou, 3),
@@ -261,7 +263,7 @@ def _places(points: Points, sets: Sequence[NDArray[np.integer[Any]]]) -> tuple[F
 
 
 def _photos(
-    things: Sequence[SeenError], dataset: Any, data: SceneData, fed: Sequence[int]
+    things: Sequence[ErrorView], dataset: Any, data: SceneData, fed: Sequence[int]
 ) -> list[tuple[int, str] | str]:
     """Of each thing the index of the frame that shows it best and its photo, or why there is none."""
     places = sorted(data.in_turn(dataset, fed)[:CANDIDATES])
@@ -272,12 +274,12 @@ def _photos(
             view = best_view([frame], thing.points)
             looks[row, column] = 0.0 if view is None else view.score
     good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
-    frames = {place: data.frame(dataset, place, PHOTO_WIDTH) for place in frame_cover(good, MOST_FRAMES)}
+    frames = {place: data.frame(dataset, place, PHOTO_WIDTH) for place in frame_cover(good, MAX_FRAMES)}
     return [_photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
 
 
 def _photo(
-    thing: SeenError, look: np.ndarray, places: Sequence[int], frames: Mapping[int, Frame]
+    thing: ErrorView, look: np.ndarray, places: Sequence[int], frames: Mapping[int, Frame]
 ) -> tuple[int, str] | str:
     for column in np.argsort(-look, kind="stable").tolist():
         if look[column] > 0 and places[column] in frames:

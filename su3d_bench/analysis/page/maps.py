@@ -14,28 +14,28 @@ import numpy as np
 
 from su3d_bench.analysis.attribution import Inputs
 from su3d_bench.analysis.page.scene import (
-    MOST_LOOKED_AT,
+    MAX_INSPECTED,
     SKETCH_WIDTH,
-    Beside,
     Growth,
     SceneData,
     SceneReader,
     Seen,
     ShownTruths,
+    TruthOverlay,
     fed_frames,
     frames_of,
     growth_of,
     instance_data,
     instances_of,
     judged_objects,
+    not_shown_reason,
     same_objects,
-    why_not_shown,
 )
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, Frame, Int64Array
-from su3d_bench.metrics.attribution.arrays import LookedAt, SceneOfMasks
+from su3d_bench.metrics.attribution.arrays import EvaluatedScene, SceneOfMasks
 from su3d_bench.metrics.matching.labelling import (
     class_index_of_ids,
     classes_of_prediction,
@@ -64,8 +64,8 @@ from su3d_bench.reports.pictures.scene import SEEN_POINTS, seen_points
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 
-MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
-BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
+MAX_POINTS, MIN_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
+BYTES_PER_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
 THUMBNAILS = 14  # frames of a scene that are shown
 FRAMES_AT_ONCE = 6  # that are read for the colours of the map before it is looked again
@@ -118,14 +118,14 @@ class PageScene:
         return about | {"remarks": list(self.remarks), "truths": list(self.truths)}
 
 
-def points_of_each(n_maps: int, most_bytes: int) -> int:
-    """How many points a map may have for a page of ``most_bytes``.
+def points_of_each(n_maps: int, max_bytes: int) -> int:
+    """How many points a map may have for a page of ``max_bytes``.
 
     >>> points_of_each(2, 30_000_000), points_of_each(160, 30_000_000)
     (60000, 18750)
     """
-    share = int(SHARE_OF_POINTS * most_bytes / BYTES_A_POINT / max(1, n_maps))
-    return min(MOST_POINTS, max(LEAST_POINTS, share))
+    share = int(SHARE_OF_POINTS * max_bytes / BYTES_PER_POINT / max(1, n_maps))
+    return min(MAX_POINTS, max(MIN_POINTS, share))
 
 
 @dataclass
@@ -160,15 +160,15 @@ def page_scene(
     maps: Sequence[MapOfRun],
     spaces: Spaces,
     data: SceneData,
-    most_points: int,
+    max_points: int,
     tell: Callable[[str], None] = lambda doing: None,
-    looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]] = MappingProxyType({}),
+    evaluated: Mapping[tuple[int, str], Mapping[str, EvaluatedScene]] = MappingProxyType({}),
 ) -> PageScene:
     """A scene with its ``maps``. What fails of a map is a reason on the page, never a page without it.
 
-    ``tell`` hears of each map before it is made; ``looked_at`` holds what evaluators saw of it already, by protocol.
+    ``tell`` hears of each map before it is made; ``evaluated`` holds what evaluators saw of it already, by protocol.
     """
-    return _Scene(scene, maps, spaces, data, looked_at).page(most_points, tell)
+    return _Scene(scene, maps, spaces, data, evaluated).page(max_points, tell)
 
 
 @dataclass
@@ -179,7 +179,7 @@ class _Scene:
     maps: Sequence[MapOfRun]
     spaces: Spaces
     data: SceneData
-    looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]]
+    evaluated: Mapping[tuple[int, str], Mapping[str, EvaluatedScene]]
     frame_of: dict[int, Frame | None] = field(default_factory=dict)
     shown_truths: ShownTruths = field(default_factory=ShownTruths)
 
@@ -187,13 +187,13 @@ class _Scene:
     def reader(self) -> SceneReader:
         return SceneReader(self.maps[0][1], self.scene, self.data)
 
-    def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
+    def page(self, max_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self.maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
         frames = {
             index: frame for index in sorted(chosen) if (frame := self._frame(index, THUMBNAIL_WIDTH)) is not None
         }
-        clouds = {key: thinned(one.points, most_points) for key, one in read.items() if not isinstance(one, str)}
+        clouds = {key: thinned(one.points, max_points) for key, one in read.items() if not isinstance(one, str)}
         seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []
         for index, run, scene, method in self.maps:
@@ -207,7 +207,7 @@ class _Scene:
             content = self._pack(run, prediction, clouds[index, method], frames, seen, growth, beside)
             made.append(PageMap(*about, content, None, None if beside is None else beside.variant))
         thumbnails = tuple((index, _thumbnail(frame)) for index, frame in frames.items())
-        truths = tuple(self.shown_truths.packed(most_points, seen))
+        truths = tuple(self.shown_truths.packed(max_points, seen))
         return PageScene(printable(self.scene, 200), thumbnails, tuple(made), truths, tuple(self.reader.remarks))
 
     def _read(self, key: MapOfRun) -> Prediction | str:
@@ -248,12 +248,12 @@ class _Scene:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
         return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
-    def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> Beside | None:
+    def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> TruthOverlay | None:
         """The truth that stands beside a map, and which of it the map misses.
 
         It is that of the first protocol of instances, else that in whose classes the map is shown.
         """
-        fitting = (run.rules(name) for name in run.protocols if not why_not_shown(run, name, prediction))
+        fitting = (run.rules(name) for name in run.protocols if not not_shown_reason(run, name, prediction))
         judging = next(fitting, None)
         rules = shown_rules(run) if judging is None else judging
         truth = None if rules is None else self.reader.truth(rules)
@@ -263,13 +263,13 @@ class _Scene:
         variant = rules.ground_truth
         if judging is None:
             if isinstance(prediction, DenseFeatures):
-                return Beside(variant, about, {})
+                return TruthOverlay(variant, about, {})
             cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
             moved = transfer_masks(prediction.points, masks_of(prediction), truth.points, cap_m, voxel_m)
-            return Beside(variant, about, same_objects(truth, moved))
+            return TruthOverlay(variant, about, same_objects(truth, moved))
 
         def judged_by(rules: ProtocolRules) -> tuple[dict[str, Any], Mapping[int, Mapping[str, Any]]]:
-            seen = self.looked_at.get(job, {}).get(rules.name)
+            seen = self.evaluated.get(job, {}).get(rules.name)
             if not isinstance(seen, SceneOfMasks):
                 rules = Inputs(run, job[1]).rules(rules)
                 seen = SceneOfMasks(rules, truth, prediction, self.spaces.naming(run, prediction))
@@ -277,7 +277,7 @@ class _Scene:
             return {"protocol": rules.name, **judged_objects(truth, seen.overlaps)}, same
 
         judged, same = self.reader.had("no missed objects", partial(judged_by, judging)) or ({}, {})
-        return Beside(variant, about | judged, same)
+        return TruthOverlay(variant, about | judged, same)
 
     def _pack(
         self,
@@ -287,7 +287,7 @@ class _Scene:
         frames: Mapping[int, Frame],
         seen: Seen | None,
         growth: Growth | None,
-        beside: Beside | None,
+        beside: TruthOverlay | None,
     ) -> str:
         rules = shown_rules(run)
         truth = None if rules is None else self.reader.truth(rules)
@@ -362,7 +362,7 @@ def shown_classes(
 
 def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     """Those of ``points`` that none of ``frames`` gives a colour."""
-    seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MOST_LOOKED_AT)
+    seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MAX_INSPECTED)
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 

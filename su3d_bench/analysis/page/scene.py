@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
-from su3d_bench.core.interfaces import HasSketches
+from su3d_bench.core.interfaces import HasPreviews
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Prediction
 from su3d_bench.core.types import Frame, GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.attribution.overlaps import Overlaps
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -35,9 +35,9 @@ from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import read_updates
 
 Had = TypeVar("Had")
-MOST_VIEWS = 12  # frames of an instance that are named
-MOST_CAPTION = 240  # characters
-MOST_STEPS = 500  # of a growth: more than a slider has pixels
+MAX_VIEWS = 12  # frames of an instance that are named
+MAX_CAPTION = 240  # characters
+MAX_STEPS = 500  # of a growth: more than a slider has pixels
 
 
 def fed_frames(run: FinishedRun, scene: str, method: str) -> list[int]:
@@ -81,7 +81,7 @@ def growth_of(run: FinishedRun, scene: str, method: str) -> Growth | None:
     frames = [int(index) for index in columns.get("frame", ())]
     if len(frames) < 2:
         return None
-    places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_STEPS)).round().astype(np.int64))
+    places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MAX_STEPS)).round().astype(np.int64))
     steps: dict[str, Any] = {"update": (places + 1).tolist(), "frame": [frames[place] for place in places]}
     if "n_instances" in columns:
         steps["held"] = [int(columns["n_instances"][place]) for place in places]
@@ -113,11 +113,11 @@ def instance_data(
     data |= {
         "id": int(prediction.ids[k]) if len(prediction.ids) else k,
         "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
-        "caption": printable(prediction.captions[k], MOST_CAPTION),
+        "caption": printable(prediction.captions[k], MAX_CAPTION),
         "score": round(float(prediction.scores[k]), 4),
         "points": len(own),
         "n_views": len(views),
-        "views": views[:MOST_VIEWS],
+        "views": views[:MAX_VIEWS],
     }
     data |= extent_of(own)
     boxes = {index: _box(own, frames[index]) for index in views if index in frames}
@@ -135,7 +135,7 @@ def _box(points: Any, frame: Frame) -> list[float] | None:
     return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
 
 
-MOST_LOOKED_AT = 48  # frames of a scene
+MAX_INSPECTED = 48  # frames of a scene
 SKETCH_WIDTH = 160  # of a frame to look at, where that saves time
 
 
@@ -174,7 +174,7 @@ class SceneData:
 
     def frame(self, dataset: Any, index: int, width: int) -> Frame:
         """Frame ``index`` of the sequence, of ``width`` pixels where a smaller one is had sooner, else as it is."""
-        has_sketches = isinstance(dataset, HasSketches)
+        has_sketches = isinstance(dataset, HasPreviews)
         key = id(dataset), index, width if has_sketches else 0
         if key not in self._frames:
             sketched = dataset.sketch(self._name, index, width) if has_sketches else None
@@ -185,7 +185,7 @@ class SceneData:
         """The frames to look at, far ones first: of those that methods were ``fed``, of all where none is known."""
         n_frames = len(self.sequence(dataset))
         known = sorted({index for index in fed if 0 <= index < n_frames}) or range(n_frames)
-        return [known[place] for place in spread(len(known), MOST_LOOKED_AT)]
+        return [known[place] for place in spread(len(known), MAX_INSPECTED)]
 
 
 class SceneReader:
@@ -227,7 +227,7 @@ Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m that frames saw and thei
 
 
 @dataclass(frozen=True)
-class Beside:
+class TruthOverlay:
     """The truth beside a map: which ``variant`` of it, and what the page's map says ``about`` it.
 
     ``same``: by the place of each instance that is an object of this truth, which object.
@@ -252,16 +252,16 @@ class ShownTruths:
         self._truths.append(truth)
         return len(self._truths) - 1
 
-    def packed(self, most_points: int, seen: Seen | None) -> list[str]:
+    def packed(self, max_points: int, seen: Seen | None) -> list[str]:
         """The truths in the form of maps, in base64."""
-        return [_packed(truth, most_points, seen) for truth in self._truths]
+        return [_packed(truth, max_points, seen) for truth in self._truths]
 
 
-def why_not_shown(run: FinishedRun, protocol: str, prediction: Prediction) -> str | None:
+def not_shown_reason(run: FinishedRun, protocol: str, prediction: Prediction) -> str | None:
     """Why ``protocol`` does not say what a map misses; None where it does."""
     with suppress(ConfigError):  # another version of it
         rules = run.rules(protocol)
-        return why_not_scorable(rules, prediction) if rules.kind == "instance" else "counts no objects"
+        return kind_incompatibility(rules, prediction) if rules.kind == "instance" else "counts no objects"
     return "its rules here are others"
 
 
@@ -307,8 +307,8 @@ def instances_of(truth: GroundTruth) -> Int64Array:
     return np.unique(truth.instance[truth.instance > 0]).astype(np.int64)
 
 
-def _packed(truth: GroundTruth, most_points: int, seen: Seen | None) -> str:
-    cloud = thinned(truth.points, most_points)
+def _packed(truth: GroundTruth, max_points: int, seen: Seen | None) -> str:
+    cloud = thinned(truth.points, max_points)
     numbers, names = instances_of(truth), [printable(name, 80) for name in truth.labels.names]
     row_of_class = truth_owner(truth)
     place = np.searchsorted(numbers, truth.instance)

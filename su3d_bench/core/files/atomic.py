@@ -30,14 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError, printable, reading
-from su3d_bench.core.files.locks import clear_unfinished, held_folder, new_file, remove_unheld
-from su3d_bench.core.printing import escaped_json
+from su3d_bench.core.files.locks import clear_unfinished, locked_folder, new_file, remove_unheld
+from su3d_bench.core.safe_output import escaped_json
 from su3d_bench.core.system.files import file_text, opened
 
 # What any file may unpack to: 600 masks of a scene's 120,000 points take 69 MiB, a byte a point.
 FREE_BYTES = 128 << 20
 # Beyond that so many bytes for one of the file; deflate alone reaches 1032. The masks above pack to a 95th.
-MOST_RATIO = 100
+MAX_RATIO = 100
 PIECE = 1 << 20
 # What readers raise on a damaged file, an .npz above all.
 DAMAGE = (
@@ -55,7 +55,7 @@ DAMAGE = (
     struct.error,
 )
 ENCRYPTED = 0x1
-LEAST_ZIP = 22  # bytes of an archive without members
+MIN_ZIP = 22  # bytes of an archive without members
 METHODS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # the others unpack without a bound
 
 
@@ -67,14 +67,14 @@ class Allowance:
     """How many bytes may still be unpacked from a file of ``n_packed`` bytes, all its parts together."""
 
     def __init__(self, n_packed: int) -> None:
-        self.n_bytes = max(FREE_BYTES, n_packed * MOST_RATIO)
+        self.n_bytes = max(FREE_BYTES, n_packed * MAX_RATIO)
         self._n_left = self.n_bytes
 
     def spend(self, n: int) -> None:
         """Count ``n`` bytes before they are made; ``UnpackingError`` where there are too many."""
         if n > self._n_left:
             raise UnpackingError(
-                f"unpacks to more than {self.n_bytes >> 20} MiB, over {MOST_RATIO} times its size; write it without "
+                f"unpacks to more than {self.n_bytes >> 20} MiB, over {MAX_RATIO} times its size; write it without "
                 "compression if it is sound"
             )
         self._n_left -= n
@@ -84,7 +84,7 @@ def allowance_of(archive: zipfile.ZipFile) -> Allowance:
     """What may be unpacked from a zip archive by its real bytes; damage where none of them is a member."""
     assert archive.fp is not None
     n_bytes = archive.fp.seek(0, io.SEEK_END)
-    if not archive.infolist() and n_bytes > LEAST_ZIP + len(archive.comment):
+    if not archive.infolist() and n_bytes > MIN_ZIP + len(archive.comment):
         raise zipfile.BadZipFile("holds bytes and names no member")
     return Allowance(n_bytes)
 
@@ -267,7 +267,7 @@ def _header(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     return header
 
 
-MOST_IN_MEMORY_BYTES = 1 << 26  # a hundredth of a small machine's memory; most scenes never reach it
+MAX_IN_MEMORY_BYTES = 1 << 26  # a hundredth of a small machine's memory; most scenes never reach it
 
 
 def scratch_folder() -> Path:
@@ -283,7 +283,7 @@ def scratch_folder() -> Path:
 class Scratch:
     """A file without a name that takes arrays, ``n_bytes`` in all; it is gone with the process, however that ends."""
 
-    def __init__(self, most_in_memory_bytes: int = MOST_IN_MEMORY_BYTES) -> None:
+    def __init__(self, most_in_memory_bytes: int = MAX_IN_MEMORY_BYTES) -> None:
         self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=str(scratch_folder()))  # noqa: SIM115
         self.n_bytes = 0
 
@@ -370,7 +370,7 @@ class TemporaryFolder:
     def __init__(self, prefix: str) -> None:
         remove_abandoned()
         try:
-            self.path, self._lock = held_folder(lambda: Path(tempfile.mkdtemp(SUFFIX, prefix)))
+            self.path, self._lock = locked_folder(lambda: Path(tempfile.mkdtemp(SUFFIX, prefix)))
         except OSError as error:
             where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
             reason = error.strerror or str(error)

@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FORM = re.compile(r"\..*\.[0-9a-f]{12}\.unfinished", re.DOTALL)
-MOST_NAME_BYTES = 200  # of the name that is written; with the rest it stays within the 255 of common disks
+MAX_NAME_BYTES = 200  # of the name that is written; with the rest it stays within the 255 of common disks
 LOCK_FILE = ".lock"
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
@@ -36,16 +36,16 @@ def is_unfinished(name: str) -> bool:
     return FORM.fullmatch(name) is not None
 
 
-def beside(path: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """Where ``path`` lies while it is written: another place at each call."""
-    start = os.fsencode(path.name)[:MOST_NAME_BYTES].decode(errors="ignore")
+    start = os.fsencode(path.name)[:MAX_NAME_BYTES].decode(errors="ignore")
     return path.with_name(f".{start}.{secrets.token_hex(6)}.unfinished")
 
 
 def new_file(path: Path) -> tuple[Path, int]:
     """An unfinished file for ``path``: its place, and the file open for writing, which holds the lock."""
     while True:  # another process may clear the file in the moment between its making and its lock
-        place = beside(path)
+        place = temporary_path(path)
         handle = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -84,7 +84,7 @@ def _locked(handle: int, operation: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> int:
     return handle
 
 
-def is_held(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Whether a living process holds the lock of ``folder``; nothing is written to find out."""
     for place, kind in ((folder, os.O_DIRECTORY), (folder / LOCK_FILE, os.O_NOFOLLOW)):
         try:
@@ -107,11 +107,11 @@ def unfinished_folder(path: Path) -> Iterator[Path]:
     """A folder in which ``path`` is written, gone at the end of the block unless it was renamed by then."""
 
     def made() -> Path:
-        place = beside(path)
+        place = temporary_path(path)
         place.mkdir()
         return place
 
-    place, handle = held_folder(made)
+    place, handle = locked_folder(made)
     try:
         yield place
     finally:
@@ -120,7 +120,7 @@ def unfinished_folder(path: Path) -> Iterator[Path]:
             os.close(handle)
 
 
-def held_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
+def locked_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
     """A folder that ``make`` made, and an open file that holds its lock; None on a disk without locks."""
     while True:  # as in ``new_file``
         place = make()
@@ -137,18 +137,18 @@ def held_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
         os.close(handle)
 
 
-def become(place: Path, path: Path) -> None:
+def publish(place: Path, path: Path) -> None:
     """Give the whole folder at ``place`` the name ``path`` once all of it is on the disk."""
     for above, _, names in os.walk(place, topdown=False):
         for name in names:
-            bring_to_disk(Path(above, name))
+            sync_to_disk(Path(above, name))
         with suppress(OSError):  # not every disk brings folders to itself by request
-            bring_to_disk(Path(above))
+            sync_to_disk(Path(above))
     os.replace(place, path)
     (path / LOCK_FILE).unlink(missing_ok=True)
 
 
-def bring_to_disk(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
     """Wait until what was written into the file or folder ``path`` is on its disk."""
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:

@@ -39,7 +39,7 @@ def noted() -> Iterator[dict[Path, None]]:
 
 def regular(path: Path) -> Path:
     """``path``, for a library that opens files itself; an ``OSError`` where no regular file is there."""
-    _refuse_others(os.stat(path).st_mode, path)
+    _check_no_others(os.stat(path).st_mode, path)
     for files in _NOTED:
         files[path] = None
     return path
@@ -50,7 +50,9 @@ def opened(path: Path) -> io.BufferedReader:
     regular(path)  # a device may act on being opened
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     try:
-        _refuse_others(os.fstat(handle).st_mode, path)  # what was opened may have taken the place of what was looked at
+        _check_no_others(
+            os.fstat(handle).st_mode, path
+        )  # what was opened may have taken the place of what was looked at
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
@@ -74,7 +76,7 @@ def file_text(path: Path, *, errors: str = "strict") -> str:
         return stream.read()
 
 
-def _refuse_others(mode: int, path: Path) -> None:
+def _check_no_others(mode: int, path: Path) -> None:
     if stat.S_ISREG(mode):
         return
     if stat.S_ISDIR(mode):

@@ -145,18 +145,18 @@ def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
     return [list(block) for _, block in groupby(rows, lambda row: (row.is_reported, row.group))]
 
 
-MOST_ROWS = 200_000
-MOST_CELLS = 4_000_000
+MAX_ROWS = 200_000
+MAX_CELLS = 4_000_000
 
-MOST_OF_A_CELL = 2000
+MAX_CELL_CHARACTERS = 2000
 # A spreadsheet takes what begins so for a formula (OWASP, "CSV Injection"); an apostrophe before it makes it text.
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 # Where the semicolon parts cells, as in half of Europe, one begins behind it.
 _CELL_WITHIN = re.compile(r"(?<=;)(?=[=+\-@])")
-_CELL_MENDED = re.compile(r"(?<=;)'(?=[=+\-@])")
+_CELL_CORRECTED = re.compile(r"(?<=;)'(?=[=+\-@])")
 
 
-def separated_rows(text: str, separator: str = ",", most_rows: int = MOST_ROWS) -> list[list[str]]:
+def separated_rows(text: str, separator: str = ",", most_rows: int = MAX_ROWS) -> list[list[str]]:
     """The rows of a CSV text; ``csv.Error`` where it is none, or has more rows or cells than any that people fill in.
 
     They are counted as they are read: a row takes one byte in a file and fifty in memory.
@@ -165,8 +165,8 @@ def separated_rows(text: str, separator: str = ",", most_rows: int = MOST_ROWS) 
     n_cells = 0
     for row in csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True):
         n_cells += len(row)
-        if len(rows) == most_rows or n_cells > MOST_CELLS:
-            raise csv.Error(f"it has more than {most_rows} rows or {MOST_CELLS} cells")
+        if len(rows) == most_rows or n_cells > MAX_CELLS:
+            raise csv.Error(f"it has more than {most_rows} rows or {MAX_CELLS} cells")
         rows.append(row)
     return rows
 
@@ -186,7 +186,7 @@ def harmless(value: object) -> object:
     """
     if not isinstance(value, str):
         return value
-    return no_formula(printable(value, MOST_OF_A_CELL))
+    return no_formula(printable(value, MAX_CELL_CHARACTERS))
 
 
 def no_formula(text: str) -> str:
@@ -202,12 +202,12 @@ def meant(cell: str) -> str:
     ('=1+1', "'chair'")
     """
     text = cell[1:] if cell[:1] == "'" and cell[1:2] in FORMULA_STARTS else cell
-    return _CELL_MENDED.sub("", text)
+    return _CELL_CORRECTED.sub("", text)
 
 
-MOST_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, which do not shrink in it
-MOST_SHEET_CELLS = 2_000_000  # of all worksheets
-MOST_COLUMNS = 64  # beyond which nothing is looked at
+MAX_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, which do not shrink in it
+MAX_SHEET_CELLS = 2_000_000  # of all worksheets
+MAX_COLUMNS = 64  # beyond which nothing is looked at
 # What openpyxl raises on damaged workbooks, beside what zipfile does.
 WORKBOOK_DAMAGE = (*ZIP_DAMAGE, LookupError, TypeError, AttributeError, OSError, SyntaxError, OverflowError)
 
@@ -233,20 +233,18 @@ def read_workbook(content: bytes, where: str) -> list[Worksheet]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             n_bytes = sum(info.file_size for info in archive.infolist())
-        if n_bytes > 2 * len(content) + MOST_XML_BYTES:
+        if n_bytes > 2 * len(content) + MAX_XML_BYTES:
             raise DataError(f"{where}: unpacks to {n_bytes >> 20} MiB; no workbook of su3d-bench sheets make does")
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, keep_links=False)
         n_cells, found = 0, []
         for sheet in book.worksheets:
             rows: list[Row] = []
             sheet.reset_dimensions()  # the file may state any
-            for number, cells in enumerate(
-                sheet.iter_rows(max_row=MOST_ROWS, max_col=MOST_COLUMNS, values_only=True), 1
-            ):
+            for number, cells in enumerate(sheet.iter_rows(max_row=MAX_ROWS, max_col=MAX_COLUMNS, values_only=True), 1):
                 texts = [_text(cell) for cell in cells]
                 n_cells += len(texts) - texts.count(None)
-                if n_cells > MOST_SHEET_CELLS:
-                    raise DataError(f"{where}: has more than {MOST_SHEET_CELLS} cells; a file of answers is smaller")
+                if n_cells > MAX_SHEET_CELLS:
+                    raise DataError(f"{where}: has more than {MAX_SHEET_CELLS} cells; a file of answers is smaller")
                 if any(text is not None for text in texts):
                     rows.append((number, texts))
             found.append(Worksheet(sheet.title, rows))

@@ -95,13 +95,13 @@ def single_mask_errors(
 ) -> list[SingleError]:
     """The errors of the masks of a scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
     errors = find_errors(overlaps)
-    mended = _MendedClasses(truth, overlaps, rules)
-    classes = [mended.of_error(error) for error in errors]
+    corrected = _CorrectedClasses(truth, overlaps, rules)
+    classes = [corrected.of_error(error) for error in errors]
     gains = [pool.gains(after) for after in _values_after(pool, classes)]
-    return [_told(error, overlaps, gain) for error, gain in zip(errors, gains, strict=True)]
+    return [_single_error(error, overlaps, gain) for error, gain in zip(errors, gains, strict=True)]
 
 
-class _MendedClasses:
+class _CorrectedClasses:
     """The counts of the classes of a scene that one error moves: masks of other classes are as they were."""
 
     def __init__(self, truth: Int64Array, overlaps: Overlaps, rules: ScoringRules) -> None:
@@ -116,7 +116,7 @@ class _MendedClasses:
         """The counts of each class that mending ``error`` moves, by its place among the scored ones."""
         rules, predicted = self._rules, self._overlaps.predicted
         repair = repaired(self._overlaps, [error])
-        touched, shared, size = repair.is_touched, self._shared, predicted.masks.sizes
+        touched, shared, size = repair.is_changed, self._shared, predicted.masks.sizes
         if repair.points or repair.added:
             shared, size = shared.copy(), size.copy()
         for k, points in repair.points.items():
@@ -128,7 +128,7 @@ class _MendedClasses:
             shared = np.concatenate([shared[kept], [self._shared_by(points) for points, _, _ in repair.added]])
         else:
             shared = shared[kept]
-        mended = LabelledMasks(
+        corrected = LabelledMasks(
             predicted.masks,
             np.append(repair.class_ids[kept], np.array([one for _, one, _ in repair.added], np.int64)),
             np.append(repair.scores[kept], np.array([one for _, _, one in repair.added], np.float64)),
@@ -137,32 +137,32 @@ class _MendedClasses:
         is_large = size >= rules.min_region_size
         answer = {}
         for index in (index for index, class_id in enumerate(rules.class_ids) if class_id in moved):
-            rows = np.flatnonzero(is_large & (mended.class_ids == rules.class_ids[index]))
+            rows = np.flatnonzero(is_large & (corrected.class_ids == rules.class_ids[index]))
             one = scene_counts.overlaps_of_class(
                 rules.class_ids[index], rows, shared[rows], size[rows], self._value, self._size, rules.class_ids,
                 rules.min_region_size,
             )  # fmt: skip
-            answer[index] = one.counts(index, mended.scores, rules.thresholds, forgives_void=rules.forgives_void)
+            answer[index] = one.counts(index, corrected.scores, rules.thresholds, forgives_void=rules.forgives_void)
         return answer
 
     def _shared_by(self, points: IntArray) -> Int64Array:
         return np.bincount(self._segment_of_point[points], minlength=len(self._value)).astype(np.int64)
 
 
-def _values_after(pool: Pool[InstanceCounts], mended: Sequence[Mapping[int, InstanceCounts]]) -> Iterator[Values]:
+def _values_after(pool: Pool[InstanceCounts], corrected: Sequence[Mapping[int, InstanceCounts]]) -> Iterator[Values]:
     """The metrics after each mending: the curves of the classes that it moves are formed again, the others stay."""
     thresholds = pool.metric.rules.thresholds
     before = instance_ap.combine([pool.mine, *pool.others], thresholds).table
     others: dict[int, list[InstanceCounts]] = {}
     changed = []
-    for of_classes in mended:
+    for of_classes in corrected:
         for index, counts in of_classes.items():
             if index not in others:
                 others[index] = [instance_ap.only(one, index) for one in pool.others]
             alone = replace(counts, class_index=np.zeros_like(counts.class_index))
             changed.append(InstanceCounts.joined([alone, *others[index]]))
     curves = iter(instance_ap.combine_each(changed, thresholds) if changed else [])
-    for of_classes in mended:
+    for of_classes in corrected:
         table = before.copy()
         for index in of_classes:
             table[index] = next(curves).table[0]
@@ -171,7 +171,7 @@ def _values_after(pool: Pool[InstanceCounts], mended: Sequence[Mapping[int, Inst
         yield {name: named[name] for name in pool.before}
 
 
-def _told(error: MaskError, overlaps: Overlaps, gains: Values) -> SingleError:
+def _single_error(error: MaskError, overlaps: Overlaps, gains: Values) -> SingleError:
     predicted = overlaps.predicted
     first = error.masks[0] if error.masks else None
     score = None if first is None else float(predicted.scores[first])
@@ -290,7 +290,7 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
 
 
-MendedScene = corrections.Mended[InstanceCounts] | corrections.Mended[SemanticCounts]
+CorrectedScene = corrections.CorrectedCounts[InstanceCounts] | corrections.CorrectedCounts[SemanticCounts]
 Errors = tuple[int, Sequence[SingleError]]
 
 
@@ -315,12 +315,12 @@ class SceneOfMasks:
     def overlaps(self) -> Overlaps:
         return measure_overlaps(true_instances(self._values, self._scoring), self._masks, self._scoring)
 
-    def mended(self) -> MendedScene:
-        mended = corrections.mend_scene(self._values, self._masks, self._scoring, self.overlaps)
+    def corrected(self) -> CorrectedScene:
+        corrected = corrections.correct_scene(self._values, self._masks, self._scoring, self.overlaps)
         if not self._has_classes:
-            return mended
+            return corrected
         relabelled = corrections.with_true_labels(self.overlaps)
-        return replace(mended, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
+        return replace(corrected, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         """How many errors the scene has, and the ``most`` that cost most, the dearest first.
@@ -349,9 +349,9 @@ class SceneOfPoints:
         self.instance = np.where(number <= truth.instance.max(initial=0), number, 0)
         self._names = [entry.name for entry in rules.classes]
 
-    def mended(self) -> MendedScene:
+    def corrected(self) -> CorrectedScene:
         scored = self.scored
-        return corrections.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
+        return corrections.correct_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         scored = self.scored
@@ -362,9 +362,9 @@ class SceneOfPoints:
         return self._names[number] if number >= 0 else NO_CLASS
 
 
-LookedAt = SceneOfMasks | SceneOfPoints
+EvaluatedScene = SceneOfMasks | SceneOfPoints
 # Of each kind the causes of its errors, and what looks at a scene.
-Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
+Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], EvaluatedScene]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
     "instance": (corrections.KINDS, SceneOfMasks),
     "semantic": (corrections.CAUSES, SceneOfPoints),

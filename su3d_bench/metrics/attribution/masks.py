@@ -1,4 +1,4 @@
-"""Where the points of an AP are lost: six kinds of error, each with the gain in AP when it alone is mended.
+"""Where the points of an AP are lost: six kinds of error, each with the gain in AP when it alone is corrected.
 
 In the spirit of TIDE (Bolya et al., ECCV 2020), for masks on points and the ScanNet AP. Nothing is estimated: a
 mending turns the predictions into others, which are scored anew by the same evaluator. *Counted* instances are those
@@ -27,10 +27,10 @@ half. A mask *matches* an instance at IoU above 0.5, so at most one. The kinds:
 - ``missed``: no mask of at least the minimum size lies in the instance or holds it, and it is not split. Mended:
   its exact mask is added, with the right class and the highest confidence of the scene (1 where there is none).
 
-Sum rules: ``AP + sum of gains + overlap + rest = 1``. ``rest`` is 1 less the AP with all six mended, one after the
+Sum rules: ``AP + sum of gains + overlap + rest = 1``. ``rest`` is 1 less the AP with all six corrected, one after the
 other in the order merged, split, duplicate, mislabelled, background, missed: masks that fit their one instance badly,
 and those that are wrong in mask and label at once. ``overlap`` is what all mendings give together beyond the sum of
-what each gives alone. A gain in AP is below 0 where a mended mask is still too poor for the
+what each gives alone. A gain in AP is below 0 where a corrected mask is still too poor for the
 higher thresholds.
 """
 
@@ -62,7 +62,7 @@ KINDS = ("merged", "split", "duplicate", "mislabelled", "background", "missed")
 
 
 @dataclass(frozen=True)
-class Mended(Generic[C]):
+class CorrectedCounts(Generic[C]):
     """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors, or points, of each kind.
 
     ``with_true_labels``: each mask named by the truth, nothing else changed; None without masks or where no label
@@ -77,20 +77,20 @@ class Mended(Generic[C]):
     n_scored: int | None = None
 
 
-def mend_scene(
+def correct_scene(
     truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules, overlaps: Overlaps | None = None
-) -> Mended[InstanceCounts]:
-    """The counts of one scene with its errors mended; ``truth`` (N,) is label * 1000 + instance, 0 where void.
+) -> CorrectedCounts[InstanceCounts]:
+    """The counts of one scene with its errors corrected; ``truth`` (N,) is label * 1000 + instance, 0 where void.
 
     ``overlaps`` of the predictions with it, where they were measured before.
 
     >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.repeat([3001, 3002], 200)
     >>> both = LabelledMasks(Masks.of_sets([np.arange(400)]), np.array([3]), np.ones(1))
-    >>> mended = mend_scene(truth, both, ScoringRules((3,)))
-    >>> [combine([counts]).ap50 for counts in (mended.as_is, mended.alone["merged"], mended.all)]
+    >>> corrected = correct_scene(truth, both, ScoringRules((3,)))
+    >>> [combine([counts]).ap50 for counts in (corrected.as_is, corrected.alone["merged"], corrected.all)]
     [0.0, 1.0, 1.0]
-    >>> mended.n["merged"], mended.n["missed"]
+    >>> corrected.n["merged"], corrected.n["missed"]
     (1, 0)
     """
     instances = true_instances(truth, rules)
@@ -105,7 +105,7 @@ def mend_scene(
     for find, _ in _KINDS.values():
         left = overlaps if everything is predicted else measure_overlaps(instances, everything, rules)
         everything = repaired(left, find(left)).labelled()
-    return Mended(as_is, alone, count_masks(truth, everything, rules), n)
+    return CorrectedCounts(as_is, alone, count_masks(truth, everything, rules), n)
 
 
 def with_true_labels(overlaps: Overlaps) -> LabelledMasks:
@@ -150,7 +150,7 @@ class MaskError:
 
 
 class Repair:
-    """The predictions of a scene while errors are mended in them."""
+    """The predictions of a scene while errors are corrected in them."""
 
     def __init__(self, predicted: LabelledMasks) -> None:
         self._predicted = predicted
@@ -164,7 +164,7 @@ class Repair:
         return self.points[k] if k in self.points else self._predicted.masks.mask(k)
 
     @property
-    def is_touched(self) -> BoolArray:
+    def is_changed(self) -> BoolArray:
         """Which of the masks (K,) count otherwise than before."""
         touched: BoolArray = ~self.is_kept | (self.class_ids != self._predicted.class_ids)
         touched |= self.scores != self._predicted.scores
@@ -172,7 +172,7 @@ class Repair:
         return touched
 
     def labelled(self) -> LabelledMasks:
-        """The mended predictions."""
+        """The corrected predictions."""
         sets = self._predicted.masks.sets()
         for k, points in self.points.items():
             sets[k] = points
@@ -202,7 +202,7 @@ class Errors:
 
 
 def errors_of(overlaps: Overlaps) -> Errors:
-    """The kind of error of each mask and of each counted instance, before anything is mended."""
+    """The kind of error of each mask and of each counted instance, before anything is corrected."""
     of_mask, of_instance = [""] * len(overlaps.predicted.masks), [""] * overlaps.n_instances
     for error in find_errors(overlaps):
         if error.kind in ("split", "missed"):
@@ -213,7 +213,7 @@ def errors_of(overlaps: Overlaps) -> Errors:
 
 
 def repaired(overlaps: Overlaps, errors: Sequence[MaskError]) -> Repair:
-    """The predictions with those errors mended, which are of one kind and in the order in which they are found."""
+    """The predictions with those errors corrected, which are of one kind and in the order in which they are found."""
     repair = Repair(overlaps.predicted)
     for kind in dict.fromkeys(error.kind for error in errors):
         _KINDS[kind][1](overlaps, errors, repair)
@@ -230,7 +230,7 @@ def _find_merged(overlaps: Overlaps) -> list[MaskError]:
     return found
 
 
-def _mend_merged(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_merged(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     predicted = overlaps.predicted
     is_found = [overlaps.is_found(g) for g in range(overlaps.n_instances)]
     for error in errors:
@@ -254,7 +254,7 @@ def _find_split(overlaps: Overlaps) -> list[MaskError]:
     return [MaskError("split", overlaps.parts[g].parts, (g,)) for g in overlaps.split.tolist()]
 
 
-def _mend_split(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_split(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     predicted = overlaps.predicted
     for error in errors:
         members, (g,) = np.array(error.masks), error.instances
@@ -275,7 +275,7 @@ def _find_duplicate(overlaps: Overlaps) -> list[MaskError]:
     ]
 
 
-def _mend_duplicate(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_duplicate(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     predicted = overlaps.predicted
     for k, first in (error.masks for error in errors):
         repair.is_kept[k] = False
@@ -291,7 +291,7 @@ def _find_mislabelled(overlaps: Overlaps) -> list[MaskError]:
     ]
 
 
-def _mend_mislabelled(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_mislabelled(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     for error in errors:
         repair.class_ids[error.masks[0]] = overlaps.class_of_instance[error.instances[0]]
 
@@ -302,7 +302,7 @@ def _find_background(overlaps: Overlaps) -> list[MaskError]:
     return [MaskError("background", (k,), ()) for k in np.flatnonzero(is_wrong).tolist()]
 
 
-def _mend_background(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_background(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     for error in errors:
         repair.is_kept[error.masks[0]] = False
 
@@ -311,7 +311,7 @@ def _find_missed(overlaps: Overlaps) -> list[MaskError]:
     return [MaskError("missed", (), (g,)) for g in overlaps.missed.tolist()]
 
 
-def _mend_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+def _correct_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     scores = overlaps.predicted.scores
     best = float(scores.max()) if len(scores) else 1.0
     for error in errors:
@@ -319,17 +319,17 @@ def _mend_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair
         repair.added.append((overlaps.members[g], int(overlaps.class_of_instance[g]), best))
 
 
-# Of each kind what finds its errors, in the order in which they are mended, and what mends some of them.
+# Of each kind what finds its errors, in the order in which they are corrected, and what mends some of them.
 _KINDS: dict[
     str,
     tuple[Callable[[Overlaps], list[MaskError]], Callable[[Overlaps, Sequence[MaskError], Repair], None]],
 ] = {
-    "merged": (_find_merged, _mend_merged),
-    "split": (_find_split, _mend_split),
-    "duplicate": (_find_duplicate, _mend_duplicate),
-    "mislabelled": (_find_mislabelled, _mend_mislabelled),
-    "background": (_find_background, _mend_background),
-    "missed": (_find_missed, _mend_missed),
+    "merged": (_find_merged, _correct_merged),
+    "split": (_find_split, _correct_split),
+    "duplicate": (_find_duplicate, _correct_duplicate),
+    "mislabelled": (_find_mislabelled, _correct_mislabelled),
+    "background": (_find_background, _correct_background),
+    "missed": (_find_missed, _correct_missed),
 }
 
 
@@ -402,14 +402,16 @@ def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Arra
     return answer
 
 
-def mend_points(points: LabelledPoints, is_counted: BoolArray, *, has_masks: bool = True) -> Mended[SemanticCounts]:
-    """The counts of one scene with its errors mended; ``is_counted`` (C,) marks the classes of the confusion matrix."""
+def correct_points(
+    points: LabelledPoints, is_counted: BoolArray, *, has_masks: bool = True
+) -> CorrectedCounts[SemanticCounts]:
+    """The counts of one scene with its errors corrected; ``is_counted`` (C,) marks the classes of the confusion matrix."""
     cause = causes_of(points, has_masks=has_masks)
 
     def count(predicted: Int64Array) -> SemanticCounts:
         return semantic.per_scene(points.true_class, predicted, is_counted)
 
-    return Mended(
+    return CorrectedCounts(
         as_is=count(points.predicted),
         alone={name: count(np.where(cause == k, points.true_class, points.predicted)) for k, name in enumerate(CAUSES)},
         all=count(np.where(cause >= 0, points.true_class, points.predicted)),

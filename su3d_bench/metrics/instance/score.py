@@ -245,7 +245,7 @@ def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks
 
 
 @dataclass(frozen=True)
-class Covered:
+class CoveredObjects:
     """``n_shared`` (K, O): truth vertices of object ``object_ids`` (O,) that instance k covers.
 
     A vertex is covered by the instances that own the map point nearest to it, where that is within the cap.
@@ -267,11 +267,11 @@ class Covered:
         return np.where(self.n_shared.max(axis=1) > 0, self.object_ids[best], NO_OBJECT)
 
 
-def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instances | Partition) -> Covered:
+def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instances | Partition) -> CoveredObjects:
     """What each instance, or row of features, covers of the truth's objects."""
     masks = transfer.masks_of(prediction)
     moved = transfer.transfer_masks(prediction.points, masks, truth.points, rules.cap_m, rules.evaluation_voxel_m)
     ids, column = np.unique(np.maximum(truth.instance, 0), return_inverse=True)
     shared = scene_counts.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
     is_object = ids > 0
-    return Covered(ids[is_object].astype(np.int64), shared[:, is_object])
+    return CoveredObjects(ids[is_object].astype(np.int64), shared[:, is_object])

@@ -69,11 +69,11 @@ def _candidates(masks: Masks, n_points: int, iou: float) -> tuple[list[int], lis
 
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice
-MOST_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million
+MAX_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million
 UNITS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
 LARGEST_RATIO = 20.0  # of what two clouds of one scene span
 NEAR_M = 0.1  # outside of the scene's box that a point still counts as inside
-LEAST_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
+MIN_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
     """Facts of K masks over ``n_points`` points."""
     n_owners = np.bincount(masks.indices, minlength=n_points)
     near = None
-    if float((n_owners.astype(np.float64) ** 2).sum()) <= MOST_SHARED:
+    if float((n_owners.astype(np.float64) ** 2).sum()) <= MAX_SHARED:
         near = tuple(duplicate_pairs(masks, n_points, NEAR_IOU))
     return MaskFacts(
         n_masks=len(masks),
@@ -203,7 +203,7 @@ def check_cloud(scene: str, points: Float32Array, truth: Float32Array) -> list[s
             f"{scene}: no point of the cloud lies in the box of the scene; is it of another scene or in another frame "
             "of reference?"
         )
-    if share < LEAST_INSIDE:
+    if share < MIN_INSIDE:
         return [
             f"{scene}: only {100 * share:.0f} % of the cloud lies in the box of the scene (the first outside is point "
             f"{int(np.argmin(is_inside))}); is the frame of reference right?"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 CPU = "cpu"
 # Sums of 4096 products of unit vectors differ between two orders by less than 1e-12; 1e-9 leaves room.
-SURE_GAP = 1e-9
+CERTAIN_GAP = 1e-9
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
 
 
@@ -244,7 +244,7 @@ def _sure_most_similar(features: Tensor, text: Tensor) -> Int64Array | None:
     n_highest = min(2, len(text))
     highest, index = (features @ text.T).topk(n_highest, dim=1)
     has_none = (features == 0).all(dim=1)
-    if n_highest == 2 and bool((~has_none & (highest[:, 0] - highest[:, 1] < SURE_GAP)).any()):
+    if n_highest == 2 and bool((~has_none & (highest[:, 0] - highest[:, 1] < CERTAIN_GAP)).any()):
         return None
     return np.asarray(torch.where(has_none, 0, index[:, 0]).cpu().numpy(), np.int64)
 

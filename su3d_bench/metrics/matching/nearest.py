@@ -19,7 +19,7 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Ar
 P = ParamSpec("P")
 R = TypeVar("R")
 Key = tuple[Any, ...]
-_MOST_BYTES = 512 << 20  # of all answers together: the oldest go
+_MAX_BYTES = 512 << 20  # of all answers together: the oldest go
 
 
 class _Memory:
@@ -32,7 +32,7 @@ class _Memory:
         if key not in self._answers:
             answer = ask()
             self._n_bytes += _n_bytes(answer)
-            while self._answers and self._n_bytes > _MOST_BYTES:
+            while self._answers and self._n_bytes > _MAX_BYTES:
                 self._n_bytes -= _n_bytes(self._answers.pop(next(iter(self._answers))))
             self._answers[key] = answer
         found: R = self._answers[key]
@@ -110,7 +110,7 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
-WORTH_ORDERING = 50_000  # candidates, below which sorting takes longer than it saves
+MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting takes longer than it saves
 
 
 class Candidates:
@@ -118,7 +118,7 @@ class Candidates:
 
     def __init__(self, points: Points) -> None:
         self._n = len(points)
-        self._is_ordered = self._n >= WORTH_ORDERING
+        self._is_ordered = self._n >= MIN_SORTED_CANDIDATES
         if not self._n:
             return
         from scipy.spatial import cKDTree

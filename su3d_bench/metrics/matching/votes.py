@@ -15,7 +15,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
-_MOST_KEPT = 12_000_000  # neighbours kept, of 16 bytes each, where they may be asked for again
+_MAX_KEPT = 12_000_000  # neighbours kept, of 16 bytes each, where they may be asked for again
 
 
 def transfer_votes(
@@ -36,7 +36,7 @@ def transfer_votes(
     wanted_rows = np.flatnonzero(wanted)
     if not len(points) or not len(wanted_rows):
         return value, distance
-    if is_remembering() and len(targets) * neighbours <= _MOST_KEPT:
+    if is_remembering() and len(targets) * neighbours <= _MAX_KEPT:
         # another rule wants others of the targets, and other values of the points
         place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours)
         place = place_of_all[wanted_rows]

@@ -268,7 +268,7 @@ class AnnotationRules(_JudgedRules):
             *("well-merged n'", "under-merged n'", "over-merged n'"),
         )
     }
-    goes_by_names = True
+    uses_names = True
     needs = ("min_region_size", "synonyms", "merging")
 
 
@@ -276,7 +276,7 @@ class ReasoningRules(_JudgedRules):
     """Questions that boxes settle."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"reasoning": ("answer", "objects")}
-    goes_by_names = True
+    uses_names = True
     needs = ("questions", "min_region_size", "synonyms", "answers")
     takes = ("per_kind",)
     allowed: ClassVar[Allowed] = GENERATED

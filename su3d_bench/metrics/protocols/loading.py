@@ -63,10 +63,10 @@ class Original(BaseModel):
         return None if self.code is None else f"https://github.com/{self.code}/tree/{self.commit}"
 
     @property
-    def held_together(self) -> str:
+    def comparison_summary(self) -> str:
         """What was compared, how many problems both answered, by how much they differ and where cases lie.
 
-        >>> Original(none="ours", data="made by the program").held_together
+        >>> Original(none="ours", data="made by the program").comparison_summary
         ''
         """
         if self.compared is None:
@@ -86,13 +86,13 @@ class Original(BaseModel):
             "its files": ", ".join(self.files),
             "licence of its code": self.licence or "",
             "licence of the data": self.data,
-            "compared": self.held_together,
+            "compared": self.comparison_summary,
         }
         return {name: text for name, text in said.items() if text}
 
 
 @dataclass(frozen=True)
-class Stated:
+class ResolvedOriginal:
     """The original that a protocol's file states, or takes over from the protocol called ``base`` that it extends."""
 
     original: Original
@@ -105,7 +105,7 @@ class Stated:
         return told if self.base is None else {"original of": f"{self.base}, which these rules extend", **told}
 
 
-def original_of(name: str) -> Stated | None:
+def original_of(name: str) -> ResolvedOriginal | None:
     """What the protocol called ``name``, or a file, says of its original; None where a file of one's own says nothing.
 
     A ``ConfigError`` for a table that is not whole, and for a built-in protocol without one.
@@ -122,7 +122,7 @@ def original_of(name: str) -> Stated | None:
             )
         return None
     where, table = content.original
-    return Stated(read_original(where, table), None if where == file else where.stem)
+    return ResolvedOriginal(read_original(where, table), None if where == file else where.stem)
 
 
 def read_original(file: Path, table: Mapping[str, Any]) -> Original:

@@ -15,17 +15,17 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.fitness import ID_LISTS
+from su3d_bench.metrics.compatibility import ID_LISTS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 # What names a protocol, says where it is used or what of it is shown, and moves no number.
 NAMING = ("name", "version", "summary", "datasets", "by_default", "headline", "not_comparable_with")
 # Says whose features were named; that text tower is the run's own, whatever the rule.
-UNMOVED = ("encoder",)
+CONSTANT_RULES = ("encoder",)
 
 
 @dataclass(frozen=True)
-class Differing:
+class RuleDifference:
     """A rule, as ``transfer.cap_m``, and its plain value in either protocol."""
 
     rule: str
@@ -33,7 +33,7 @@ class Differing:
     second: Any
 
 
-def differing(first: ProtocolRules, second: ProtocolRules) -> list[Differing]:
+def differing(first: ProtocolRules, second: ProtocolRules) -> list[RuleDifference]:
     """The rules in which two protocols differ, in the order of the model; ``ConfigError`` for two kinds."""
     if first.kind != second.kind:
         raise ConfigError(
@@ -50,7 +50,7 @@ def differing(first: ProtocolRules, second: ProtocolRules) -> list[Differing]:
             values = [(key, getattr(of_first, leaf), getattr(of_second, leaf)) for key, leaf in leaves]
         else:
             values = [(field, of_first, of_second)]
-        found += [Differing(key, plain(one), plain(other)) for key, one, other in values if one != other]
+        found += [RuleDifference(key, plain(one), plain(other)) for key, one, other in values if one != other]
     return found
 
 
@@ -89,7 +89,7 @@ class Mixtures:
 
         Merged until every choice of groups makes a protocol.
         """
-        rules = [one.rule for one in differing(self.first, self.second) if one.rule not in UNMOVED]
+        rules = [one.rule for one in differing(self.first, self.second) if one.rule not in CONSTANT_RULES]
         groups: list[tuple[str, ...]] = [(rule,) for rule in rules]
         # Ground truths whose class ids are of a list of their own take the classes with them.
         own_ids = [ID_LISTS.get(one.ground_truth) for one in (self.first, self.second)]

@@ -181,7 +181,7 @@ class ProtocolRules(_Strict):
     confidences: ClassVar[tuple[str, ...]] = ()  # where there are precision-recall curves
     allowed: ClassVar[Mapping[str, tuple[object, ...]]] = {}  # of those of OWN_FIELDS that take less than their type
     takes_dense: ClassVar[bool] = False  # a map with one feature a point
-    goes_by_names: ClassVar[bool] = False  # of instances, without features
+    uses_names: ClassVar[bool] = False  # of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
     needs_boxes: ClassVar[bool] = False  # in the truth
     needs_places: ClassVar[bool] = False  # of floors and rooms, in the truth and in the prediction
@@ -236,7 +236,7 @@ class ProtocolRules(_Strict):
 
     def _check_texts(self) -> None:
         texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
-        compares = self.names_masks or not (self.needs_instances or self.goes_by_names or self.needs_places)
+        compares = self.names_masks or not (self.needs_instances or self.uses_names or self.needs_places)
         if not compares and (texts or self.encoder):
             raise ValueError("prompt: these rules compare no features; they take no prompt and no encoder")
         if compares and (self.prompt is None) == (not self.prompts):

@@ -13,7 +13,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
 from su3d_bench.metrics.metric import ROWS, Counts, Metric, Pooled, SceneScore, Values, axes, n_predictions
 from su3d_bench.metrics.protocols.model import PresenceRules
-from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
+from su3d_bench.metrics.questions.score import PresenceQuery, PresenceTruth
 from su3d_bench.numerics.statistics import ratio
 
 SAMPLINGS = ("random", "popular", "adversarial")  # POPE's, of things that are not there
@@ -25,7 +25,7 @@ _MAX_CELLS = 4_000_000  # of a (resamples, questions) block: 32 MB of float64
 class PresenceCounts(Counts):
     """What one scene, or several, adds: a row for each question.
 
-    ``sampling`` (Q,) int64 is its place among ``SAMPLINGS``; ``is_there`` (Q,) and ``says_yes`` (Q,) are what is true
+    ``sampling`` (Q,) int64 is its place among ``SAMPLINGS``; ``is_there`` (Q,) and ``is_yes`` (Q,) are what is true
     and what the map says; ``similarity`` (Q,) float64 is that of the best instance with the text, -1 in an empty map.
     """
 
@@ -33,7 +33,7 @@ class PresenceCounts(Counts):
 
     sampling: Int64Array = field(metadata=axes(ROWS))
     is_there: BoolArray = field(metadata=axes(ROWS))
-    says_yes: BoolArray = field(metadata=axes(ROWS))
+    is_yes: BoolArray = field(metadata=axes(ROWS))
     similarity: Float64Array = field(metadata=axes(ROWS))
 
     def contradiction(self) -> str | None:
@@ -71,7 +71,7 @@ def _of_sampling(counts: PresenceCounts, place: int) -> PresenceCounts:
 
 
 def _shares(rows: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
-    each = [np.bincount(2 * row.is_there + row.says_yes, minlength=4) for row in rows]
+    each = [np.bincount(2 * row.is_there + row.is_yes, minlength=4) for row in rows]
     true_no, false_yes, false_no, true_yes = (weights @ np.stack(each)).astype(np.float64).T
     n = true_yes + false_yes + true_no + false_no
     precision, recall = ratio(true_yes, true_yes + false_yes), ratio(true_yes, true_yes + false_no)
@@ -105,7 +105,7 @@ def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
     return areas
 
 
-NOWHERE = -1.0  # the similarity of a text with the best instance of an empty map
+EMPTY_MAP_SIMILARITY = -1.0  # the similarity of a text with the best instance of an empty map
 _NOT_KNOWN = (
     "what the truth itself would score is not known: how well similarities tell what is there is up to the encoder"
 )
@@ -124,7 +124,7 @@ class PresenceMetric(Metric[PresenceCounts]):
         counts = PresenceCounts(
             sampling=np.array([SAMPLINGS.index(thing.sampling) for thing in truth.asked], np.int64),
             is_there=np.array([thing.is_there for thing in truth.asked], bool),
-            says_yes=relevancy > rules.relevancy,
+            is_yes=relevancy > rules.relevancy,
             similarity=similarity,
         )
         warnings = [encoder_warning(self.rules, prediction, encoder), truth.source]
@@ -132,13 +132,13 @@ class PresenceMetric(Metric[PresenceCounts]):
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def _answers(
-        self, asked: Sequence[AskedThing], prediction: Instances | Partition, encoder: Encoder | None
+        self, asked: Sequence[PresenceQuery], prediction: Instances | Partition, encoder: Encoder | None
     ) -> tuple[Float64Array, Float64Array]:
         """The greatest similarity and the greatest relevancy (Q,) that an instance has to each text."""
         rules = self.rules.presence
         assert rules is not None
         if not n_predictions(prediction) or not asked:
-            return np.full(len(asked), NOWHERE), np.zeros(len(asked))
+            return np.full(len(asked), EMPTY_MAP_SIMILARITY), np.zeros(len(asked))
         texts = list(dict.fromkeys(thing.text for thing in asked))
         cosine = similarities(self.rules, [*texts, *rules.canonical], prediction, encoder).clip(-1.0, 1.0)
         of_text = cosine[:, : len(texts)]

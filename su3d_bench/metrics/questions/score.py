@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from su3d_bench.core.interfaces import Encoder, KnowsRelativeTexts
+from su3d_bench.core.interfaces import Encoder, TrainedOnRelativeTexts
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
-from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
+from su3d_bench.metrics.instance.score import NO_OBJECT, CoveredObjects, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
 from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, n_predictions
 from su3d_bench.metrics.protocols.model import AnswerRules, MergeRules, ProtocolRules
@@ -81,7 +81,7 @@ def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Arra
 
 
 @dataclass(frozen=True)
-class AskedText:
+class TextTarget:
     """A text of a kind such as ``property``, and the ids of every object that answers it.
 
     ``by_chance``: how often an object drawn at random answers; ``by_name``: one drawn from those of the right name.
@@ -99,11 +99,11 @@ class RetrievalTruth:
     """The objects of a scene and the texts that ask for them."""
 
     scene: GroundTruth
-    asked: tuple[AskedText, ...]
+    asked: tuple[TextTarget, ...]
 
 
 @dataclass(frozen=True)
-class AskedThing:
+class PresenceQuery:
     """What a map is asked for that the scene has or has not; ``sampling``: the way by which absent things are drawn."""
 
     text: str
@@ -117,7 +117,7 @@ class PresenceTruth:
     are frequent, and which stand together."""
 
     scene: GroundTruth
-    asked: tuple[AskedThing, ...]
+    asked: tuple[PresenceQuery, ...]
     source: str
 
 
@@ -168,12 +168,12 @@ class TrueAnswer:
 
 
 @dataclass(frozen=True)
-class GivenAnswer:
-    """What a solver said of a map: ``rows`` are the instances that it names; nothing where it ``is_settled`` not."""
+class SolverAnswer:
+    """What a solver said of a map: ``rows`` are the instances that it names; nothing where it ``is_decided`` not."""
 
     value: float | int | bool | None
     rows: Int64Array
-    is_settled: bool
+    is_decided: bool
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class ReasoningTruth:
 
     scene: GroundTruth
     asked: tuple[TrueAnswer, ...]
-    solve: Callable[[Instances, Encoder | None], Sequence[GivenAnswer]]
+    solve: Callable[[Instances, Encoder | None], Sequence[SolverAnswer]]
     solver: str
 
 
@@ -271,7 +271,7 @@ class RetrievalMetric(ShareMetric):
 
 def relative_remark(encoder: object) -> str | None:
     """What must stand beside figures of relative queries; None where the encoder was not trained on such texts."""
-    return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, KnowsRelativeTexts) else None
+    return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, TrainedOnRelativeTexts) else None
 
 
 def first_instances(
@@ -283,10 +283,10 @@ def first_instances(
     return np.asarray(similarities(rules, list(texts), prediction, encoder).argmax(axis=0))
 
 
-def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[AskedText]) -> BoolArray:
+def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[TextTarget]) -> BoolArray:
     """Whether (Q,) the instance ``first`` (Q,) of each question stands for an object that answers it.
 
-    >>> chair = AskedText("instance", "chair", (4, 5))
+    >>> chair = TextTarget("instance", "chair", (4, 5))
     >>> judge_retrieval(np.array([5, 9]), np.array([0, 1, -1]), [chair, chair, chair]).tolist()
     [True, False, False]
     """
@@ -332,10 +332,10 @@ class AnnotationMetric(ShareMetric):
         return self._score(truth.scene, truth.object_ids, prediction, rows, warnings)
 
 
-def said_by(warnings: Sequence[str], start: str) -> tuple[str, ...]:
+def remarks_starting(warnings: Sequence[str], start: str) -> tuple[str, ...]:
     """What the remarks say that begin with ``start`` behind the name of their scenes; each once.
 
-    >>> said_by(["a/b: n': the vote", "every scene: answers by gpt", "c/d: n': the vote"], REFINED_BY)
+    >>> remarks_starting(["a/b: n': the vote", "every scene: answers by gpt", "c/d: n': the vote"], REFINED_BY)
     ('the vote',)
     """
     parts = [warning.partition(start) for warning in warnings]
@@ -352,7 +352,7 @@ def _are_called(truth: AnnotationTruth, names: Sequence[str], objects: Int64Arra
     return np.array([truth.is_called(names[k], int(objects[k])) for k in judged], bool)
 
 
-def judge_merging(rules: MergeRules, covered: Covered) -> tuple[str, ...]:
+def judge_merging(rules: MergeRules, covered: CoveredObjects) -> tuple[str, ...]:
     """How each instance was merged; over-merged goes before under-merged, and what covers nothing is neither.
 
     >>> rules = MergeRules(over_merged_share=0.25, under_merged_share=0.5)
@@ -393,7 +393,7 @@ class ReasoningMetric(ShareMetric):
             "answer": np.array([is_answer_right(rules, question, given, main) for question, given in pairs], bool),
             "objects": np.array([are_objects_right(*pair, main) for pair in pairs if pair[0].object_ids], bool),
         }
-        is_open = any(not given.is_settled for given in answers)
+        is_open = any(not given.is_decided for given in answers)
         warnings = [f"{ANSWERED_BY}{truth.solver}"]
         if is_open:
             warnings.append("questions that the solver could not settle count as wrong")
@@ -402,15 +402,15 @@ class ReasoningMetric(ShareMetric):
         return self._score(truth.scene, named, prediction, rows, warnings, cheap)
 
 
-def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:
+def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: SolverAnswer, main_object: Int64Array) -> bool:
     """Whether counts and yes or no agree, a distance is near enough, or else the objects are right.
 
     >>> rules = AnswerRules(distance_m=0.25, distance_share=0.1)
-    >>> given = GivenAnswer(2.2, np.zeros(0, np.int64), True)
+    >>> given = SolverAnswer(2.2, np.zeros(0, np.int64), True)
     >>> is_answer_right(rules, TrueAnswer("how far?", "distance", 2.0, ()), given, np.zeros(0, np.int64))
     True
     """
-    if not given.is_settled:
+    if not given.is_decided:
         return False
     if true.value is None or given.value is None:
         return true.value is given.value and are_objects_right(true, given, main_object)
@@ -419,6 +419,6 @@ def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, ma
     return type(given.value) is type(true.value) and given.value == true.value
 
 
-def are_objects_right(true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:
+def are_objects_right(true: TrueAnswer, given: SolverAnswer, main_object: Int64Array) -> bool:
     """Whether the instances named stand for exactly the objects that the true answer names."""
-    return given.is_settled and {int(main_object[row]) for row in given.rows} == set(true.object_ids)
+    return given.is_decided and {int(main_object[row]) for row in given.rows} == set(true.object_ids)

@@ -239,7 +239,7 @@ def rule_of(rules: ProtocolRules) -> Rule:
     return "panopticapi" if rules.metric == "panopticapi" else "semantic-kitti"
 
 
-def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
+def visible_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
     """The truth that a method is told under a protocol, if it is told any: as it stands, but for where stuff counts.
 
     There every labelled point belongs to a segment, and what the annotation gives a class and no instance, as
@@ -250,7 +250,7 @@ def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
     >>> names = LabelSet("replica", (93, 20), ("wall", "chair"))
     >>> ids = np.array([93, 20, 0, 93], np.int32), np.array([0, 5, 0, 0], np.int32)
     >>> truth = GroundTruth(np.zeros((4, 3), np.float32), *ids, names, "mesh-vertices", "by hand")
-    >>> told_truth(load_protocol("rooms-panoptic"), truth).instance.tolist()
+    >>> visible_truth(load_protocol("rooms-panoptic"), truth).instance.tolist()
     [6, 5, 0, 6]
     """
     is_open = (truth.semantic > 0) & (truth.instance <= 0)

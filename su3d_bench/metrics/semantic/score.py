@@ -131,7 +131,7 @@ def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
 
 
 @dataclass(frozen=True)
-class CalledPoints:
+class PredictedPoints:
     """The P points that a protocol of kind ``semantic`` looks at, and what a prediction calls them.
 
     ``source`` (P,): the truth's point that each one takes its class from. ``true_class`` and ``predicted`` (P,) are -1
@@ -156,7 +156,7 @@ class CalledPoints:
 
 def call_points(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
-) -> CalledPoints:
+) -> PredictedPoints:
     """What each evaluation point is and is called."""
     class_of_label = labelling.class_index_of_ids(rules, truth.semantic)
     is_scored = labelling.scored_classes(rules)
@@ -186,7 +186,7 @@ def call_points(
         predicted = np.append(classes, -1)[mask]
     if len(classes):
         predicted = with_unnamed(rules, predicted)
-    return CalledPoints(
+    return PredictedPoints(
         targets=targets,
         source=source,
         true_class=true_class,
@@ -227,7 +227,7 @@ def owners_at(
     """
     owner, rank = _point_owners(prediction, takes_part)
     if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
-        rank = _one_a_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
+        rank = _one_per_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
     mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, wanted)
     if rules.transfer.cap_m is not None:
         mask = np.where(distance_m <= rules.transfer.cap_m, mask, -1)
@@ -284,7 +284,7 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
     return owner, owner
 
 
-def _one_a_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
+def _one_per_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
     """``rank`` (N,) where each object keeps its first point a voxel, -1 for all others."""
     taking = np.flatnonzero(rank >= 0)
     voxel = voxel_coordinates(points[taking], voxel_m)

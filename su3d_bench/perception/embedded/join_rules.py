@@ -184,7 +184,7 @@ def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: Segmen
     return plane_of_piece
 
 
-def take_out_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
+def remove_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
     """The surfaces of superpixels ``graph``, with the pieces of floor, walls and ceiling joined and marked (N,)."""
     surfaces = join_surfaces(graph, config)
     planes = structural_planes(surfaces, config)

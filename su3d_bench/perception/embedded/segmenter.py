@@ -18,10 +18,10 @@ from su3d_bench.core.types import (
     UInt8Array,
 )
 from su3d_bench.perception.cache import CODE, content_key, mask_boxes
-from su3d_bench.perception.embedded.join_rules import SegmenterConfig, join_objects, region_quality, take_out_structure
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig, join_objects, region_quality, remove_structure
 from su3d_bench.perception.embedded.surface_graph import Graph, Pieces, measure_borders
 
-MOST_LEVELS = 2048
+MAX_LEVELS = 2048
 
 
 def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:
@@ -56,7 +56,7 @@ def _cheap_first(cost: Float32Array) -> Int64Array:
 
     Those of equal level are in row-major order, right neighbours first.
     """
-    level = np.minimum(cost * 64, MOST_LEVELS - 1).astype(np.int16)
+    level = np.minimum(cost * 64, MAX_LEVELS - 1).astype(np.int16)
     level[0, :, -1] = level[1, -1] = -1  # no neighbour
     return np.argsort(level, axis=None, kind="stable")[sum(cost.shape[1:]) :]
 
@@ -151,7 +151,7 @@ class RgbdSegmenter:
 
         cv2.setNumThreads(1)
         labels, graph = superpixels(frame, self._config)
-        surfaces, is_structure = take_out_structure(graph, self._config)
+        surfaces, is_structure = remove_structure(graph, self._config)
         objects, is_structure = join_objects(surfaces, is_structure, self._config)
         is_left_out = is_structure & (self._level == "objects")
         return self._regions(frame, labels, objects, is_structure, is_left_out)

@@ -34,7 +34,7 @@ STRATEGY = (
 )
 
 # What of the language model's settings moves a caption; times, prices and limits do not.
-MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
+CAPTION_SETTINGS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
 logger = logging.getLogger(__name__)
 
 
@@ -61,7 +61,7 @@ class Captioner:
         self._model = model
         self._config = config
         self.vision_model = config.vision_model
-        self.digest = content_key("captioner", config.model_dump_json(include=MOVES_CAPTIONS))
+        self.digest = content_key("captioner", config.model_dump_json(include=CAPTION_SETTINGS))
 
     def requests(self, crops: Sequence[UInt8Array]) -> list[ChatRequest]:
         """The requests for the crops (h, w, 3)."""

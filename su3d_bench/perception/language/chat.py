@@ -22,10 +22,10 @@ from su3d_bench.core.files.atomic import json_text, make_folder, write_bytes, wr
 from su3d_bench.core.files.locks import hold_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.store.run_folder import refuse_links
+from su3d_bench.store.run_folder import check_no_links
 
 Purpose = Literal["caption", "refine", "ask", "judge"]
-CHARACTERS_A_TOKEN = 4  # OpenAI's rule of thumb for English
+CHARACTERS_PER_TOKEN = 4  # OpenAI's rule of thumb for English
 MESSAGE_TOKENS = 8  # what the frame of a message costs, roughly
 
 
@@ -58,14 +58,14 @@ class Image:
         return 85 + 170 * int(np.ceil(height * scale / 512) * np.ceil(width * scale / 512))
 
 
-def fitted(rgb: UInt8Array, most_px: int) -> Image:
-    """``rgb`` with its longer side at most ``most_px``."""
+def fitted(rgb: UInt8Array, max_px: int) -> Image:
+    """``rgb`` with its longer side at most ``max_px``."""
     longer = max(rgb.shape[:2])
-    if longer <= most_px:
+    if longer <= max_px:
         return Image(rgb)
     import cv2
 
-    height, width = (max(1, round(side * most_px / longer)) for side in rgb.shape[:2])
+    height, width = (max(1, round(side * max_px / longer)) for side in rgb.shape[:2])
     return Image(np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8))
 
 
@@ -132,7 +132,7 @@ class ChatRequest:
 
 def n_tokens(text: str) -> int:
     """A rough count of the tokens of ``text``: one for every four bytes of UTF-8."""
-    return -(-len(text.encode()) // CHARACTERS_A_TOKEN)
+    return -(-len(text.encode()) // CHARACTERS_PER_TOKEN)
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ def check_address(address: str) -> None:
 
 SCHEMA = 1
 IMAGES = "images"
-MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
+MAX_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
 
 
 _REPLY = TypeAdapter(Reply)
@@ -248,7 +248,7 @@ class ReplyStore:
         """The reply under ``key``; None if missing or damaged."""
         path = self.path(key)
         try:
-            if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
+            if not path.is_file() or path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
             entry: Any = json.loads(file_text(path))
             digests = digest_json(entry["request"]), digest_json(entry["reply"])
@@ -260,7 +260,7 @@ class ReplyStore:
 
     def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
         """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
-        refuse_links(self.folder.parent, self.folder / IMAGES)
+        check_no_links(self.folder.parent, self.folder / IMAGES)
         make_folder(self.folder)
         with self._locked():
             earlier = None if replace else self.load(request.key)

@@ -22,10 +22,10 @@ from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Rep
 
 HOSTED = "https://api.openai.com/v1"
 NO_KEY = "none"  # servers on one's own machine ask for no key, the client library for any text
-MOST_TOKENS = 100_000_000  # of one request; no model reads or writes so many
+MAX_TOKENS = 100_000_000  # of one request; no model reads or writes so many
 OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens", "response_format")
 PLACE = "(key)"
-SHORTEST_KEY = 8  # what is shorter is no secret: "none", "EMPTY", "test"
+MIN_KEY_LENGTH = 8  # what is shorter is no secret: "none", "EMPTY", "test"
 KEY_LIKE = re.compile(r"\b(?:sk|pk|key|gsk|hf)[-_][A-Za-z0-9_\-*]{6,}", re.IGNORECASE)
 
 
@@ -41,16 +41,16 @@ class ChatClient:
     """An OpenAI-compatible server with stored replies; thread-safe.
 
     ``offline``: a question without a stored reply is a ``StoreError``. A request that failed for good is stored as
-    that, so that a rerun is identical; ``ask_failed_again`` gives it another chance.
+    that, so that a rerun is identical; ``retry_failed`` gives it another chance.
     """
 
     def __init__(
-        self, config: LanguageConfig, store: ReplyStore, *, offline: bool = False, ask_failed_again: bool = False
+        self, config: LanguageConfig, store: ReplyStore, *, offline: bool = False, retry_failed: bool = False
     ) -> None:
         self._config = config
         self._store = store
         self._offline = offline
-        self._ask_failed_again = ask_failed_again
+        self._retry_failed = retry_failed
         self._server = Server(config)
         self._pace = _Pace(config.requests_per_minute)
         self._lock = threading.Lock()
@@ -90,11 +90,11 @@ class ChatClient:
                 )
             reply = self._send(request)
             self._sent.add(request.key)
-            return self._store.save(request, reply, self._server.name, replace=self._ask_failed_again)
+            return self._store.save(request, reply, self._server.name, replace=self._retry_failed)
 
     def _known(self, request: ChatRequest) -> Reply | None:
         reply = self._store.load(request.key)
-        is_wanted_again = self._ask_failed_again and request.key not in self._sent and not self._offline
+        is_wanted_again = self._retry_failed and request.key not in self._sent and not self._offline
         return None if reply is not None and reply.failure and is_wanted_again else reply
 
     def estimate(self, requests: Sequence[ChatRequest]) -> Estimate:
@@ -171,8 +171,8 @@ class _Choice(BaseModel):
 
 
 class _Usage(BaseModel):
-    prompt_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
-    completion_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
+    prompt_tokens: int = Field(default=0, ge=0, le=MAX_TOKENS)
+    completion_tokens: int = Field(default=0, ge=0, le=MAX_TOKENS)
 
 
 class _Completion(BaseModel):
@@ -298,7 +298,7 @@ class Server:
         return Reply(answer, finish, model, usage.prompt_tokens, usage.completion_tokens, dropped)
 
     def _without_key(self, text: str) -> str:
-        return text.replace(self._key, PLACE) if len(self._key) >= SHORTEST_KEY else text
+        return text.replace(self._key, PLACE) if len(self._key) >= MIN_KEY_LENGTH else text
 
     def _shown(self, text: str, limit: int = 200) -> str:
         """What a server says, fit for a message or a record: without the key or what looks like one."""
@@ -330,8 +330,8 @@ def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
     return kept
 
 
-def _bounded(most_bytes: int) -> Callable[[Any], None]:
-    """A hook that ends the reading of a response beyond ``most_bytes``, and of one that is packed, with an error."""
+def _bounded(max_bytes: int) -> Callable[[Any], None]:
+    """A hook that ends the reading of a response beyond ``max_bytes``, and of one that is packed, with an error."""
 
     def hook(response: Any) -> None:
         if response.headers.get("content-encoding", "identity") not in ("", "identity"):
@@ -345,8 +345,8 @@ def _bounded(most_bytes: int) -> Callable[[Any], None]:
                 n = 0
                 for chunk in body:
                     n += len(chunk)
-                    if n > most_bytes:
-                        raise _TooLarge(f"larger than {most_bytes:,} bytes")
+                    if n > max_bytes:
+                        raise _TooLarge(f"larger than {max_bytes:,} bytes")
                     yield chunk
 
             def close(self) -> None:

@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from su3d_bench.core.errors import printable
 from su3d_bench.perception.embedded.lexicon import words
 
-MOST_READ = 8000  # characters of an answer; a name, a caption or an answer stands within
-MOST_NAME_CHARACTERS, MOST_NAME_WORDS = 60, 5
-MOST_CAPTION_CHARACTERS = 500
-MOST_OBJECTS_TRIED = 20
+MAX_READ = 8000  # characters of an answer; a name, a caption or an answer stands within
+MAX_NAME_CHARACTERS, MAX_NAME_WORDS = 60, 5
+MAX_CAPTION_CHARACTERS = 500
+MAX_OBJECTS_TRIED = 20
 
 _QUOTE = "`'\"‘’‚‛“”„´*_"
 _REFUSAL = re.compile(
@@ -109,7 +109,7 @@ def described(text: str) -> Described | None:
     >>> described("I'm sorry, I can't help with that.") is None
     True
     """
-    plain = _FENCE.sub("", text[:MOST_READ])
+    plain = _FENCE.sub("", text[:MAX_READ])
     for value in _json_objects(plain):
         if _KEYS_OF_ERRORS.isdisjoint(value):
             pairs = [(value.get("name"), value.get("description", ""))] if "name" in value else list(value.items())
@@ -125,7 +125,7 @@ def described(text: str) -> Described | None:
 
 def chosen_name(text: str, names: Sequence[str]) -> str | None:
     """The name that an answer settles on: one of ``names``, in their spelling, or a short noun phrase of its own."""
-    plain = _FENCE.sub("", text[:MOST_READ]).strip()
+    plain = _FENCE.sub("", text[:MAX_READ]).strip()
     told = next((value["name"] for value in _json_objects(plain) if isinstance(value.get("name"), str)), plain)
     lines = [_NAME_LEAD.sub("", line.strip(_QUOTE + " ")) for line in told.splitlines() if line.strip()]
     by_words: dict[tuple[str, ...], str] = {}
@@ -147,7 +147,7 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
 
     Ids that are none of ``known_ids`` are left out.
     """
-    plain = _FENCE.sub("", text[:MOST_READ]).strip()
+    plain = _FENCE.sub("", text[:MAX_READ]).strip()
     if not plain:
         return None
     known = set(known_ids)
@@ -178,12 +178,12 @@ def clean_name(text: str) -> str | None:
     >>> clean_name('"The Office Chair".'), clean_name("I cannot tell")
     ('office chair', None)
     """
-    if len(text) > 4 * MOST_NAME_CHARACTERS:
+    if len(text) > 4 * MAX_NAME_CHARACTERS:
         return None
     name = " ".join(text.strip(_QUOTE + " .,;:!?()[]{}<>#-\n\t").split()).lower()
     name = re.sub(r"^(?:an?|the|some)\s+", "", name).replace("**", "").replace("`", "")
     parts = re.findall(r"[^\W\d_]+", name)
-    is_short = len(name) <= MOST_NAME_CHARACTERS and len(name.split()) <= MOST_NAME_WORDS
+    is_short = len(name) <= MAX_NAME_CHARACTERS and len(name.split()) <= MAX_NAME_WORDS
     if not parts or not is_short or set(parts) & _NO_NAME or name in _NO_OBJECT:
         return None
     return None if not name.isprintable() or re.search(r"[{}\[\]<>|\\=:;?!\"]", name) else name
@@ -192,7 +192,7 @@ def clean_name(text: str) -> str | None:
 def _json_objects(text: str) -> Iterator[dict[str, Any]]:
     """The JSON objects in ``text``, including those inside prose."""
     decoder, start = json.JSONDecoder(), 0
-    for _ in range(MOST_OBJECTS_TRIED):
+    for _ in range(MAX_OBJECTS_TRIED):
         start = text.find("{", start)
         if start < 0:
             return
@@ -209,7 +209,7 @@ def _pair(name: Any, caption: Any) -> Described | None:
     if not isinstance(name, str) or not isinstance(caption, str):
         return None
     cleaned = clean_name(name)
-    caption = printable(caption.strip(_QUOTE + " \n\t,{}"), MOST_CAPTION_CHARACTERS)
+    caption = printable(caption.strip(_QUOTE + " \n\t,{}"), MAX_CAPTION_CHARACTERS)
     return None if cleaned is None else Described(cleaned, caption)
 
 

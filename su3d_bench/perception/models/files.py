@@ -40,7 +40,7 @@ DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"
 Checked = TypeVar("Checked")
 Loaded = TypeVar("Loaded")
-LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
+MAX_SETTINGS_BYTES = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
 PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 
 
@@ -267,8 +267,10 @@ def _read_pickled(path: Path, device: str) -> Any:
 
 def check_settings_size(path: Path) -> None:
     """Refuse a file of settings or words that is far larger than any model's; one that is not there is fine."""
-    if path.is_file() and path.stat().st_size > LARGEST_SETTINGS:
-        raise DataError(f"{path}: has {path.stat().st_size} bytes; a model's settings have at most {LARGEST_SETTINGS}")
+    if path.is_file() and path.stat().st_size > MAX_SETTINGS_BYTES:
+        raise DataError(
+            f"{path}: has {path.stat().st_size} bytes; a model's settings have at most {MAX_SETTINGS_BYTES}"
+        )
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -301,7 +303,7 @@ def bounded(error: object, limit: int = 160) -> str:
 
 
 # A worker segments one scene after another; a segmenter, a detector and a tagger stay in memory.
-MOST_KEPT = 3
+MAX_KEPT = 3
 _kept: OrderedDict[tuple[object, ...], object] = OrderedDict()
 
 
@@ -310,7 +312,7 @@ def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) 
     status = files.weights.stat()
     key = (files.entry.name, str(files.weights), status.st_size, status.st_mtime_ns, *place)
     if key not in _kept:
-        while len(_kept) >= MOST_KEPT:
+        while len(_kept) >= MAX_KEPT:
             _kept.popitem(last=False)
         _kept[key] = load()
     _kept.move_to_end(key)

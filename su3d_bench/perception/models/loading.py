@@ -31,7 +31,7 @@ from su3d_bench.perception.models.masks.grounding_dino import load_grounding_din
 from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
 from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
 
-FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
+RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
     "torch": ("torch", "transformers"),
     "open_clip": ("torch", "open_clip"),
@@ -75,7 +75,7 @@ def check_encoder(config: ModelsConfig, name: str) -> None:
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
     """Where the files of encoder ``name`` lie in the form that the configured runtime reads."""
     model_entry(name, "encoder")
-    return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.paths.get(name), folder=config.folder)
+    return locate(name, (RUNTIME_FORM[config.runtime],), path=config.paths.get(name), folder=config.folder)
 
 
 def _torch_encoder(
@@ -173,7 +173,7 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     )
 
 
-def is_front_end_here(config: PaperConfig, models: ModelsConfig) -> bool:
+def is_front_end_available(config: PaperConfig, models: ModelsConfig) -> bool:
     """Whether the profile can run: packages, encoder, detector and segmenter are here; tags can do without RAM++."""
     try:
         _check_networks(config, models)
@@ -212,7 +212,7 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The tagger that is asked for, or with ``auto`` the first that is here."""
     if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
-        with _passed_over(config.tagger):
+        with _skip_missing(config.tagger):
             require("ram", "tagger 'ram'")
             files = _locate(models, TAGGER, ("original",))
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
@@ -220,7 +220,7 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
             return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
-        with _passed_over(config.tagger):
+        with _skip_missing(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
             if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
@@ -231,7 +231,7 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
     return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
-def _passed_over(tagger: str) -> AbstractContextManager[None]:
+def _skip_missing(tagger: str) -> AbstractContextManager[None]:
     """A model that is not here is an error where it was asked for by its name."""
     return suppress(ModelMissing) if tagger == "auto" else nullcontext()
 

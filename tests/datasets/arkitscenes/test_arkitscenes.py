@@ -54,12 +54,12 @@ def test_camera_file_may_be_1_ms_off_and_images_without_one_are_excluded(tmp_pat
 
 def test_depth_of_low_confidence_is_dropped_on_request(tmp_path: Path) -> None:
     folder = ark.write_scene(tmp_path)
-    sure, all_of_it = (opened(tmp_path, least_confidence=least).frames(ark.SCENE, 1)[0].depth_m for least in (2, 1))
+    sure, all_of_it = (opened(tmp_path, min_confidence=least).frames(ark.SCENE, 1)[0].depth_m for least in (2, 1))
     assert not sure[:, :4].any() and (sure[:, 4:] == all_of_it[:, 4:]).all() and all_of_it[1:, :4].all()
     for path in (folder / "confidence").iterdir():
         path.unlink()
-    with pytest.raises(DataError, match="option least_confidence needs confidence/, which is missing"):
-        opened(tmp_path, least_confidence=1).frames(ark.SCENE, 1)
+    with pytest.raises(DataError, match="option min_confidence needs confidence/, which is missing"):
+        opened(tmp_path, min_confidence=1).frames(ark.SCENE, 1)
 
 
 def test_wide_camera_uses_scanner_or_phone_depth_and_is_downsized(tmp_path: Path) -> None:

@@ -100,13 +100,13 @@ def test_poses_of_both_grids_map_a_pixel_to_the_same_point(grid: Grid) -> None:
 def test_colour_extrinsic_maps_to_the_same_frame_as_depth_extrinsic() -> None:
     both = motion(0.3, 1, 2, 3)
     camera = pair((4, 3), (4, 3), both, both, colour_focal=4.0)
-    assert register(camera).is_needless
+    assert register(camera).is_identity
 
 
 def test_equal_sizes_with_different_focal_lengths_are_registered() -> None:
-    assert not register(pair((640, 480), (640, 480), colour_focal=577.9, depth_focal=577.8)).is_needless
-    assert register(pair((640, 480), (640, 480), colour_focal=577.870605, depth_focal=577.8706054688)).is_needless
-    assert not register(pair((4, 3), (4, 3), motion(x=1e-4), colour_focal=4.0)).is_needless
+    assert not register(pair((640, 480), (640, 480), colour_focal=577.9, depth_focal=577.8)).is_identity
+    assert register(pair((640, 480), (640, 480), colour_focal=577.870605, depth_focal=577.8706054688)).is_identity
+    assert not register(pair((4, 3), (4, 3), motion(x=1e-4), colour_focal=4.0)).is_identity
 
 
 # A slanted wall in front of the depth camera: points X with normal . X = 2, coloured by position.

@@ -12,8 +12,8 @@ from scored_room import NAMES, instances, room, truth_as_prediction
 
 from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.maps import Instances, Partition
-from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.instance.score import Covered
+from su3d_bench.metrics.compatibility import kind_incompatibility
+from su3d_bench.metrics.instance.score import CoveredObjects
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import (
     REFINED_BY,
@@ -21,9 +21,10 @@ from su3d_bench.metrics.questions.score import (
     RefinedNames,
     judge_merging,
     labels_n,
-    said_by,
+    remarks_starting,
 )
 from su3d_bench.metrics.scoring import metric_of, score_scene
+from su3d_bench.questions.ground_truths import Refine, question_truth
 from su3d_bench.questions.refining import (
     FILE_NAME,
     FilterConfig,
@@ -35,7 +36,6 @@ from su3d_bench.questions.refining import (
     voted_names,
     write_records,
 )
-from su3d_bench.questions.truths import Refine, question_truth
 from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")
@@ -124,7 +124,7 @@ def test_the_vote_takes_the_name_of_most_weight() -> None:
 
 def test_who_named_is_what_stands_behind_the_name_of_a_scene_alone() -> None:
     told = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' leaves out 1 of 4"]
-    assert said_by(told, REFINED_BY) == ("the vote", "a model")
+    assert remarks_starting(told, REFINED_BY) == ("the vote", "a model")
 
 
 def test_a_label_that_the_method_decided_goes_before_the_name() -> None:
@@ -147,7 +147,7 @@ def test_a_label_that_the_method_decided_goes_before_the_name() -> None:
 )
 def test_merging_is_judged_by_shares(shared: list[list[int]], judged: tuple[str, ...]) -> None:
     assert RULES.merging is not None
-    assert judge_merging(RULES.merging, Covered(np.array([1, 2]), np.array(shared))) == judged
+    assert judge_merging(RULES.merging, CoveredObjects(np.array([1, 2]), np.array(shared))) == judged
 
 
 def test_masks_of_half_and_of_two_objects_are_faulty() -> None:
@@ -177,9 +177,9 @@ def test_shuffled_instances_change_nothing() -> None:
 
 
 def test_a_map_without_names_is_told_why() -> None:
-    assert "needs names" in str(why_not_scorable(RULES, truth_as_prediction(TRUTH, with_labels=False)))
+    assert "needs names" in str(kind_incompatibility(RULES, truth_as_prediction(TRUTH, with_labels=False)))
     partition = Partition(TRUTH.points, TRUTH.instance - 1, np.ones((8, 3), np.float32))
-    assert "gives a partition" in str(why_not_scorable(RULES, partition))
+    assert "gives a partition" in str(kind_incompatibility(RULES, partition))
 
 
 def test_labels_of_the_file_beside_a_map_are_taken_while_it_is_that_maps(tmp_path: Path) -> None:

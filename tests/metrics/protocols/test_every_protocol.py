@@ -18,7 +18,7 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import SAMPLINGS
-from su3d_bench.metrics.questions.score import AskedText, AskedThing, PresenceTruth, RetrievalTruth
+from su3d_bench.metrics.questions.score import PresenceQuery, PresenceTruth, RetrievalTruth, TextTarget
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 
 OF_ROOMS = (
@@ -49,11 +49,11 @@ def truth_of(name: str, seed: int) -> Any:
     truth = scored_room.room(seed, n_each=150 + 25 * (seed % 3))
     if rules.kind == "presence":
         asked = [(text, True) for text in ANSWERS] + [(text, False) for text in ("bed", "sofa", "toilet")]
-        things = [AskedThing(text, sampling, is_there=there) for sampling in SAMPLINGS for text, there in asked]
+        things = [PresenceQuery(text, sampling, is_there=there) for sampling in SAMPLINGS for text, there in asked]
         return PresenceTruth(truth, tuple(things), "made for a test")
     if rules.kind == "retrieval":
         kinds = rules.headline[:-1]  # the last is of all
-        return RetrievalTruth(truth, tuple(AskedText(kind, *answer) for kind in kinds for answer in ANSWERS.items()))
+        return RetrievalTruth(truth, tuple(TextTarget(kind, *answer) for kind in kinds for answer in ANSWERS.items()))
     if rules.kind == "boxes":
         ends = [[truth.points[truth.instance == k].min(axis=0), truth.points[truth.instance == k].max(axis=0)]
                 for k in range(1, 9)]  # fmt: skip

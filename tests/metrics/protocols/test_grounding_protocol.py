@@ -21,7 +21,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.grounding import aligned, box_iou, choose, in_group
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.questions.query_files import query_truth, scanrefer_groups
-from su3d_bench.questions.question_files import read_foreign_queries
+from su3d_bench.questions.question_files import read_external_queries
 
 RULES = load_protocol("grounding")
 PROBLEMS = json.loads((CASES / "grounding01_scanrefer.json").read_text())["problems"]
@@ -76,12 +76,12 @@ def test_sentences_are_read_from_the_files_of_scanrefer_and_nr3d(tmp_path: Path)
     (tmp_path / "ScanRefer_filtered_val.json").write_text(json.dumps([row, row]))
     (tmp_path / "nr3d.csv").write_text('scan_id,target_id,utterance\nscene0011_00,4,"the chair, brown"\n')
     chair = TextQuery("the brown chair", (5,))  # ScanNet's ids are one less
-    assert read_foreign_queries(tmp_path / "ScanRefer_filtered_val.json") == {"scene0011_00": (chair, chair)}
-    assert read_foreign_queries(tmp_path / "nr3d.csv") == {"scene0011_00": (TextQuery("the chair, brown", (5,)),)}
+    assert read_external_queries(tmp_path / "ScanRefer_filtered_val.json") == {"scene0011_00": (chair, chair)}
+    assert read_external_queries(tmp_path / "nr3d.csv") == {"scene0011_00": (TextQuery("the chair, brown", (5,)),)}
     asked = {"scene_id": "scene0011_00", "situation": "", "question": "Is it red?", "question_id": 1}
     (tmp_path / "v1_questions_val.json").write_text(json.dumps({"questions": [asked]}))
     with pytest.raises(DataError, match="SQA3D has no answer objects"):
-        read_foreign_queries(tmp_path / "v1_questions_val.json")
+        read_external_queries(tmp_path / "v1_questions_val.json")
 
 
 # ---- groups
@@ -103,7 +103,7 @@ def test_what_scanrefer_calls_unique_and_its_shares_hold_to_the_last_bit(index: 
     path.write_text(json.dumps(problem["rows"]))
     of_scene = {
         scene: iter(scanrefer_groups(queries, problem["classes"].get))
-        for scene, queries in read_foreign_queries(path).items()
+        for scene, queries in read_external_queries(path).items()
     }
     groups = [next(of_scene[row["scene_id"]]).groups for row in problem["rows"]]
     assert [int(one == ("multiple",)) for one in groups] == problem["multiple"]
@@ -122,7 +122,7 @@ def test_the_sentences_that_nr3d_counts_and_its_shares_hold_to_the_last_bit(inde
         table = csv.DictWriter(file, names, extrasaction="ignore")
         table.writeheader()
         table.writerows(problem["rows"])
-    groups = [query.groups for query in read_foreign_queries(path)["scene0011_00"]]
+    groups = [query.groups for query in read_external_queries(path)["scene0011_00"]]
     right = np.array([choose(np.array(row["logits"])) == row["target"] for row in problem["rows"]])
     counted = in_group(groups, "accuracy", "referit3d")
     assert counted.sum() == problem["counted"]
@@ -210,5 +210,5 @@ def test_each_fault_of_a_row_of_nr3d_is_one_line(tmp_path: Path, stimulus: str, 
         table.writerow(("scan_id", "target_id", "utterance", "stimulus_id", "tokens"))
         table.writerow(("scene0011_00", "4", "the chair", stimulus, tokens))
     with pytest.raises(DataError, match=message) as caught:
-        read_foreign_queries(path)
+        read_external_queries(path)
     assert "nr3d.csv: row 2" in str(caught.value) and "\n" not in str(caught.value)

@@ -41,7 +41,7 @@ CASE: dict[str, Any] = {
 }
 
 
-class GivenTexts:
+class GivenTextEncoder:
     """An encoder that knows the feature of each name."""
 
     name, digest, device = "given", "given", "cpu"
@@ -97,7 +97,7 @@ def test_objects_have_the_answer_of_hovsgs_evaluator(index: int) -> None:
     ids = [names.index(name) + 1 if name in names else 0 for name in problem["categories"]]
     truth = truth_of(split(arrays[f"true_{index}"], problem["sizes"]["true"]), ids, arrays[f"boxes_{index}"])
     found = map_of(split(arrays[f"pred_{index}"], problem["sizes"]["pred"]), features=arrays[f"features_{index}"])
-    encoder = GivenTexts(names, arrays[f"text_{index}"])
+    encoder = GivenTextEncoder(names, arrays[f"text_{index}"])
     assert numbers(rules_of(len(names)), (truth, found), encoder=encoder) == problem["answer"]
 
 
@@ -125,7 +125,7 @@ def test_floors_and_rooms_have_the_answer_of_hovsgs_evaluator(index: int) -> Non
 def test_the_truth_itself_is_found_whole_and_the_area_ends_at_the_last_ten(tmp_path: Any) -> None:
     write_walk(tmp_path)
     oracle = Oracle(Oracle.Config())
-    oracle.receive_truth(truth := Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects"))
+    oracle.receive_ground_truth(truth := Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects"))
     answer = numbers(OBJECT_RULES, (truth, oracle.finish()))
     assert answer.pop("AUC") == pytest.approx((1620 - 5) / 1624)
     assert set(answer.values()) == {1.0}
@@ -145,7 +145,7 @@ def test_an_object_without_a_feature_has_no_category_and_no_points_no_overlap() 
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     truth = truth_of([cube, cube + 5], [1, 2])
     found = map_of([cube, np.zeros((0, 3))], features=np.array([[0.0, 0.0], [0.0, 1.0]], np.float32))
-    encoder: Any = GivenTexts(["c0", "c1"], np.eye(2, dtype=np.float32))
+    encoder: Any = GivenTextEncoder(["c0", "c1"], np.eye(2, dtype=np.float32))
     score = score_scene(rules_of(2), truth, found, encoder)
     assert isinstance(score.counts, MatchedObjects)
     assert score.counts.n_ranked.tolist() == [1, 0, 1] and score.counts.n_found.tolist() == [1] * 10 + [0]

@@ -13,8 +13,8 @@ from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, nothing, 
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
+from su3d_bench.evaluation.ground_truth import VertexTruth
 from su3d_bench.evaluation.scoring import score_on_vertices
-from su3d_bench.evaluation.truth import VertexTruth
 from su3d_bench.metrics.matching.labelling import text_features
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -23,7 +23,7 @@ from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d, score
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
@@ -303,8 +303,8 @@ def test_points_of_several_instances_are_told() -> None:
 def test_a_prediction_without_features_cannot_be_ranked() -> None:
     truth = lex_truth()
     named = instances_with(truth.points, masks_of(perfect(truth)), None, labels=labels_of(truth))
-    assert why_not_scorable(TOPN, named) is None
-    reason = why_not_scorable(RANKING, named)
+    assert kind_incompatibility(TOPN, named) is None
+    reason = kind_incompatibility(RANKING, named)
     assert reason == "openlex3d-ranking: needs features to compare with texts, and the prediction has none"
     with pytest.raises(PredictionError, match="needs features"):
         score_scene(RANKING, truth, named, ENCODER)

@@ -16,7 +16,7 @@ from scored_room import ID, LABELS, OneHotEncoder, instances
 from su3d_bench.core.maps import DenseFeatures, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.evaluation.scoring import map_of, skips_missing_scenes
-from su3d_bench.metrics.fitness import ContentFacts, why_not_content
+from su3d_bench.metrics.compatibility import ContentFacts, content_incompatibility
 from su3d_bench.metrics.instance.score import without_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import ProtocolResult, combine, pack_scores, score_scene, unpack_scores
@@ -131,9 +131,9 @@ def test_a_scene_without_a_submission_counts_as_missed() -> None:
 
 def test_files_of_class_ids_are_refused_where_the_benchmark_counts_places() -> None:
     facts = ContentFacts("vertex-labels", 3, class_ids=np.array([1, 2, 3]), n_points=3)
-    assert "number the classes by their place in the list from 0" in (why_not_content(SEMANTIC, facts) or "")
-    assert why_not_content(TOP_K, facts) is None
-    assert why_not_content(SEMANTIC, replace(facts, class_ids=None)) is None
+    assert "number the classes by their place in the list from 0" in (content_incompatibility(SEMANTIC, facts) or "")
+    assert content_incompatibility(TOP_K, facts) is None
+    assert content_incompatibility(SEMANTIC, replace(facts, class_ids=None)) is None
 
 
 def test_masked_points_leave_truth_and_masks_of_every_protocol_of_masks() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.metrics.protocols.mixtures import NAMING, UNMOVED, Mixtures, differing
+from su3d_bench.metrics.protocols.mixtures import CONSTANT_RULES, NAMING, Mixtures, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 RULES = [load_protocol(name) for name in protocol_names()]
@@ -34,7 +34,7 @@ def test_every_choice_of_rules_makes_a_protocol_from_the_first_to_the_second(
     mixtures = Mixtures(first, second)
     rules = [one.rule for one in differing(first, second)]
     moved = [rule for group in mixtures.groups for rule in group]
-    assert sorted(moved) == sorted(set(rules) - set(UNMOVED))
+    assert sorted(moved) == sorted(set(rules) - set(CONSTANT_RULES))
     n = len(mixtures.groups)
     for bits in range(1 << n):
         chosen = [k for k in range(n) if bits >> k & 1]
@@ -43,7 +43,7 @@ def test_every_choice_of_rules_makes_a_protocol_from_the_first_to_the_second(
         for rule in moved:
             assert of_rule(between, rule) == of_rule(second if rule in of_second else first, rule)
     last = mixtures.of(range(n))
-    same = set(type(first).model_fields) - {*NAMING, *UNMOVED}
+    same = set(type(first).model_fields) - {*NAMING, *CONSTANT_RULES}
     assert {field for field in same if getattr(last, field) != getattr(second, field)} == set()
 
 

@@ -22,9 +22,9 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.base import VertexMasks
-from su3d_bench.predictions.export import answer_as_it_is, answer_to, write_opensun3d
+from su3d_bench.predictions.export import answer_to, masks_as_predicted, write_opensun3d
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.questions.truths import question_truth
+from su3d_bench.questions.ground_truths import question_truth
 
 PROBLEMS = json.loads((CASES / "opensun3d02_queries.json").read_text())["problems"]
 RULES = load_protocol("opensun3d-queries")
@@ -96,7 +96,7 @@ def test_an_exported_map_is_scored_as_the_map_and_comes_back_byte_for_byte(tmp_p
     for name in reader.scenes(first):
         content = reader.read(first, name).content
         assert isinstance(content, VertexMasks)
-        write_opensun3d(answer_as_it_is(content), name, second)
+        write_opensun3d(masks_as_predicted(content), name, second)
     files = {str(path.relative_to(first)): path.read_bytes() for path in first.rglob("*.txt")}
     assert files == {str(path.relative_to(second)): path.read_bytes() for path in second.rglob("*.txt")}
     request = Request((first,), ground_truth=tmp_path / TRUTH_FOLDER, protocols=("opensun3d-challenge",))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import made_boxes
-import made_instances
-import made_objects
-import made_points
-import made_queries
 import numpy as np
 import pytest
+import synthetic_boxes
+import synthetic_instances
+import synthetic_objects
+import synthetic_points
+import synthetic_queries
 from places import CASES, ROOT
 
 from su3d_bench.cli.main import main
@@ -103,7 +103,7 @@ LAST_BITS = {"class-agnostic-maskclustering": 1.2e-16}  # its means are summed i
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in FOUND["answers"] for k in FOUND["answers"][name]])
 def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -> None:
     rules = load_protocol(name)
-    scenes = {str(s): made_instances.scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
+    scenes = {str(s): synthetic_instances.scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
     found = combine(rules, scenes, with_intervals=False).metrics
     answer = np.array(FOUND["answers"][name][number], float)  # null is undefined
     ours = [found[key] for key in ("AP", "AP50", "AP25")]
@@ -119,7 +119,7 @@ OF_POINTS = json.loads((CASES / "originals_semantic.json").read_text())
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in OF_POINTS for k in range(len(OF_POINTS[name]))])
 def test_a_made_problem_of_points_has_the_answer_of_the_original(name: str, number: int) -> None:
     rules, problem = load_protocol(name), OF_POINTS[name][number]
-    read = made_objects.scored if rules.metric == "ovo" else made_points.scored
+    read = synthetic_objects.scored if rules.metric == "ovo" else synthetic_points.scored
     scores = {str(s): read(rules, scene) for s, scene in enumerate(problem["scenes"])}
     found = combine(rules, scores, with_intervals=False)
     if rules.metric == "ovo":  # with the means of thirds, NaN where no class of one is true or called
@@ -151,11 +151,11 @@ OF_A_CLASS = ("AP25", "recall25", "AP50", "recall50")
 @pytest.mark.parametrize("number", range(len(OF_BOXES)))
 def test_a_made_problem_of_boxes_has_the_answer_of_votenet(number: int) -> None:
     rules, problem = load_protocol("replica-boxes"), OF_BOXES[number]
-    scores = {str(s): made_boxes.scored(rules, scene) for s, scene in enumerate(problem["scenes"])}
+    scores = {str(s): synthetic_boxes.scored(rules, scene) for s, scene in enumerate(problem["scenes"])}
     found = combine(rules, scores, with_intervals=False)
     expected = np.array(problem["answer"], float).reshape(len(OF_A_CLASS), -1)  # null: no true box, or no mean
     for key, (*of_slots, mean) in zip(OF_A_CLASS, expected.tolist(), strict=True):
-        ours = [found.per_class[name][key] for _, name in made_boxes.names_of(rules).values()]
+        ours = [found.per_class[name][key] for _, name in synthetic_boxes.names_of(rules).values()]
         np.testing.assert_allclose(ours, of_slots, rtol=0, atol=2.3e-16)
         assert np.isnan(mean) or found.metrics[key] == pytest.approx(mean, rel=0, abs=2.3e-16)
 
@@ -163,6 +163,6 @@ def test_a_made_problem_of_boxes_has_the_answer_of_votenet(number: int) -> None:
 @pytest.mark.parametrize("number", range(len(OF_QUERIES)))
 def test_a_made_problem_of_text_queries_has_the_answer_of_scannets_script(number: int) -> None:
     problem = OF_QUERIES[number]
-    found = made_queries.scored(load_protocol("query-ap"), problem["scenes"])
+    found = synthetic_queries.scored(load_protocol("query-ap"), problem["scenes"])
     ours = [found.ap, found.ap50, found.ap25, *found.table[0]]
     np.testing.assert_allclose(ours, np.array(problem["answer"], float), rtol=0, atol=2.3e-16)

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_segments import our_qualities
 from painted_runs import see_painted
 from places import CASES, ROOT
 from scored_room import ID, room, truth_as_prediction
+from synthetic_segments import our_qualities
 
-from su3d_bench.analysis.rules_walk import Walker
+from su3d_bench.analysis.rule_attribution import RuleStepper
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.scoring import score_on_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine
-from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, visible_truth
 from su3d_bench.runs.finished import read_run
 
 RULES = load_protocol("rooms-panoptic")
@@ -66,14 +66,14 @@ def test_points_that_evaluations_leave_out_are_in_no_predicted_segment_either() 
 
 def test_the_truth_that_is_told_has_an_instance_for_each_class_without_one_where_stuff_counts_alone() -> None:
     truth = open_walls()
-    told = told_truth(RULES, truth)
+    told = visible_truth(RULES, truth)
     assert set(told.instance[truth.semantic == ID["wall"]].tolist()) == {truth.instance.max() + 1}
     is_other = truth.semantic != ID["wall"]
     assert told.instance[is_other].tolist() == truth.instance[is_other].tolist()
-    assert told_truth(load_protocol("rooms-instance"), truth) is truth
+    assert visible_truth(load_protocol("rooms-instance"), truth) is truth
     assert (
-        told_truth(RULES, room()) is not None
-        and told_truth(RULES, room()).instance.tolist() == room().instance.tolist()
+        visible_truth(RULES, room()) is not None
+        and visible_truth(RULES, room()).instance.tolist() == room().instance.tolist()
     )
 
 
@@ -104,5 +104,5 @@ def test_a_run_of_the_truth_has_its_stuff_where_stuff_counts_and_nowhere_else(
         assert of_run["open"][protocol].metrics["PQ stuff"] == 1.0
     n_predictions = {key: list(one.n_predictions.values()) for key, one in of_run["open"].items()}
     assert n_predictions == {"rooms-panoptic": [4], "replica-panoptic": [4], "rooms-instance": [3]}
-    walk = Walker.of(load_protocol("rooms-panoptic"), load_protocol("replica-panoptic"), "open:oracle").walk()
+    walk = RuleStepper.of(load_protocol("rooms-panoptic"), load_protocol("replica-panoptic"), "open:oracle").walk()
     assert walk.start["PQ stuff"] == walk.end["PQ stuff"] == 1.0

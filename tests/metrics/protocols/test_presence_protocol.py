@@ -18,7 +18,7 @@ from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Arra
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
-from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
+from su3d_bench.metrics.questions.score import PresenceQuery, PresenceTruth
 from su3d_bench.metrics.scoring import metric_of, plain_json, score_scene
 from su3d_bench.questions.generated import absent_names, counted_rooms, drawn, presence_questions
 from su3d_bench.questions.scene_map import is_called, is_room_surface, known_objects, plain_name
@@ -28,10 +28,10 @@ POPE = json.loads((CASES / "presence01_pope.json").read_text())
 TRUTH = room()
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
 ASKED = (
-    AskedThing("chair", "random", is_there=True),
-    AskedThing("bed", "random", is_there=False),
-    AskedThing("lamp", "random", is_there=True),
-    AskedThing("sofa", "random", is_there=False),
+    PresenceQuery("chair", "random", is_there=True),
+    PresenceQuery("bed", "random", is_there=False),
+    PresenceQuery("lamp", "random", is_there=True),
+    PresenceQuery("sofa", "random", is_there=False),
 )
 QUESTIONS = PresenceTruth(TRUTH, ASKED, "made for a test")
 
@@ -110,17 +110,17 @@ class Plane:
         return np.stack([np.cos(degrees), np.sin(degrees)], axis=1).astype(np.float32)
 
 
-@pytest.mark.parametrize(("degrees", "says_yes"), [((19.0, 60.0), True), ((21.0, 60.0), False)])
+@pytest.mark.parametrize(("degrees", "is_yes"), [((19.0, 60.0), True), ((21.0, 60.0), False)])
 def test_yes_needs_an_instance_that_is_nearer_to_the_text_than_to_every_canonical_phrase(
-    degrees: tuple[float, ...], says_yes: bool
+    degrees: tuple[float, ...], is_yes: bool
 ) -> None:
     at = np.radians(degrees)
     features = np.stack([np.cos(at), np.sin(at)], axis=1).astype(np.float32)
     masks = [np.arange(10), np.arange(10, 20)]
-    asked = PresenceTruth(TRUTH, (AskedThing("one", "popular", is_there=True),), "")
+    asked = PresenceTruth(TRUTH, (PresenceQuery("one", "popular", is_there=True),), "")
     counts = score_scene(RULES, asked, instances(TRUTH.points, masks, None, features), Plane()).counts
     assert isinstance(counts, PresenceCounts)
-    assert counts.says_yes.tolist() == [says_yes]
+    assert counts.is_yes.tolist() == [is_yes]
     assert counts.similarity[0] == pytest.approx(np.cos(at[0]), abs=1e-6)
     assert counts.sampling.tolist() == [1]
 

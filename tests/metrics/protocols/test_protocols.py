@@ -14,15 +14,15 @@ from scored_room import instances
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.metrics.fitness import (
+from su3d_bench.metrics.compatibility import (
     ContentFacts,
     Form,
     TruthFacts,
+    class_id_incompatibility,
+    content_incompatibility,
     list_of_ids,
     n_feature_dimensions,
-    why_not_content,
-    why_not_numbers,
-    why_not_truth,
+    truth_incompatibility,
 )
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
@@ -157,7 +157,7 @@ def test_a_single_name_or_class_is_enough_to_be_judged_by() -> None:
     rules = load_protocol("scannet-instance")
     for class_ids, reason in (([0, 3], None), ([0, 0], "needs classes, every mask has class 0")):
         content = ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array(class_ids))
-        assert why_not_content(rules, content) == reason
+        assert content_incompatibility(rules, content) == reason
 
 
 MESH = TruthFacts("truth", "replica", ("mesh-vertices",))
@@ -176,27 +176,27 @@ TRUTHS = [
 
 @pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
 def test_a_truth_that_lacks_what_a_protocol_scores_is_told(name: str, truth: TruthFacts, reason: str | None) -> None:
-    said = why_not_truth(load_protocol(name), truth)
+    said = truth_incompatibility(load_protocol(name), truth)
     assert said == reason if reason is None else str(said).startswith(reason)
 
 
 def test_questions_of_a_dataset_itself_need_one_that_knows_them() -> None:
     rules = load_protocol("rooms-retrieval").model_copy(update={"questions": "dataset"})
-    assert "knows questions and answers itself, which truth does not" in str(why_not_truth(rules, MESH))
-    assert why_not_truth(rules, replace(MESH, knows_questions=True)) is None
+    assert "knows questions and answers itself, which truth does not" in str(truth_incompatibility(rules, MESH))
+    assert truth_incompatibility(rules, replace(MESH, knows_questions=True)) is None
 
 
 def test_class_ids_up_to_forty_are_of_nyu_and_larger_ones_of_scannet200() -> None:
     assert [list_of_ids(one) for one in (1, 40, 41)] == ["nyu40-vertices"] * 2 + ["scannet200-vertices"]
     facts = {one: ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array([3, one])) for one in (40, 41)}
     twenty, two_hundred = load_protocol("scannet-instance"), load_protocol("scannet200-instance")
-    assert [why_not_numbers(twenty, facts[one]) is None for one in (40, 41)] == [True, False]
-    assert [why_not_numbers(two_hundred, facts[one]) is None for one in (40, 41)] == [False, True]
-    assert "go up to 41, as ids of ScanNet200 do" in str(why_not_numbers(twenty, facts[41]))
-    assert why_not_numbers(load_protocol("rooms-instance"), facts[41]) is None
-    assert why_not_numbers(load_protocol("class-agnostic-segment3d"), facts[41]) is None
+    assert [class_id_incompatibility(twenty, facts[one]) is None for one in (40, 41)] == [True, False]
+    assert [class_id_incompatibility(two_hundred, facts[one]) is None for one in (40, 41)] == [False, True]
+    assert "go up to 41, as ids of ScanNet200 do" in str(class_id_incompatibility(twenty, facts[41]))
+    assert class_id_incompatibility(load_protocol("rooms-instance"), facts[41]) is None
+    assert class_id_incompatibility(load_protocol("class-agnostic-segment3d"), facts[41]) is None
     for without in (None, np.zeros(0, np.int64)):
-        assert why_not_numbers(two_hundred, replace(facts[40], class_ids=without)) is None
+        assert class_id_incompatibility(two_hundred, replace(facts[40], class_ids=without)) is None
 
 
 @pytest.mark.parametrize(

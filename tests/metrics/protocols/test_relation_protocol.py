@@ -162,7 +162,7 @@ def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Pat
     assert truth.instance.tolist() == [1, 1, 6, 6] and truth.semantic.tolist() == [chair, chair, table, table]
     assert truth.graph == TrueGraph({1: chair, 6: table, 8: chair}, ((1, "near", 6), (6, "with", 8)))
     oracle = Oracle(Oracle.Config())
-    oracle.receive_truth(truth)
+    oracle.receive_ground_truth(truth)
     found = values(truth, oracle.finish(), REPLICA)
     # the sofa has no face: nobody can find it, nor what it stands with
     assert [found[name] for name in REPLICA.headline] == [2 / 3, 1 / 2, 1 / 2]

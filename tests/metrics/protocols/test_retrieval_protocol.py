@@ -15,15 +15,15 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
-from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
+from su3d_bench.metrics.compatibility import content_incompatibility, kind_incompatibility
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, rules_file
 from su3d_bench.metrics.questions.score import (
-    AskedText,
-    GivenAnswer,
     ReasoningTruth,
     RetrievalTruth,
     ShareCounts,
+    SolverAnswer,
+    TextTarget,
     TrueAnswer,
     are_objects_right,
     first_instances,
@@ -31,9 +31,9 @@ from su3d_bench.metrics.questions.score import (
 )
 from su3d_bench.metrics.scoring import combine, metric_of, plain_json, score_scene
 from su3d_bench.predictions.base import vertex_masks
-from su3d_bench.questions import truths
-from su3d_bench.questions.sight import Sight
-from su3d_bench.questions.truths import question_truth
+from su3d_bench.questions import ground_truths
+from su3d_bench.questions.appearance import Sight
+from su3d_bench.questions.ground_truths import question_truth
 from su3d_bench.runs.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
@@ -41,12 +41,12 @@ REASONING = load_protocol("rooms-reasoning")
 TRUTH = room()
 # Objects 1..8 are NAMES in order: 2 and 3 are chairs, 4 the table, 5 the lamp.
 ASKED = (
-    AskedText("instance", "chair", (2, 3)),
-    AskedText("instance", "lamp", (5,)),
-    AskedText("affordance", "lamp to read by", (5,)),
-    AskedText("property", "red table", (8,)),
-    AskedText("relative", "book on table", (7,)),
-    AskedText("relative", "cushion", (6,)),
+    TextTarget("instance", "chair", (2, 3)),
+    TextTarget("instance", "lamp", (5,)),
+    TextTarget("affordance", "lamp to read by", (5,)),
+    TextTarget("property", "red table", (8,)),
+    TextTarget("relative", "book on table", (7,)),
+    TextTarget("relative", "cushion", (6,)),
 )
 QUESTIONS = RetrievalTruth(TRUTH, ASKED)
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
@@ -62,7 +62,7 @@ def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, f
 def all_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every object of the truth is plain to see, in no colour."""
     seen = {int(instance): Sight(1.0, "") for instance in np.unique(TRUTH.instance)}
-    monkeypatch.setattr(truths, "sights", lambda dataset, scene, truth, min_vertices: seen)
+    monkeypatch.setattr(ground_truths, "sights", lambda dataset, scene, truth, min_vertices: seen)
 
 
 def test_the_instance_ranked_first_is_right_where_it_stands_for_an_answer() -> None:
@@ -106,8 +106,8 @@ def test_a_partition_is_scored_as_its_instances_are() -> None:
 
 
 def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -> None:
-    asked = (AskedText("instance", "chair", (2, 3), 0.25, 0.5), AskedText("instance", "lamp", (5,), 0.125, 1.0))
-    found = values(PERFECT, RetrievalTruth(TRUTH, (*asked, AskedText("property", "red table", (4,), 0.5, 0.25))))
+    asked = (TextTarget("instance", "chair", (2, 3), 0.25, 0.5), TextTarget("instance", "lamp", (5,), 0.125, 1.0))
+    found = values(PERFECT, RetrievalTruth(TRUTH, (*asked, TextTarget("property", "red table", (4,), 0.5, 0.25))))
     assert (found["chance_instance"], found["names-alone_instance"]) == (0.1875, 0.75)
     assert (found["chance_property"], found["names-alone_property"]) == (0.5, 0.25)
     assert (found["chance_all"], found["chance_relative"]) == (0.875 / 3, None)
@@ -115,7 +115,9 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
 
 def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
     kinds = (("property by name", 4), ("relative by name", 4), ("relative by name", 8))  # "red table" finds the table
-    found = values(PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(AskedText(kind, "red table", (i,)) for kind, i in kinds))))
+    found = values(
+        PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(TextTarget(kind, "red table", (i,)) for kind, i in kinds)))
+    )
     assert (found["by name"], found["n_by name"]) == (2 / 3, 3)
     assert (found["all"], found["n_all"]) == (4 / 6, 6)
 
@@ -132,7 +134,7 @@ def test_scenes_pool_by_their_questions() -> None:
 
 def test_a_map_without_features_is_told_why() -> None:
     labelled = truth_as_prediction(TRUTH, with_labels=True)
-    assert "needs features" in str(why_not_scorable(RULES, labelled))
+    assert "needs features" in str(kind_incompatibility(RULES, labelled))
     with pytest.raises(PredictionError, match="needs features"):
         score_scene(RULES, QUESTIONS, labelled, ENCODER)
 
@@ -176,16 +178,16 @@ def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_
 )  # fmt: skip
 def test_an_answer_is_right_within_the_rules(value: float, given: float | None, is_right: bool) -> None:
     assert REASONING.answers is not None
-    true, told = TrueAnswer("?", "count", value, ()), GivenAnswer(given, np.zeros(0, np.int64), True)
+    true, told = TrueAnswer("?", "count", value, ()), SolverAnswer(given, np.zeros(0, np.int64), True)
     assert is_answer_right(REASONING.answers, true, told, np.zeros(0, np.int64)) is is_right
-    assert not is_answer_right(REASONING.answers, true, replace(told, is_settled=False), np.zeros(0, np.int64))
+    assert not is_answer_right(REASONING.answers, true, replace(told, is_decided=False), np.zeros(0, np.int64))
 
 
 def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
     main_object = np.array([4, 4, 9])
     true = TrueAnswer("which?", "nearest", None, (4,))
     for rows, is_right in (([0], True), ([0, 1], True), ([0, 2], False), ([], False)):
-        assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
+        assert are_objects_right(true, SolverAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
 
 
 def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:
@@ -250,4 +252,4 @@ def test_predictions_from_elsewhere_are_scored_as_a_run_is(all_is_seen: None) ->
     assert isinstance(score.counts, ShareCounts)
     assert outcome.score.counts.n_right.tolist() == score.counts.n_right.tolist()
     masks = vertex_masks("none", [], None)
-    assert "needs a map with points of its own" in str(why_not_content(rules, facts_of(masks)))
+    assert "needs a map with points of its own" in str(content_incompatibility(rules, facts_of(masks)))

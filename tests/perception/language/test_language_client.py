@@ -113,7 +113,7 @@ def test_permanent_failure_is_stored_and_retried_only_on_request(server: ChatSer
     server.answer = lambda body: Answered("up again")
     assert client(server, tmp_path).ask(ask("x")) == failed
     assert server.n_asked == 2
-    again = ChatClient(quick_config(server), ReplyStore(tmp_path), ask_failed_again=True)
+    again = ChatClient(quick_config(server), ReplyStore(tmp_path), retry_failed=True)
     assert [reply.text for reply in again.ask_all([ask("x"), ask("x")])] == ["up again"] * 2
     assert server.n_asked == 3
 

@@ -73,8 +73,8 @@ def test_texts_are_cleaned_and_parted_as_open_clip_does(text: str, cleaned: str,
 
 
 def test_texts_in_a_broken_encoding_stay_broken() -> None:
-    for text, mended in CASES["broken"]:
-        assert plain_text(text) == text.lower() != mended
+    for text, corrected in CASES["broken"]:
+        assert plain_text(text) == text.lower() != corrected
 
 
 def test_the_mark_of_a_texts_end_does_not_end_a_text(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import chromium
 import pytest
 from chromium import Chromium
-from looks import DESKTOP
+from page_checks import DESKTOP
 from painted_runs import COLLECTOR, painted_run, run, see_painted
 
 from su3d_bench.cli.main import main

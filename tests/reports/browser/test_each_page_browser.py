@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import needs_chromium
-from looks import CHECKS, complaints, unfold
-from made_sheets import made
+from page_checks import CHECKS, complaints, unfold
 from places import SCENES
 from registry_bundles import painted_bundle
 from runs_page import STRUCK, browser_for_pages, finished_runs, page_of_runs
+from synthetic_sheets import made
 
 from su3d_bench.cli.main import main
+from su3d_bench.human_eval.scores import ReviewItem, review_items_page
+from su3d_bench.human_eval.sets import PAGE, write_sheets
 from su3d_bench.reports.pictures.items import png_bytes
-from su3d_bench.sheets.scores import SecondLook, second_looks_page
-from su3d_bench.sheets.sets import PAGE, write_sheets
 
 LONG = "the chair with a very long name that was given to it by nobody in particular and goes on"
 
@@ -41,18 +41,18 @@ def page_of_annotation(folder: Path) -> Path:
 def page_of_second_looks(folder: Path) -> Path:
     """What ``sheets score`` leaves to look at again."""
     (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
-    look = SecondLook(
+    look = ReviewItem(
         "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.png",),
         {"annotator-1": "right", "annotator-2": "wrong"}, "right", "annotators disagree",
     )  # fmt: skip
-    page = folder / "second_looks.html"
-    page.write_text(second_looks_page([look, replace(look, text="x" * 200)], ".", "sheet-1"), encoding="utf-8")
+    page = folder / "review_items.html"
+    page.write_text(review_items_page([look, replace(look, text="x" * 200)], ".", "sheet-1"), encoding="utf-8")
     return page
 
 
 def page_of_audit(folder: Path) -> Path:
     """``questions audit``."""
-    words = ["query", "audit", "--scenes", f"{SCENES}/painted.py:Painted/a", "--n", "6", "--quiet"]
+    words = ["query", "audit", "--scenes", f"{SCENES}/painted.py:Painted/a", "--n-questions", "6", "--quiet"]
     assert main([*words, "--out", str(folder)]) == 0
     return folder / "index.html"
 
@@ -64,7 +64,7 @@ def site_of_registry(folder: Path) -> Path:
         registry.mkdir()
         painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], said=f"{LONG} {STRUCK}")
         painted_bundle(registry, "bob", [""], scenes="ab")
-        words = ["--out", str(site), "--bundles-at", "https://example.org/bundles", "--quiet"]
+        words = ["--out", str(site), "--bundle-url", "https://example.org/bundles", "--quiet"]
         assert main(["dev", "registry", "build", str(registry), *words]) == 0
     return site
 

@@ -10,7 +10,7 @@ import chromium
 import pytest
 import runs_page
 from chromium import Chromium, needs_chromium
-from looks import WHOLE, complaints
+from page_checks import WHOLE, complaints
 
 pytestmark = needs_chromium
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Chromium, needs_chromium
-from looks import WHOLE
+from page_checks import WHOLE
 from painted import Collector
 from painted_runs import COLLECTOR, painted_page, painted_run
 from runs_page import SELECT, choose
 
-from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
+from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, ErrorView, error_photo
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Frame, SceneInfo
 
@@ -122,8 +122,8 @@ def on_wall(low: float, high: float, spacing: float, depth: float = 2.0) -> Any:
 
 def test_a_photo_shows_the_prediction_as_an_area_and_the_truth_as_a_line() -> None:
     frame, small = plane_seen(), on_wall(-0.3, 0.3, 0.02)
-    area = error_photo(frame, SeenError((small,), ()))
-    line = error_photo(frame, SeenError((), (small,)))
+    area = error_photo(frame, ErrorView((small,), ()))
+    line = error_photo(frame, ErrorView((), (small,)))
     assert area is not None
     assert line is not None
     middle = PHOTO[1] // 2, PHOTO[0] // 2

@@ -20,8 +20,8 @@ import numpy as np
 from su3d_bench.core.errors import DataError, Su3dError
 
 N_DAMAGES = int(os.environ.get("SU3D_DAMAGES", "400"))  # per file; make proofs uses 2,000
-MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, but no infinite loop passes
-MOST_BYTES = 256 << 20  # of memory, used or only reserved, beyond that before the first read
+MAX_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, but no infinite loop passes
+MAX_BYTES = 256 << 20  # of memory, used or only reserved, beyond that before the first read
 LENGTHS = (1, 1, 2, 4, 8, 64)
 EXTREMES = (0, 0x7F, 0x80, 0xFF)
 
@@ -66,7 +66,7 @@ def outcomes(
     Each rejection must be a one-line ``refusal`` that contains ``must_name``, the name of the file.
     """
     n_read = n_refused = 0
-    with bounded_addresses(MOST_BYTES):
+    with bounded_addresses(MAX_BYTES):
         before = reset_peak()
         for damaged in copies:
             started = time.monotonic()
@@ -76,8 +76,8 @@ def outcomes(
             except refusal as error:
                 assert_fit(error, must_name)
                 n_refused += 1
-            assert time.monotonic() - started < MOST_SECONDS
-            assert peak_bytes() - before < MOST_BYTES
+            assert time.monotonic() - started < MAX_SECONDS
+            assert peak_bytes() - before < MAX_BYTES
     return n_read, n_refused
 
 
@@ -106,10 +106,10 @@ def assert_same(ours: Any, theirs: Any) -> None:
 
 
 @contextmanager
-def bounded_addresses(most_bytes: int) -> Iterator[None]:
-    """At most ``most_bytes`` of address space beyond current use; larger requests raise MemoryError."""
+def bounded_addresses(max_bytes: int) -> Iterator[None]:
+    """At most ``max_bytes`` of address space beyond current use; larger requests raise MemoryError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + most_bytes, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + max_bytes, hard))
     try:
         yield
     finally:

@@ -168,15 +168,15 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConf
     holds_instance, is_instance = scene.ids[near] != NONE, frame.ids != NONE
     comes = is_instance | ~np.isin(new, np.append(held[holds_instance], new[is_instance]))
     if settings.density == "frame":
-        return scene.followed_by(frame.where(comes & ~np.isin(new, held) & one_a_voxel(new, is_instance, 1)))
-    comes &= one_a_voxel(new, is_instance, -1)
+        return scene.followed_by(frame.where(comes & ~np.isin(new, held) & one_per_voxel(new, is_instance, 1)))
+    comes &= one_per_voxel(new, is_instance, -1)
     goes = np.isin(held, new[is_instance]) | (~holds_instance & np.isin(held, new))
     stays = np.ones(len(near), bool)
     stays[np.flatnonzero(near)[goes]] = False
     return scene.where(stays).followed_by(frame.where(comes))
 
 
-def one_a_voxel(voxel: Array, is_instance: Array, step: int) -> Array:
+def one_per_voxel(voxel: Array, is_instance: Array, step: int) -> Array:
     """Whether a point is the first of its voxel, or the last (step -1): of instance points if there are any."""
     in_turn = np.lexsort([step * np.arange(len(voxel)), ~is_instance])
     _, first = np.unique(voxel[in_turn], return_index=True)

@@ -11,7 +11,7 @@ from fuzzing import BadMessage, fault_of_message
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, EXIT_INTERNAL, Su3dError
 
-MOST_LINES = 200  # on stderr: many faults are listed one by one
+MAX_LINES = 200  # on stderr: many faults are listed one by one
 
 
 class Declined(Su3dError):
@@ -33,7 +33,7 @@ def called(words: Sequence[str]) -> None:
             raise BadMessage(f"exit code {code}: {fault}")
     if code in (EXIT_DONE, EXIT_CHECK_FAILED, EXIT_INCOMPLETE):
         return
-    if not lines or len(lines) > MOST_LINES or not lines[-1].startswith("su3d-bench: "):
+    if not lines or len(lines) > MAX_LINES or not lines[-1].startswith("su3d-bench: "):
         raise BadMessage(f"exit code {code} and {len(lines)} lines: {said[-300:]!r}")
     if (fault := fault_of_message(lines[-1].removeprefix("su3d-bench: "))) is not None:
         raise BadMessage(f"exit code {code}: {fault}")

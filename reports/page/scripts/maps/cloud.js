@@ -49,7 +49,7 @@ async function unpackMap(text) {
   return { ...map, outward: outwardOf(map) };
 }
 
-const CELL_M = 0.2, MOST_LAYERS = 30, WALL_SHARE = 0.6, LAYER_SHARE = 0.3, LAYER_M = 0.15;
+const CELL_M = 0.2, MAX_LAYERS = 30, WALL_SHARE = 0.6, LAYER_SHARE = 0.3, LAYER_M = 0.15;
 const SURFACES = ['wall', 'ceiling', 'floor'];
 
 // Of each point three bytes: where the outside is of the wall, ceiling or floor that it is part of, else zeros.
@@ -60,7 +60,7 @@ function outwardOf(map) {
   if (!map.n) return outward;
   const at = (k, axis) => map.positions[3 * k + axis] * map.step;
   const named = surfacesNamed(map), cell = Math.max(CELL_M, 2.5 * map.spacing);
-  const [lowZ, highZ] = spanOf(map, 2), layer = Math.max(cell, (highZ - lowZ) / MOST_LAYERS);
+  const [lowZ, highZ] = spanOf(map, 2), layer = Math.max(cell, (highZ - lowZ) / MAX_LAYERS);
   const wide = Math.ceil((map.high[0] - map.low[0]) / cell) + 1;
   const columnOf = new Int32Array(map.n), columns = new Map();
   const middle = [0, 0];
@@ -73,7 +73,7 @@ function outwardOf(map) {
       columns.set(key, one);
     }
     const z = at(k, 2);
-    if (z >= lowZ && z <= highZ) one.layers |= 1 << Math.min(MOST_LAYERS - 1, Math.floor((z - lowZ) / layer));
+    if (z >= lowZ && z <= highZ) one.layers |= 1 << Math.min(MAX_LAYERS - 1, Math.floor((z - lowZ) / layer));
     one.isTop = one.isTop || z > highZ - LAYER_M;
     one.isBottom = one.isBottom || z < lowZ + LAYER_M;
     one.hasWall = one.hasWall || named[k] === 1;
@@ -86,7 +86,7 @@ function outwardOf(map) {
     middle[0] += one.x / all.length;
     middle[1] += one.y / all.length;
   }
-  const nLayers = Math.max(1, Math.min(MOST_LAYERS, Math.ceil((highZ - lowZ) / layer)));
+  const nLayers = Math.max(1, Math.min(MAX_LAYERS, Math.ceil((highZ - lowZ) / layer)));
   const filled = (one) => { let n = 0; for (let bits = one.layers; bits; bits &= bits - 1) n++; return n / nLayers; };
   const isHigh = highZ - lowZ > 4 * cell;
   const walls = new Map(all.filter((one) => one.hasWall || (isHigh && filled(one) >= WALL_SHARE))

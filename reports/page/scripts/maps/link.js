@@ -1,6 +1,6 @@
 // What the view of the maps shows as the end of the page's address, and back. Nothing in an address is believed.
 
-const LINK = '#maps?', MOST_LINK = 2000, MOST_FRAME = 1e9, MOST_OBJECT = 2 ** 31;
+const LINK = '#maps?', MAX_LINK = 2000, MAX_FRAME = 1e9, MAX_OBJECT = 2 ** 31;
 const mapKey = (one) => (RUNS.length > 1 ? `${one.run + 1}:${one.method}` : one.method);
 const mapIndex = (scene, key) => DATA.maps.findIndex((one) => one.scene === scene && mapKey(one) === key);
 
@@ -26,7 +26,7 @@ function linkText(state, eye) {
 }
 // What an address asks for, of what there is; null where it asks for no map of this page.
 function readLink(hash) {
-  if (!hash.startsWith(LINK) || hash.length > MOST_LINK) return null;
+  if (!hash.startsWith(LINK) || hash.length > MAX_LINK) return null;
   const said = new URLSearchParams(hash.slice(LINK.length)), text = (name) => said.get(name) || '';
   const isWhole = (name) => /^\d{1,10}$/.test(text(name));
   const whole = (name, most) => (isWhole(name) && Number(text(name)) <= most ? Number(text(name)) : null);
@@ -37,8 +37,8 @@ function readLink(hash) {
   const beside = text('beside') === 'truth' ? 'truth' : other >= 0 ? String(other) : '';
   const colour = COLOURINGS.some(([kind]) => kind === text('colour')) ? text('colour') : null;
   return { scene, index, beside, colour, text: whole('text', 1000), cut: whole('cut', 100),
-    frame: whole('frame', MOST_FRAME), missed: yes('missed'), walls: yes('walls'), instance: whole('instance', 0xffff),
-    object: whole('object', MOST_OBJECT), camera: cameraOf(text('camera')) };
+    frame: whole('frame', MAX_FRAME), missed: yes('missed'), walls: yes('walls'), instance: whole('instance', 0xffff),
+    object: whole('object', MAX_OBJECT), camera: cameraOf(text('camera')) };
 }
 // The address of what a single error is about: its instance, and the object of the truth beside; null without a map.
 function linkToError(one) {

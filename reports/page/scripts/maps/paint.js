@@ -14,7 +14,7 @@ const ERRORS = [
 const JUDGED = [
   ['missed', [219, 41, 140]], ['not missed', [59, 140, 226]], ['not evaluated', [176, 180, 186]],
 ];
-const MOST_ENTRIES = 300; // of a legend
+const MAX_ENTRIES = 300; // of a legend
 const NEAR_NONE = 0xffff, NOT_SCORED = 0xfffe;
 
 function distinct(k) {
@@ -77,7 +77,7 @@ function painted(map, kind, query, judged) {
     return PALE[of ? of.name : one.name] || distinct(of ? of.place : nObjects + own);
   }
   const named = () => map.instances.map((one, own) => [colourOfInstance(own), titleOf(map, one), own, one.points])
-    .sort((a, b) => b[3] - a[3]).slice(0, MOST_ENTRIES);
+    .sort((a, b) => b[3] - a[3]).slice(0, MAX_ENTRIES);
   const nJudged = (e) => map.instances.filter((_, own) => judgedAt(judged, own) === e).length;
   const warmth = (own) => heat(high > low ? (values[own] - low) / (high - low) : 0.5);
   const paintOf = {

@@ -4,7 +4,7 @@ const CLICK_ONE = 'Click an instance in the view or in the list to see its name,
 const GROWN = 'Each instance of the final map appears, complete, from the first frame in which it is seen; instances that '
   + 'were merged or removed earlier are not shown.';
 const NO_POINTS = 'This map has no points.', DAMAGED = 'This map is damaged; build the page again.';
-const MOST_READ = 6; // maps that are kept unpacked
+const MAX_READ = 6; // maps that are kept unpacked
 // The maps follow the script, so that the page appears before they are loaded.
 const isWhole = new Promise((done) => {
   if (document.readyState === 'loading') document.addEventListener('DOMContentLoaded', () => done(), { once: true });
@@ -99,7 +99,7 @@ function mapsContent(section) {
   // A map or truth, unpacked once; null where it is damaged.
   function unpacked(key, text) {
     if (!read.has(key)) read.set(key, unpackMap(text).catch(() => null));
-    if (read.size > MOST_READ) read.delete(read.keys().next().value);
+    if (read.size > MAX_READ) read.delete(read.keys().next().value);
     return read.get(key);
   }
   const mapAt = (index) => unpacked(index, byId(`map-${index}`).textContent);

@@ -21,7 +21,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions, UInt8Array
-from su3d_bench.perception.cache import CropsOnDemand, OfLastFrame, content_key, mask_boxes
+from su3d_bench.perception.cache import CropsOnDemand, LastFrameCache, content_key, mask_boxes
 from su3d_bench.perception.embedded.lexicon import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
@@ -34,7 +34,7 @@ from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
 # Of its tensors: made by the network itself from its window size; the authors' loader drops them too.
-MADE_BY_ITSELF = ("relative_position_index", "attn_mask")
+RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
 WORDS_CAVEAT = "tags: RAM++ is not installed; using the most probable words of a list by the encoder instead"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
@@ -221,13 +221,13 @@ def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
     named = {
         name.replace("vision_multi", "tagging_head"): tensor
         for name, tensor in tensors.items()
-        if not any(part in name for part in MADE_BY_ITSELF)
+        if not any(part in name for part in RECOMPUTED_BUFFERS)
     }
     try:
         missing = model.load_state_dict(named, strict=False).missing_keys
     except RuntimeError as error:
         raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); {advice}") from error
-    if missing := [name for name in missing if not any(part in name for part in MADE_BY_ITSELF)]:
+    if missing := [name for name in missing if not any(part in name for part in RECOMPUTED_BUFFERS)]:
         raise DataError(f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; {advice}")
 
 
@@ -324,7 +324,7 @@ class SamRegions(CropsOnDemand):
     def __init__(self, networks: Networks, encoder: Encoder) -> None:
         super().__init__(encoder)
         self._networks = networks
-        self._seen = OfLastFrame(lambda frame: networks.load_sam().look(frame.rgb))
+        self._seen = LastFrameCache(lambda frame: networks.load_sam().look(frame.rgb))
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
         """SAM's single mask (H, W) of what all ``points`` lie on and its predicted IoU; empty and 0 for no points."""

@@ -1,0 +1,359 @@
+"""What comes of a run, an evaluation or a comparison, as tables of pandas and as what a terminal or notebook shows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.api import frames
+from su3d_bench.core.errors import ConfigError, counted, printable, some
+from su3d_bench.core.safe_output import terminal_width
+
+if TYPE_CHECKING:
+    import pandas
+
+    from su3d_bench.core.maps import Prediction
+    from su3d_bench.formats.tables.table import Prose, Table
+    from su3d_bench.runs.finished import FinishedRun
+    from su3d_bench.store.records import MetricsRecord
+
+MAX_NAMED = 4  # methods and protocols in one line
+Place = str | Path
+Names = str | Sequence[str]
+
+
+def several(names: Names) -> tuple[str, ...]:
+    """One name or several, as several."""
+    return (names,) if isinstance(names, str) else tuple(map(str, names))
+
+
+class Printable(ABC):
+    """What prints as tables, in a terminal by ``print`` and in a notebook by itself; a line where it stands in code."""
+
+    @abstractmethod
+    def _line(self) -> str: ...
+
+    @abstractmethod
+    def _parts(self) -> Sequence[Table | Prose]: ...
+
+    def __repr__(self) -> str:
+        return f"<{printable(self._line())}>"
+
+    def __str__(self) -> str:
+        from su3d_bench.reports.tables.formats import plain
+
+        return plain(self._parts(), terminal_width()).rstrip("\n")
+
+    def _repr_html_(self) -> str:
+        from su3d_bench.reports.tables.formats import html_tables, safe
+
+        return f"<p><b>{safe(self._line())}</b></p>\n{html_tables(self._parts())}"
+
+
+class Scores(Printable):
+    """The numbers of methods under protocols, as ``evaluate`` forms them; those of a folder are a ``Run``.
+
+    All values are fractions in full precision, ``n_...`` are numbers of things, NaN stands where a value is undefined.
+    ``remarks`` are lines that must be known beside the numbers: formats, scenes that are missing, partial runs.
+
+    >>> import su3d_bench as su3d
+    >>> scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
+    >>> float(scores.metrics.set_index("metric")["value"]["AP50"])
+    0.5
+    >>> scores
+    <Scores: predictions under scannet-instance>
+    """
+
+    def __init__(self, metrics: MetricsRecord, remarks: Sequence[str] = ()) -> None:
+        self._record = metrics
+        self.remarks = tuple(printable(line) for line in remarks)
+
+    @property
+    def metrics(self) -> pandas.DataFrame:
+        """Every value over all scenes, a row a method, protocol and metric: what ``metrics.json`` holds, to the bit.
+
+        Columns: ``method``, ``protocol`` and ``metric`` (string); ``is_headline`` (bool), whether tables show it;
+        ``value``, ``low`` and ``high`` of its 95 % interval over scenes, ``ceiling``, what the truth itself scores
+        (float64, NaN for none); ``n_scenes`` (int64).
+
+        >>> import su3d_bench as su3d
+        >>> metrics = su3d.load_run("runs/demo").metrics
+        >>> metrics.query("is_headline and method == 'oracle'")["value"].unique().tolist()
+        [1.0]
+        """
+        return frames.metrics_frame(self._record)
+
+    @property
+    def scene_metrics(self) -> pandas.DataFrame:
+        """Every value of each scene alone, a row a method, protocol, scene and metric.
+
+        Columns: ``method``, ``protocol``, ``scene``, ``metric`` (string), ``value`` (float64).
+
+        >>> import su3d_bench as su3d
+        >>> su3d.load_run("runs/demo").scene_metrics["scene"].unique().tolist()
+        ['rooms/bathroom7']
+        """
+        return frames.scenes_frame(self._record)
+
+    @property
+    def class_metrics(self) -> pandas.DataFrame:
+        """Every value of each class over all scenes, a row a method, protocol, class and metric.
+
+        Columns: ``method``, ``protocol``, ``class_name``, ``metric`` (string), ``value`` (float64).
+
+        >>> import su3d_bench as su3d
+        >>> classes = su3d.load_run("runs/demo").class_metrics.query("metric == 'AP' and method == 'oracle'")
+        >>> float(classes["value"].min())
+        1.0
+        """
+        return frames.classes_frame(self._record)
+
+    def _line(self) -> str:
+        methods = dict.fromkeys(result.method for result in self._record.results)
+        protocols = dict.fromkeys(result.protocol for result in self._record.results)
+        return f"Scores: {some(list(methods), MAX_NAMED)} under {some(list(protocols), MAX_NAMED)}"
+
+    def _parts(self) -> Sequence[Table | Prose]:
+        from su3d_bench.formats.tables.table import Prose
+        from su3d_bench.reports.tables.run import run_tables
+        from su3d_bench.store.records import plain
+
+        remarks = [Prose(self.remarks, is_list=True)] if self.remarks else []
+        return [*run_tables(plain(self._record)), *remarks]
+
+
+class Run(Scores):
+    """A finished run: a folder that ``run``, or ``evaluate`` with ``out``, wrote; nothing in it is ever changed here.
+
+    ``path`` is the folder, ``scenes``, ``methods`` and ``protocols`` are their names, ``is_complete`` says that no
+    scene failed. ``print(run)`` shows the tables, a notebook shows them by itself.
+
+    >>> import su3d_bench as su3d
+    >>> run = su3d.load_run("runs/demo")
+    >>> run
+    <Run runs/demo: complete, 1 scene, opensu3d, oracle under rooms-semantic, rooms-instance>
+    >>> run.scenes, run.methods, run.is_complete
+    (('rooms/bathroom7',), ('opensu3d', 'oracle'), True)
+    """
+
+    def __init__(self, path: Place, remarks: Sequence[str] = ()) -> None:
+        from su3d_bench.runs.finished import read_run
+        from su3d_bench.store.records import MetricsRecord
+
+        run: FinishedRun = read_run(Path(path))
+        results = tuple(run.results.values())
+        super().__init__(
+            MetricsRecord(is_partial=run.record.is_partial, limit=run.limit, scenes=run.scenes, results=results),
+            list(dict.fromkeys([*_state_of(run), *run.elsewhere_lines(), *run.record.warnings, *remarks])),
+        )
+        self._run = run
+        self.path = run.folder.path
+        self.scenes = run.scenes
+        self.methods = run.methods
+        self.protocols = tuple(run.protocols)
+        self.is_complete = not run.is_incomplete
+
+    @property
+    def updates(self) -> pandas.DataFrame:
+        """What each update took, a row a method, scene and update, with every column of the ``updates.csv``.
+
+        Columns: ``method``, ``scene`` (string), ``update`` (int64), ``frame`` (Int64), then float64: sizes (``n_...``,
+        ``rss_bytes``), milliseconds of each stage (``..._ms``), of the method and in all; NaN where a method has no
+        such column. Methods that look at no frame have no row.
+
+        >>> import su3d_bench as su3d
+        >>> updates = su3d.load_run("runs/demo").updates
+        >>> updates.query("method == 'opensu3d'")[["update", "frame"]].values.tolist()[:2]
+        [[0, 0], [1, 40]]
+        """
+        from su3d_bench.runs.finished import read_update_times
+
+        return frames.updates_frame([one for method in self.methods for one in read_update_times(self._run, method)])
+
+    @property
+    def instances(self) -> pandas.DataFrame:
+        """Every instance, predicted and true, under each protocol of masks or points; ``samples`` with no choice.
+
+        >>> import su3d_bench as su3d
+        >>> instances = su3d.load_run("runs/demo").instances
+        >>> masks = instances.query("protocol == 'rooms-instance'")
+        >>> predicted = masks.query("method == 'oracle' and kind == 'predicted' and is_counted")
+        >>> bool((predicted["best_iou"] == 1).all())
+        True
+        """
+        return frames.samples_frame(self._all_samples)
+
+    @cached_property
+    def _all_samples(self) -> Any:
+        return self._samples()
+
+    def samples(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
+        """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report samples``.
+
+        The ground truth is read again, so the scenes' data must be here (``SU3D_DATA``); else a ``DataError``. A
+        ``ConfigError`` for a name that the run does not have, or where nothing has instances. ``su3d-bench report
+        samples --columns`` says what each column holds; boxes are in metres.
+
+        >>> import su3d_bench as su3d
+        >>> found = su3d.load_run("runs/demo").samples(methods="opensu3d", protocols="rooms-instance")
+        >>> found["kind"].unique().tolist()
+        ['predicted', 'true']
+        """
+        return frames.samples_frame(self._samples(several(methods), several(protocols), several(scenes)))
+
+    def _samples(self, *chosen: tuple[str, ...]) -> Any:
+        from su3d_bench.analysis.samples import Selection, samples
+
+        return samples([self.path], Selection(*chosen)).rows
+
+    @property
+    def errors(self) -> pandas.DataFrame:
+        """What each kind of error costs each method, as ``su3d-bench report attribution`` computes it.
+
+        Columns: ``method``, ``protocol``, ``metric`` (string); ``value`` (float64), that of the run; ``part`` (string):
+        ``error``, ``overlap``, ``rest`` or ``stage``; ``kind`` (string) of the error or the stage; ``n`` (Int64), how
+        many of it; ``gain`` (float64), by how much the value rises when it alone is corrected. Of each metric the value
+        and the gains but those of stages add up to 1. Protocols of kind ``instance`` and ``semantic`` alone are
+        explained, and the scenes' data must be here, else a ``DataError``.
+
+        >>> import su3d_bench as su3d
+        >>> errors = su3d.load_run("runs/demo").errors.query("method == 'opensu3d' and metric == 'AP'")
+        >>> gains = errors.query("part != 'stage'")["gain"].sum()
+        >>> round(float(errors["value"].iloc[0] + gains), 12)
+        1.0
+        """
+        return frames.errors_frame(self._attributions)
+
+    @cached_property
+    def _attributions(self) -> Any:
+        from su3d_bench.analysis.attribution import attribute
+        from su3d_bench.metrics.attribution.arrays import EXPLAINED
+
+        wanted = {
+            method: [
+                name
+                for (whose, name), result in self._run.results.items()
+                if whose == method and result.kind in EXPLAINED and result.result is not None
+            ]
+            for method in self.methods
+        }
+        return [attribute(self.path, method=method, protocols=names) for method, names in wanted.items() if names]
+
+    def prediction(self, scene: str, method: str | None = None) -> Prediction:
+        """The map of a scene, of the run's only method where none is named: ``Instances``, ``Partition`` or
+        ``DenseFeatures``, points in metres.
+
+        A ``StoreError`` where the run has no such map, a ``ConfigError`` where a method must be named.
+
+        >>> import su3d_bench as su3d
+        >>> prediction = su3d.load_run("runs/demo").prediction("rooms/bathroom7", "oracle")
+        >>> prediction.points.shape[1], len(prediction) == len(prediction.labels)
+        (3, True)
+        """
+        from su3d_bench.runs.finished import map_of_scene
+
+        if method is None and len(self.methods) > 1:
+            raise ConfigError(f"{self._run.name}: holds {', '.join(self.methods)}; name one of them")
+        return map_of_scene(scene, method or self.methods[0], self.path)[2]
+
+    def compare(
+        self,
+        other: Run | Place,
+        *,
+        method: str | None = None,
+        other_method: str | None = None,
+        protocols: Names = (),
+        per_class: bool = False,
+    ) -> Comparison:
+        """What ``other`` changes over this run, as ``su3d-bench compare`` tells it: differences are other - this.
+
+        Methods of one name are compared, or ``method`` with ``other_method`` (default: the same). A ``ConfigError``
+        where the two cannot be compared, naming the first thing that differs.
+
+        >>> import su3d_bench as su3d
+        >>> run = su3d.load_run("runs/demo")
+        >>> compared = run.compare(run, method="opensu3d", other_method="oracle", protocols="rooms-instance")
+        >>> compared.differences["metric"].tolist(), bool((compared.differences["difference"] > 0).all())
+        (['AP', 'AP50', 'AP25'], True)
+        """
+        from su3d_bench.analysis.comparison import compare
+
+        place = other.path if isinstance(other, Run) else Path(other)
+        sides = [
+            str(folder) if name is None else f"{folder}:{name}"
+            for folder, name in ((self.path, method), (place, other_method or method))
+        ]
+        return Comparison(compare(*sides, protocols=several(protocols), per_class=per_class).to_json())
+
+    def _line(self) -> str:
+        state = "complete" if self.is_complete else self._run.record.status
+        partial = ", PARTIAL" if self._run.record.is_partial else ""
+        what = f"{some(self.methods, MAX_NAMED)} under {some(self.protocols, MAX_NAMED) or 'no protocol'}"
+        return f"Run {self._run.name}: {state}{partial}, {counted(len(self.scenes), 'scene')}, {what}"
+
+
+class Comparison(Printable):
+    """Two runs side by side, as ``Run.compare`` gives them; ``remarks`` must be known beside the differences.
+
+    >>> import su3d_bench as su3d
+    >>> run = su3d.load_run("runs/demo")
+    >>> run.compare(run, method="opensu3d", other_method="oracle")
+    <Comparison: runs/demo and runs/demo: opensu3d and oracle>
+    """
+
+    def __init__(self, comparison: dict[str, Any]) -> None:
+        self._comparison = comparison
+        own = [line for protocol in comparison["protocols"] for line in protocol["remarks"]]
+        self.remarks = tuple(printable(line) for line in dict.fromkeys([*comparison["remarks"], *own]))
+
+    @property
+    def differences(self) -> pandas.DataFrame:
+        """A row a protocol and metric, and a row a class where ``per_class`` asked for them.
+
+        Columns: ``protocol``, ``left``, ``right``, the methods, ``class_name``, empty for all classes, ``metric``
+        (string); ``value_left``, ``value_right``, ``difference``, right - left, ``low`` and ``high`` of its 95 %
+        interval, ``p`` of the exact test over scenes, ``p_of_all`` corrected for all that are compared (float64, NaN
+        for none); ``n_scenes`` in common (int64).
+
+        >>> import su3d_bench as su3d
+        >>> run = su3d.load_run("runs/demo")
+        >>> run.compare(run, method="opensu3d", other_method="oracle").differences.columns[:3].tolist()
+        ['protocol', 'left', 'right']
+        """
+        return frames.differences_frame(self._comparison)
+
+    def _line(self) -> str:
+        pairs = dict.fromkeys(f"{one['left']} and {one['right']}" for one in self._comparison["protocols"])
+        return f"Comparison: {self._comparison['left']} and {self._comparison['right']}: {some(list(pairs), MAX_NAMED)}"
+
+    def _parts(self) -> Sequence[Table | Prose]:
+        from su3d_bench.reports.tables.comparison import comparison_tables
+
+        return comparison_tables(self._comparison)
+
+
+def _state_of(run: FinishedRun) -> list[str]:
+    lines = []
+    if run.record.is_partial:
+        lines.append(f"PARTIAL: only the first {counted(run.limit, 'frame')} of each scene")
+    if run.is_incomplete:
+        lines.append("INCOMPLETE: scenes that failed are not in these numbers")
+    return lines
+
+
+def load_run(path: Place) -> Run:
+    """The finished run in the folder ``path``; nothing in it is changed.
+
+    A ``StoreError`` where it holds none, or one that is not finished.
+
+    >>> import su3d_bench as su3d
+    >>> su3d.load_run("runs/demo").protocols
+    ('rooms-semantic', 'rooms-instance')
+    >>> su3d.load_run("runs/none")
+    Traceback (most recent call last):
+    su3d_bench.core.errors.StoreError: runs/none: holds no run.json; name the folder of a run, such as runs/my-run
+    """
+    return Run(path)

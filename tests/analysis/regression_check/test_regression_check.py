@@ -1,0 +1,245 @@
+"""The gate: planted regressions are caught, unchanged repeats pass."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from painted_runs import painted_run
+from reference_runs import (
+    counted_otherwise,
+    edit,
+    in_record,
+    lowered,
+    results_in,
+    slower,
+    timed,
+    without_calibration,
+)
+
+from su3d_bench.analysis.regression_check import HIGHER_IS_BETTER, Reference, Value, check, compared, learn
+from su3d_bench.cli.main import main
+from su3d_bench.reports.regression_check import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
+from su3d_bench.runs.finished import read_run
+
+
+@pytest.fixture(scope="module")
+def gated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return timed(painted_run(tmp_path_factory.mktemp("gate") / "run"))
+
+
+@pytest.fixture(scope="module")
+def reference(gated: Path) -> Reference:
+    return learn([read_run(gated)])
+
+
+@pytest.fixture(scope="module")
+def reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The reference as the command writes it."""
+    path = tmp_path_factory.mktemp("gate") / "reference.json"
+    assert main(["check", "--build-from", str(gated), "--out", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def run(gated: Path, tmp_path: Path) -> Path:
+    """A copy that may be spoiled."""
+    return Path(shutil.copytree(gated, tmp_path / "run"))
+
+
+def counts_alone(run: Path) -> None:
+    """Other counts than those from which the metrics were formed."""
+    text = (run / "metrics.json").read_text()
+    counted_otherwise(run)
+    (run / "metrics.json").write_text(text)
+
+
+def other_option(run: Path) -> None:
+    text = (run / "run.toml").read_text()
+    (run / "run.toml").write_text(text.replace("n_frames = 6", "n_frames = 5", 1))
+
+
+PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "a metric off by the last bit": (lowered("metrics", "F-mIoU", by=1e-15), "F-mIoU: is worse"),
+    "a class worse": (lowered("per_class", "chair", "IoU"), "class chair / IoU: is worse"),
+    "a scene missing in the run": (in_record(lambda r: r["scenes"].remove("painted/b")), "painted/b: the run does not"),
+    "another protocol version": (
+        in_record(lambda r: r["protocols"][0].update(version=9)),
+        "rooms-semantic: protocol version was",
+    ),
+    "other data": (in_record(lambda r: r["data_digests"].update({"painted/a": "x"})), "painted/a: data digest was"),
+    "another option of the dataset": (other_option, "dataset.painted.n_frames was 6, now 5"),
+    "an update slower by half": (slower(1.5), "cost of the updates after 3: costs 1.50 times"),
+    "an update that nobody timed": (without_calibration, "collector / cost: the run did not measure it"),
+    "a map that is gone": (
+        lambda run: (run / "scenes/painted.a/collector/prediction.npz").unlink(),
+        "collector / scene painted/a: prediction.npz is missing",
+    ),
+    "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
+    "a scene more": (
+        in_record(lambda r: r["scenes"].append("painted/c")),
+        "run / scene painted/c: the reference does not have this scene",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_regression_is_caught(
+    name: str, run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant, said = PLANTED[name]
+    plant(run)
+    assert main(["check", str(run), "--against", str(reference_file)]) == 1
+    assert said in capsys.readouterr().out
+
+
+def test_what_no_run_can_have_written_is_refused(
+    run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = (run / "run.json").read_text()
+    edit(run / "run.json", lambda r: r["protocols"].append(r["protocols"][0] | {"digest": "f" * 64}))
+    for said in ("run.json: names the protocol 'rooms-semantic' twice", "collector / rooms-semantic' twice"):
+        assert main(["check", str(run), "--against", str(reference_file)]) == 2
+        error = capsys.readouterr().err
+        assert said in error and error.count("\n") == 1
+        assert main(["check", "--build-from", str(run), "--out", str(run / "r.json")]) == 2
+        capsys.readouterr()
+        (run / "run.json").write_text(record)
+        edit(run / "metrics.json", lambda m: m["results"].append(m["results"][0]))
+
+
+def test_unchanged_repeats_pass(run: Path, reference_file: Path) -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(10):
+        # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
+        noise = np.exp(generator.normal(0, 0.05, 8))
+        timed(run, (40 * noise[:6]).tolist(), 60 * noise[6], start_ms=10 * noise[7])
+        assert main(["check", str(run), "--against", str(reference_file)]) == 0
+
+
+def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(
+    run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timed(run, [100.0] * 6, 150.0, calibration_ms=15.0)
+    assert main(["check", str(run), "--against", str(reference_file)]) == 0
+    assert "the calibrating work took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
+    timed(run, [106.0] * 6, 150.0, calibration_ms=15.0)
+    assert main(["check", str(run), "--against", str(reference_file)]) == 1
+
+
+def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
+    run: Path, reference_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(run), "--against", str(reference_file)]) == 0
+    lowered("metrics", "mAcc")(run)
+    capsys.readouterr()
+    words = ["check", str(run), "--against", str(reference_file), "--github"]
+    assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
+    shown = capsys.readouterr().out
+    assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
+    assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert suite.get("failures") == "2" and len(suite.findall("testcase/failure")) == 2
+    assert main([*words, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+
+
+HOSTILE = "<script>|`$(x)`\n::error::\x00" + "é" * 400
+
+
+def test_a_hostile_name_does_no_harm() -> None:
+    verdict = Verdict("run", (Finding("changed", HOSTILE, HOSTILE),), 1, (HOSTILE,))
+    assert "<script>" not in markdown(verdict).replace("\\<script\\>", "")
+    ElementTree.fromstring(junit_xml(verdict))
+    lines = "\n".join(github_lines(verdict)).split("\n")
+    assert len(lines) == 2 and all(line.startswith("::") and " title=su3d-bench::" in line for line in lines)
+
+
+def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_not_compared(
+    run: Path, reference: Reference
+) -> None:
+    (gone,) = list(reference.data_digests)[:1]
+    edit(run / "run.json", lambda r: r.update(scenes=[s for s in r["scenes"] if s != gone]))
+    edit(run / "run.json", lambda r: r["data_digests"].pop(gone))
+
+    def without(metrics: Any) -> None:
+        metrics["scenes"].remove(gone)
+        for result in metrics["results"]:
+            result["n_planned"] -= 1
+            result["result"]["scenes"].remove(gone)
+            result["result"]["per_scene"].pop(gone)
+            result["result"]["n_scenes"] -= 1
+            for row in (result["result"]["metrics"], *result["result"]["per_class"].values()):
+                row.update({name: 0.25 for name, value in row.items() if isinstance(value, float)})
+
+    edit(run / "metrics.json", without)
+    lines = plain_lines(check(read_run(run), reference))
+    assert lines[1] == f"FAIL {gone}: the run does not have this scene"
+    assert len(lines) < 12 and not any(" / mAcc:" in line for line in lines), "what is formed over other scenes"
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[" * 100_000])
+def test_a_damaged_reference_is_one_line(
+    text: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.json").write_text(text)
+    assert main(["check", str(run), "--against", str(tmp_path / "bad.json")]) == 2
+    error = capsys.readouterr().err
+    assert "check --build-from" in error and error.count("\n") == 1
+
+
+def test_what_is_better_is_said_and_passes(run: Path, gated: Path) -> None:
+    verdict = check(read_run(gated), learn([read_run(counted_otherwise(run))]))
+    assert verdict.is_passed
+    assert {one.kind for one in verdict.findings} == {"better"}
+    assert f"{len(verdict.findings)} better" in plain_lines(verdict)[0]
+
+
+def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, gated: Path, tmp_path: Path) -> None:
+    first, second = (read_run(path) for path in (gated, counted_otherwise(run, 4)))
+    values = [results_in(one).metrics["mAcc"] for one in (first, second)]
+    taught = learn([first, second])
+    expected = taught.results[0].metrics["mAcc"]
+    assert expected.value == pytest.approx(np.mean(values))
+    assert expected.tolerance == pytest.approx(2 * (values[0] - values[1]))
+    for n_points, is_passed in ((9, True), (11, False)):  # 2 less than the mean of the two, and 8 more at most
+        shutil.copytree(gated, tmp_path / str(n_points))
+        verdict = check(read_run(counted_otherwise(tmp_path / str(n_points), n_points)), taught)
+        assert verdict.is_passed == is_passed, verdict.findings
+
+
+def findings_of(run: Path, name: str, measured: float, value: Value, across: float | None = None) -> list[Finding]:
+    """What is said where a run measured this of a headline value of which no scene and class is known."""
+    numbers = replace(results_in(read_run(run)), metrics={name: measured}, per_scene={}, per_class={})
+    first = learn([read_run(run)]).results[0]
+    expected = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
+    return list(compared("m / p", expected, numbers, across))
+
+
+@pytest.mark.parametrize("value", [0.25, 0.75])
+def test_a_value_without_a_better_direction_may_move_in_neither(value: float, gated: Path) -> None:
+    assert "over-merged" not in HIGHER_IS_BETTER
+    found = findings_of(gated, "over-merged", value, Value(value=0.5))
+    assert [(one.kind, one.text, one.is_failure) for one in found] == [
+        ("regression", "differs from the reference", True)
+    ]
+    found = findings_of(gated, "mAcc", value, Value(value=0.5))
+    assert [one.kind for one in found] == ["better" if value > 0.5 else "regression"]
+
+
+def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
+    slower(3.0)(counted_otherwise(run, 4))
+    assert not check(read_run(run), reference).is_passed
+    edit(run / "run.json", lambda r: r.update(processor="other"))
+    verdict = check(read_run(run), reference)
+    assert verdict.is_passed, verdict.findings
+    assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
+    counted_otherwise(run, 40)
+    assert not check(read_run(run), reference).is_passed

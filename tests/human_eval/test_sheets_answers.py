@@ -1,0 +1,119 @@
+"""The answers of annotators, their files and keys: what is read, and what is refused with which words."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from simulated_annotators import as_csv, both, retrieval_set, workbook
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.human_eval.answers import check_answers, check_key, read_answers
+from su3d_bench.human_eval.items import ANSWER_COLUMNS, Key, Sheet
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[Sheet, Key]:
+    return retrieval_set(8, ("ann", "bob"))
+
+
+# What is refused
+
+
+def test_duplicate_answer_error_names_both_rows(small: tuple[Sheet, Key]) -> None:
+    rows = [*both(small), replace(both(small)[0], at="again.csv: row 9")]
+    (fault,) = check_answers(small[0], rows).faults
+    assert fault == "again.csv: row 9: duplicate answer, first at ann.csv: row 2; remove one of them"
+
+
+@pytest.mark.parametrize("change", [{"sheet_id": "retrieval-other"}, {"kind": "annotation"}, {"items": ()}])
+def test_a_key_of_another_set_is_refused(small: tuple[Sheet, Key], change: dict[str, object]) -> None:
+    with pytest.raises(DataError, match=r"^key: "):
+        check_key(small[0], replace(small[1], **change))  # type: ignore[arg-type]
+
+
+# Files
+
+
+@pytest.mark.parametrize(("separator", "mark"), [(",", ""), (";", ""), ("\t", "\ufeff")])
+def test_csv_from_pages_and_spreadsheets_is_read(
+    small: tuple[Sheet, Key], separator: str, mark: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "ann.csv"
+    file.write_text(mark + as_csv(both(small), separator), encoding="utf-8", newline="")
+    found = read_answers(file)
+    assert [replace(one, at="") for one in found] == [replace(one, at="") for one in both(small)]
+    assert found[0].at == f"{file}: row 2"
+
+
+def test_a_workbook_gives_the_same_rows_as_a_csv(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    file = tmp_path / "ann.xlsx"
+    file.write_bytes(workbook(both(small), header_at=5))
+    found = read_answers(file)
+    assert [replace(one, at="") for one in found] == [replace(one, at="") for one in both(small)]
+    assert found[0].at == f"{file}: Sheet: row 6"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"item_id": "item-00O1"},
+        {"answer": ""},
+        {"answer": "wrnog"},
+        {"check": "c000000000000"},
+        {"question": "merging"},
+        {"annotator": "bop"},
+        {"sheet_id": "retrieval-other"},
+    ],
+)
+def test_each_fault_names_its_file_and_row(small: tuple[Sheet, Key], change: dict[str, str]) -> None:
+    rows = both(small)
+    rows[1] = replace(rows[1], **change)
+    faults = check_answers(small[0], rows).faults
+    assert sum(fault.startswith("ann.csv: row 3: ") for fault in faults) == 1
+    assert not any("\n" in fault for fault in faults)
+
+
+NO_WORDS = ",".join(ANSWER_COLUMNS).encode() + b"\na,b,\x1b[2J,d,e,f\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"sheet_id,item_id\n", b"\xff\xfes\x00", NO_WORDS])
+def test_invalid_csv_fails(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.csv"):
+        read_answers(tmp_path / "a.csv")
+
+
+# Workbooks that are made to harm who scores them
+
+PAGE = "xl/worksheets/sheet1.xml"
+ENTITY = b'<?xml version="1.0"?><!DOCTYPE worksheet [<!ENTITY a "right">]><worksheet>&a;</worksheet>'
+
+
+def with_page(content: bytes, page: bytes) -> bytes:
+    """A workbook with other bytes in the place of its first worksheet."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, page if name == PAGE else old.read(name))
+    return stream.getvalue()
+
+
+def test_hostile_and_truncated_workbooks_fail(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    book = workbook(both(small))
+    with zipfile.ZipFile(io.BytesIO(book)) as archive:
+        swollen = archive.read(PAGE).replace(b"</worksheet>", b" " * (300 << 20) + b"</worksheet>")
+    for content in (with_page(book, swollen), with_page(book, ENTITY), book[: len(book) // 2], b""):
+        (tmp_path / "a.xlsx").write_bytes(content)
+        with pytest.raises(DataError, match=r"a\.xlsx"):
+            read_answers(tmp_path / "a.xlsx")
+
+
+def test_formula_is_not_an_answer(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    rows = both(small)
+    rows[0] = replace(rows[0], answer='=IF(1,"right","wrong")')
+    (tmp_path / "a.xlsx").write_bytes(workbook(rows))
+    assert len(check_answers(small[0], read_answers(tmp_path / "a.xlsx")).faults) == 1

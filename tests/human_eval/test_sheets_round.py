@@ -1,0 +1,109 @@
+"""Sheets as they are made, filled by people of known error rates as table and as workbook, and scored."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import openpyxl
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.human_eval.drafts import Draft
+from su3d_bench.human_eval.items import CANNOT_TELL, Key, Sheet, SheetKind
+from su3d_bench.human_eval.sets import TABLE, WORKBOOK, make_sheets, write_sheets
+
+HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
+
+
+def drafts(kind: SheetKind, n: int) -> list[Draft]:
+    """``n`` things to judge, of which the truth says by turns all that it can say."""
+    found = []
+    for k in range(n):
+        right, other = ("right", "wrong") if k % 3 else ("wrong", "right")
+        more: dict[str, Any] = {}
+        if kind == "retrieval":
+            more = {"asks": ("retrieval",), "automatic": {"retrieval": right}, "question_kind": "instance"}
+        elif kind == "annotation":
+            merging = ("well-merged", "under-merged", "over-merged")[k % 3]
+            more = {"asks": ("label 1", "label 2", "merging"), "represents": {"label 1": ("n'",), "label 2": ("n",)}}
+            more["automatic"] = {"label 1": right, "label 2": other, "merging": merging}
+        else:
+            more = {"asks": ("answer", "objects"), "automatic": {"answer": right, "objects": other}}
+            more["question_kind"] = "closer"
+        more["question_id"] = "" if kind == "annotation" else f"q{k}"
+        found.append(Draft(kind, "rooms/a", ("opensu3d",), (k,), (k,), (HOSTILE,), f"{HOSTILE} {k}", **more))
+    return found
+
+
+def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, as_workbook: bool) -> Path:
+    """The file of an annotator with every answer in it."""
+    rng = random.Random(name)
+    truth = {one.id: one.automatic for one in key.items}
+
+    def answer(item: str, ask: str) -> str:
+        right = truth[item][ask]
+        others = [one for one in sheet.ask(ask).choices if one not in (right, CANNOT_TELL)]
+        return rng.choice(others) if rng.random() < error_rate else right
+
+    if as_workbook:
+        path = folder / name / WORKBOOK
+        book = openpyxl.load_workbook(path)
+        page = book["answers"]
+        at = next(row for row in range(1, 10) if page.cell(row, 1).value == "item_id")
+        columns = {page.cell(at, k).value: k for k in range(1, 12)}
+        for row in range(at + 1, page.max_row + 1):
+            item, ask = (str(page.cell(row, columns[one]).value) for one in ("item_id", "question"))
+            page.cell(row, columns["answer"]).value = answer(item, ask)
+        book.save(path)
+        return path
+    path = folder / name / TABLE
+    table = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
+    for cells in table[1:]:
+        cells[table[0].index("answer")] = answer(cells[1], cells[3])
+    with path.open("w", encoding="utf-8-sig", newline="") as stream:
+        csv.writer(stream, delimiter=";").writerows(table)  # as a spreadsheet of another country saves it
+    return path
+
+
+@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
+def test_annotator_answers_are_scored_end_to_end(kind: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    png = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
+    origin = Key("", kind, "runs/made", "0", ("opensu3d",), "a made truth", ())
+    made = make_sheets(origin, drafts(kind, 30), [png] * 30, seed=5, annotators=3, overlap=0.4)
+    folder, apart = tmp_path / "sheets" / kind, tmp_path / "sheets" / f"{kind}-key"
+    write_sheets(made, folder, apart)
+    rates = {"annotator-1": 0.0, "annotator-2": 0.0, "annotator-3": 0.8}
+    files = [
+        fill(made.sheet, made.key, folder, name, rate, as_workbook=name == "annotator-2")
+        for name, rate in rates.items()
+    ]
+    capsys.readouterr()
+    assert main(["sheets", "score", *map(str, files[:2]), "--key", str(apart), "--json"]) == 0
+    told = capsys.readouterr()
+    found = json.loads(told.out)
+    assert "no answers from annotator-3" in told.err and found["silent"] == ["annotator-3"]
+    values = {(one["judge"], one["metric"]): (one["value"], one["n_items"]) for one in found["cells"]}
+    metrics = {metric for _, metric in values}
+    assert found["n_judged"] == 24  # the 12 that all share, and 6 of one's own of each of two
+    assert {metric: values["people", metric] for metric in metrics} == {m: values["automatic", m] for m in metrics}
+    assert all(
+        one["agreement"]["alpha"] == 1.0 and one["agreement"]["n_items"] % 12 == 0 for one in found["agreements"]
+    )
+    assert found["review_items"] == []
+
+    out = tmp_path / "scores"
+    assert main(["sheets", "score", *map(str, files), "--key", str(apart), "--out", str(out), "--quiet"]) == 0
+    found = json.loads((out / "scores.json").read_text())
+    assert found["n_judged"] == 30 and found["review_items"]
+    assert {one["reason"] for one in found["review_items"]} == {"annotators disagree", "against the truth"}
+    assert all(one["agreement"]["alpha"] < 1.0 for one in found["agreements"])
+    page = (out / "review_items.html").read_text()
+    assert f"../sheets/{kind}/pictures/item-" in page and "<script" not in page
+    assert "\u202e" not in page + (out / "review_items.csv").read_text()
