@@ -94,7 +94,7 @@ class Layout(ABC):
     def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         """Write all files except those of the frames into ``target.partial``."""
 
-    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have a file a frame
+    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have one file per frame
         """Create in ``target.partial`` the file for all frames; called after everything else is written."""
 
 

@@ -171,7 +171,7 @@ class Command:
         source="",
         licence="that of the program",
         needs=("your program", "docker or conda if used"),
-        status="writing frames and reading predictions are tested in both directions; says nothing about the program",
+        status="writing frames and reading predictions are tested in both directions; the program itself is not",
     )
 
     def __init__(self, config: CommandConfig | None = None) -> None:

@@ -219,7 +219,7 @@ class PhoneFrames(Sequence[Frame]):
         image = self._recording.images[index]
         full, intrinsics = read_camera(self._recording.folder / image.camera, self._at(image.camera))
         size = self._size(full)
-        rgb = sized(decode_colour, self._content(image.colour), full, self._at(image.colour), "as its camera file says")
+        rgb = sized(decode_colour, self._content(image.colour), full, self._at(image.colour), "as in its camera file")
         scale = np.array(size) / np.array(full)
         intrinsics[:2, :2] *= scale[:, None]
         intrinsics[:2, 2] = (intrinsics[:2, 2] + 0.5) * scale - 0.5  # the centre of the first pixel is at 0

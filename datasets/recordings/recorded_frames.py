@@ -198,7 +198,7 @@ class RecordedFrames(Sequence[Frame]):
         expected, (cx, cy) = self._recording.image_size, self._recording.intrinsics[:2, 2]
         if expected is not None and expected != (width, height):
             raise DataError(
-                f"{where} is {width}x{height}, the camera file says {expected[0]}x{expected[1]}; intrinsics belong to "
+                f"{where} is {width}x{height}, the camera file has {expected[0]}x{expected[1]}; intrinsics belong to "
                 "one image size"
             )
         if not (0 <= cx <= width and 0 <= cy <= height):

@@ -211,7 +211,7 @@ def open_cpp_export(folder: Path, where: str) -> sensors.ExportedFrames:
     sensors.check_complete(kinds, expected, where)
     colours, depths, poses = kinds.values()
     frames = [sensors.FrameFiles(n, colours[n], depths[n], poses[n]) for n in expected]
-    return sensors.ExportedFrames(folder, where, camera, frames, [INFO], f"as {INFO} says")
+    return sensors.ExportedFrames(folder, where, camera, frames, [INFO], f"as in {INFO}")
 
 
 def read_info(path: Path, where: str) -> tuple[sensors.SensorPair, int]:

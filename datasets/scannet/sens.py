@@ -200,7 +200,7 @@ class SensFile:
         signature = images.PNG_SIGNATURE if header.colour_compression == "png" else images.JPEG_START
         if not content.startswith(signature) or images.image_size(content) is None:
             raise DataError(f"{where}: not a {header.colour_compression.upper()} image; copy the file again")
-        return images.sized(images.decode_colour, content, size, where, "as the header says")
+        return images.sized(images.decode_colour, content, size, where, "as in the header")
 
     def depth(self, i: int) -> images.UInt16Array:
         """The depth image (H, W) of frame ``i`` in raw units, 0 if invalid."""

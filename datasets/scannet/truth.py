@@ -356,7 +356,7 @@ def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[
     if table is None:
         raise GroundTruthMissing(
             f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "
-            f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is beside the scans"
+            f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is next to the scans"
         )
     _warn_unknown_categories(scan, table)
     return scan.of_category(table.nyu40_of), f"the NYU40 classes of the objects' categories in {table.name}"

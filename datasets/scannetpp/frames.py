@@ -179,7 +179,7 @@ class IphoneFrames(Sequence[Frame]):
             return self._video.image(number)
         where, content = self._content(self._recording.colour_of[number])
         size = self._recording.posed.size
-        return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
+        return self._colour_at_size(sized(decode_colour, content, size, where, "as in the camera file"))
 
     def _depth_values(self, number: int) -> UInt16Array:
         if self._recording.depth_of is None:

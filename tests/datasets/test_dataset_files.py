@@ -137,7 +137,7 @@ QUERIES = "video_id,visit_id,query\n"
 ANNOTATION = f"hm3d/val/{hm.SCENE}/{hm.SHORT}.semantic.txt"
 FAULTS: list[tuple[str, str, Content, str]] = [
     ("replica", f"{RENDER}/results/frame000001.jpg", None, "results/frame000001.jpg is missing; copy results/ again"),
-    ("replica", f"{RENDER}/results/frame000001.jpg", GREY, "frame000001.jpg is 30x20, the camera file says 12x8"),
+    ("replica", f"{RENDER}/results/frame000001.jpg", GREY, "frame000001.jpg is 30x20, the camera file has 12x8"),
     ("replica", "", flip(f"{RENDER}/results/depth000001.png", 45), "depth000001.png: not a readable PNG image"),
     ("replica", f"{RENDER}/traj.txt", f"{IDENTITY}\nnan{IDENTITY[1:]}\n", "traj.txt line 2: the pose holds 'nan'"),
     ("replica", "Replica/cam_params.json", {"camera": rep.CAMERA | {"fy": "600"}}, "camera.fy: Input should be"),
@@ -170,7 +170,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("scannet python", f"{SCANS}/depth/1.png", DEEP, "depth/1.png is 30x20; expected 32x24, as the first frame"),
     ("scannet cpp", f"{SCANS}/frame-000002.color.jpg", None, "frame-000002.color.jpg is missing; "),
     ("scannet cpp", f"{SCANS}/frame-000004.pose.txt", IDENTITY, "has 4 frames, but there is also frame-000004.pose"),
-    ("scannet cpp", f"{SCANS}/frame-000001.depth.pgm", pgm_bytes(DEEP), "is 30x20; expected 32x24, as _info.txt says"),
+    ("scannet cpp", f"{SCANS}/frame-000001.depth.pgm", pgm_bytes(DEEP), "is 30x20; expected 32x24, as in _info.txt"),
     ("scannet cpp", f"{SCANS}/_info.txt", b"\xff\xfe", "_info.txt: not a text file"),
     *(
         ("scannet cpp", f"{SCANS}/_info.txt", RECORDED["info_cpp"].replace(old, new), message)
@@ -213,7 +213,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("rgbd", "", described(depth=None, dept="a"), "rgbd.toml:7: unknown key 'dept'; did you mean 'depth'?"),
     ("rgbd", "", described(colour="**/*.png"), "expected a pattern with one {index}, or with * or ?"),
     ("rgbd", "", described(pose=None, trajectory="intrinsics.txt"), "has 3 lines; expected blocks of five"),
-    ("rgbd", "", described(intrinsics=None, intrinsics_file="wide.json"), "the camera file says 640x8; intrinsics"),
+    ("rgbd", "", described(intrinsics=None, intrinsics_file="wide.json"), "the camera file has 640x8; intrinsics"),
     ("rgbd", "", link_away("rgbd/desk/data/colour/frame-0.png"), "'colour/frame-0.png' leads out of the folder"),
     ("rgbd", "", link_away("rgbd/desk/data/frame-1.pose.txt"), "'frame-1.pose.txt' leads out of the folder"),
     ("tum", f"{SEQUENCE}/groundtruth.txt", None, "groundtruth.txt is missing; copy the file again"),

@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")  # root folders, reached through links in the package
-USERS = ("benchmarks", ".ci")  # folders beside the package that import it
+USERS = ("benchmarks", ".ci")  # folders outside the package that import it
 PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {

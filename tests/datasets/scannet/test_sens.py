@@ -206,7 +206,7 @@ def jpeg(width: int, height: int) -> bytes:
     ("colour", "message"),
     [
         (b"\xff\xd8\xff" + bytes(50), "not a JPEG image"),
-        (jpeg(16, 6), "is 16x6; expected 8x6, as the header says"),
+        (jpeg(16, 6), "is 16x6; expected 8x6, as in the header"),
         (jpeg(8, 6)[:-2], "not a readable JPEG image"),
     ],
 )
