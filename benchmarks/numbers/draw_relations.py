@@ -35,22 +35,22 @@ class Panel:
 TABLE: Box = (0, 0, 0, 1, 1, 0.7)
 PICTURE: Box = (0.2, 0.97, 1.1, 0.6, 0.03, 0.5)
 PANELS = (
-    Panel("on", "rests on its top,\n0.04 m at most apart", SIDE, (0.4, 0.4, 0.72, 0.2, 0.2, 0.2), TABLE),
+    Panel("on", "rests on its top,\nat most 0.04 m apart", SIDE, (0.4, 0.4, 0.72, 0.2, 0.2, 0.2), TABLE),
     Panel("on", "0.06 m of air", SIDE, (0.4, 0.4, 0.76, 0.2, 0.2, 0.2), TABLE),
     Panel("on", "0.4 of its footprint", SIDE, (0.88, 0.4, 0.7, 0.3, 0.3, 0.2), TABLE),
     Panel("on", "0.2 of its footprint", SIDE, (0.94, 0.4, 0.7, 0.3, 0.3, 0.2), TABLE),
     Panel("on", "an inner board",
           SIDE, (0.2, 0.05, 0.5, 0.2, 0.2, 0.3), (0, 0, 0, 1, 0.3, 1.4), (), ("a", "shelf")),
-    Panel("on", "an inner board of\nno shelf and no seat",
+    Panel("on", "an inner board, but\nno shelf or seat",
           SIDE, (0.2, 0.05, 0.2, 0.2, 0.2, 0.2), (0, 0, 0, 1, 0.3, 0.6), (), ("a", "stand")),
     Panel("in", "may stick out of\na container",
           SIDE, (0.36, 0.1, 0.1, 0.2, 0.2, 0.8), (0, 0, 0, 0.6, 0.5, 0.6), (), ("a", "basket")),
     Panel("under", "supports it", SIDE, TABLE, (0.4, 0.4, 0.7, 0.2, 0.2, 0.2)),
     Panel("under", "not through a slab",
           SIDE, (0, 0, 0, 1, 1, 0.6), (0.4, 0.4, 0.7, 0.2, 0.2, 0.2), ((-0.2, 0, 0.6, 1.4, 1, 0.1),)),
-    Panel("under", "0.9 of its ground\nis covered", SIDE, (0.73, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
-    Panel("under", "0.4 of its ground\nis covered", SIDE, (0.88, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
-    Panel("above", "hangs over it,\na metre at most", SIDE, PICTURE, TABLE),
+    Panel("under", "0.9 of its footprint\nis covered", SIDE, (0.73, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
+    Panel("under", "0.4 of its footprint\nis covered", SIDE, (0.88, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
+    Panel("above", "hangs over it,\nat most 1 m", SIDE, PICTURE, TABLE),
     Panel("above", "1.4 m of air", SIDE, (0.2, 0.97, 2.1, 0.6, 0.03, 0.5), TABLE),
     Panel("above", "neither half of it\nnor its middle", SIDE, (0.9, 0.97, 1.1, 0.6, 0.03, 0.5), TABLE),
     Panel("above", "something is between", SIDE, PICTURE, TABLE, ((0.2, 0.72, 0.7, 0.6, 0.26, 0.3),)),
@@ -67,7 +67,7 @@ PANELS = (
           TOP, (0.95, 0.15, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
     Panel("between", "in the lane",
           TOP, (0.95, 0.42, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
-    Panel("between", "aside of the lane",
+    Panel("between", "outside the lane",
           TOP, (0.95, 0.75, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
 )  # fmt: skip
 
