@@ -1,1 +1,1 @@
-"""Finished runs compared, gated, ranked and taken apart."""
+"""Comparison, regression checks, ranking and error attribution of finished runs."""

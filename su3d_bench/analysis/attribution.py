@@ -1,7 +1,7 @@
-"""Why a run's numbers are not perfect: what each kind of error costs, and what each stage of the pipeline does.
+"""Error attribution: what each kind of error and each stage of the pipeline costs a run.
 
-A run's maps are matched to the ground truth again, as the evaluators of its protocols matched them; counts that differ
-from those stored in the run are refused. ``report samples`` and the galleries of a page go through the same walk,
+A run's maps are matched to the ground truth again, with the evaluators of its protocols; counts that differ from those
+stored in the run are an error. ``report samples`` and the galleries of a page use the same iteration,
 ``matched_instances`` or ``Explained.matched``. The kinds of errors are defined in ``metrics.attribution``.
 """
 
@@ -32,13 +32,13 @@ from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.job import as_configured
 from su3d_bench.store.predictions import read_prediction
 
-TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for
-MendedJob = Mapping[str, CorrectedScene]  # of a scene under a method, by protocol
+TruthOf = Callable[[str], GroundTruth]  # ground-truth variant -> ground truth
+MendedJob = Mapping[str, CorrectedScene]  # protocol -> counts of one scene and method
 
 
 @dataclass(frozen=True)
 class Matched:
-    """A scene under a method and a protocol: what was scored, and how the protocol's evaluator sees it."""
+    """One scene, method and protocol: what was scored, and how the protocol's evaluator matched it."""
 
     explained: Explained
     scene: str
@@ -51,7 +51,7 @@ class Matched:
 def matched_instances(
     run: FinishedRun, methods: Sequence[Explained], scenes: Sequence[str]
 ) -> Iterator[tuple[str, Iterator[Matched]]]:
-    """Scene after scene, what ``methods`` of ``run`` gave under each protocol that scored it."""
+    """For each scene, the matched predictions of ``methods`` of ``run`` under each protocol that scored it."""
     encoder = cache(run.encoder)
     for scene in scenes:
         truth_of = cache(partial(truth_of_scene, run, scene))
@@ -59,14 +59,14 @@ def matched_instances(
 
 
 def explained_of(run: FinishedRun, method: str, wanted: Sequence[str] = ()) -> Explained:
-    """The protocols under which the errors of ``method`` are explained: those ``wanted``, else all that can be."""
+    """The protocols for attributing errors of ``method``: those ``wanted``, by default all that support it."""
     names, remarks = _protocols_of(run, wanted)
     return Explained(run, method, tuple(names), tuple(remarks))
 
 
 @dataclass(frozen=True)
 class Explained:
-    """A method of a run, whose errors are explained under ``protocols``."""
+    """A method of a run, with its errors attributed under ``protocols``."""
 
     run: FinishedRun
     method: str
@@ -82,11 +82,11 @@ class Explained:
         return Inputs(self.run, self.method)
 
     def rules(self, protocol: str) -> ProtocolRules:
-        """The rules of a protocol as they count for this method."""
+        """The rules of a protocol as applied to this method."""
         return self._inputs.rules(self.run.rules(protocol))
 
     def matched(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> Iterator[Matched]:
-        """``scene`` as the evaluators of the protocols that scored it see it."""
+        """``scene`` as matched by the evaluators of the protocols that scored it."""
         for name in self.scored_under(scene):
             rules = self.rules(name)
             truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
@@ -97,7 +97,7 @@ class Explained:
             yield Matched(self, scene, rules, truth, prediction, evaluated)
 
     def corrected(self, scene: str, evaluated: Mapping[str, EvaluatedScene]) -> MendedJob:
-        """The counts of ``scene``, which must be those of the run, and those with its errors corrected."""
+        """The counts of ``scene``, checked against those of the run, and the counts with its errors corrected."""
         corrected = {name: one.corrected() for name, one in evaluated.items()}
         for name, counts in corrected.items():
             self.check_same_counts(name, scene, counts.as_is)
@@ -106,27 +106,27 @@ class Explained:
     def errors(
         self, scene: str, protocol: str, evaluated: EvaluatedScene, most: int
     ) -> tuple[int, Sequence[SingleError]]:
-        """How many errors ``scene`` has under ``protocol``, and the ``most`` that cost the run most."""
+        """The number of errors in ``scene`` under ``protocol``, and the ``most`` errors that cost the run most."""
         scores = self._scores[protocol]
         others = [score.counts for name, score in scores.items() if name != scene]
         return evaluated.errors(self.rules(protocol), scores[scene].counts, others, most)
 
     def instance_ids(self, scene: str) -> Sequence[int]:
-        """How the method numbers its instances; nothing where their places are their numbers."""
+        """The ids of the method's instances; empty if they are numbered by position."""
         if self.run.data.truth_files is not None:
             return ()
         return getattr(self._inputs.of_map(scene), "ids", np.zeros(0, np.int64)).tolist()
 
     def check_same_counts(self, protocol: str, scene: str, formed: Counts) -> None:
-        """A ``PredictionError`` where what is explained is not what the run's own number is of."""
+        """Raise a ``PredictionError`` if the recomputed counts differ from those stored in the run."""
         stored = self._scores[protocol][scene].counts
         if type(stored) is type(formed) and all(
             np.array_equal(getattr(stored, each.name), getattr(formed, each.name)) for each in fields(formed)
         ):
             return
         raise PredictionError(
-            f"{printable(scene, 100)}: {protocol}: the counts of the run are not those that its prediction gives here; "
-            "score it again"
+            f"{printable(scene, 100)}: {protocol}: the run's stored counts differ from those recomputed from its "
+            "prediction; score it again"
         )
 
     def scored_under(self, scene: str) -> list[str]:
@@ -135,7 +135,7 @@ class Explained:
 
 
 def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The protocols that can be explained, and remarks on the others; one that is named and cannot is an error."""
+    """The protocols that support attribution, and remarks on the others; an unsupported ``wanted`` one is an error."""
     for name in wanted:
         run.check_protocol(name)
     chosen, remarks = [], []
@@ -144,31 +144,31 @@ def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], l
         if rules.kind in EXPLAINED:
             chosen.append(name)
         elif wanted:
-            raise ConfigError(f"protocol '{name}' is of kind '{rules.kind}'; only instance and semantic are explained")
+            raise ConfigError(f"protocol '{name}' is of kind '{rules.kind}'; only instance and semantic are supported")
         else:
-            remarks.append(f"{name} is of kind {rules.kind}, which is not explained")
+            remarks.append(f"{name} is of kind {rules.kind}, which has no error attribution")
     if not chosen:
-        raise ConfigError(f"{run.name}: was scored under no protocol of kind instance or semantic; nothing to explain")
+        raise ConfigError(f"{run.name}: has no scores under a protocol of kind instance or semantic")
     return chosen, remarks
 
 
 def method_of(run: FinishedRun, method: str | None) -> str:
-    """``method``, or the only one of the run; ``ConfigError`` where it must be named or has no scores."""
+    """``method``, or the only one of the run; ``ConfigError`` if it must be named or has no scores."""
     if method is None and len(run.methods) > 1:
-        raise ConfigError(f"{run.name}: holds {', '.join(run.methods)}; choose one with --method")
+        raise ConfigError(f"{run.name}: has several methods ({', '.join(run.methods)}); choose one with --method")
     chosen = method or run.methods[0]
     run.check_method(chosen)
     return chosen
 
 
 def truth_of_scene(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
-    """The truth in the data of ``run``, which must be those that it was made from."""
+    """The ground truth in the data of ``run``, which must be unchanged since the run."""
     truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
     return truth
 
 
 class Inputs:
-    """The truth, the maps and the encoder of a method of a run, be its predictions made here or elsewhere."""
+    """Ground truth, maps and encoder of a method of a run, also for predictions made elsewhere."""
 
     def __init__(self, run: FinishedRun, method: str) -> None:
         self._run, self._method = run, method
@@ -176,7 +176,7 @@ class Inputs:
         self.of_map = lru_cache(maxsize=1)(self._read_map)
 
     def rules(self, rules: ProtocolRules) -> ProtocolRules:
-        """``rules`` as they count here: of files, their confidences may count where a rule has 1."""
+        """``rules`` as applied here: prediction files may supply confidences where a rule uses 1."""
         elsewhere = self._run.external.get(self._method)
         takes_files = elsewhere is not None and elsewhere.confidences == "file"
         return with_confidences_of_files(rules) if takes_files else rules
@@ -196,7 +196,7 @@ class Inputs:
         return read_prediction(self._run.folder.job(scene, self._method).prediction)
 
     def encoder(self, rules: ProtocolRules, prediction: Prediction, own: Callable[[], Encoder]) -> Encoder | None:
-        """What named the instances; None where they have names."""
+        """The encoder that named the instances; None if they have labels."""
         if getattr(prediction, "labels", None) is not None:
             return None
         elsewhere = self._run.external.get(self._method)
@@ -207,7 +207,7 @@ class Inputs:
         assert given is not None
         texts = GivenTextEncoder(given, rules)
         if texts.digest != digest:
-            raise DataError(f"{printable(path, 200)}: is not the file that {self._run.name} was scored with")
+            raise DataError(f"{printable(path, 200)}: is not the text features file used to score {self._run.name}")
         return texts
 
 
@@ -225,11 +225,11 @@ class Cause:
 
 @dataclass(frozen=True)
 class ProtocolAttribution:
-    """Of one protocol: ``values + sum of gains + overlap + rest = 1`` for each metric.
+    """Attribution under one protocol: ``values + sum of gains + overlap + rest = 1`` for each metric.
 
-    ``rest`` is 1 less the value with everything corrected, ``overlap`` what that gives beyond the sum of the gains.
-    ``stages`` are values with one stage of the pipeline replaced by the truth. ``n_scored`` points where points are
-    counted.
+    ``rest`` is 1 minus the value with everything corrected, ``overlap`` what that gains beyond the sum of the gains.
+    ``stages`` are values with one stage of the pipeline replaced by ground truth. ``n_scored`` is the number of points
+    if points are counted.
     """
 
     protocol: str
@@ -252,7 +252,7 @@ class RunAttribution:
     protocols: tuple[ProtocolAttribution, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, fractions in full precision, null where undefined."""
+        """JSON values: fractions in full precision, null if undefined."""
         return {"schema": SCHEMA, **plain_json(asdict(self))}
 
 
@@ -263,9 +263,9 @@ def attribute(
     protocols: Sequence[str] = (),
     oracle: Path | None = None,
 ) -> RunAttribution:
-    """Where the run at ``path`` loses its points, under each protocol of kind ``instance`` or ``semantic``.
+    """Error attribution of the run at ``path``, under each protocol of kind ``instance`` or ``semantic``.
 
-    ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the stage of the 2D masks.
+    ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the 2D mask stage.
     """
     run = read_run(path)
     explained = explained_of(run, method_of(run, method), protocols)
@@ -288,7 +288,7 @@ def attribute(
 def attribution_of(
     explained: Explained, corrected: Mapping[str, MendedJob], other: Side | None = None
 ) -> RunAttribution:
-    """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
+    """The cost of the errors of all scenes; ``other`` is the side with ground-truth 2D masks."""
     side = Side(explained.run, explained.method)
     formed = []
     for name in explained.protocols:
@@ -296,13 +296,13 @@ def attribution_of(
         if of_scenes:
             formed.append(_form(rules, of_scenes, _oracle_values(rules, side, other, list(of_scenes))))
     if not formed:
-        raise ConfigError(f"{side.name}: no scene is scored under {', '.join(explained.protocols)}; nothing to explain")
+        raise ConfigError(f"{side.name}: no scene is scored under {', '.join(explained.protocols)}")
     remarks = (*explained.remarks, *run_remarks(explained.run))
     return RunAttribution(explained.run.name, explained.method, remarks, tuple(formed))
 
 
 def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes: Sequence[str]) -> Values | None:
-    """The metrics of the run with perfect 2D masks over the same scenes."""
+    """The metrics of the run with ground-truth 2D masks over the same scenes."""
     if other is None:
         return None
     if rules.name not in other.run.protocols:
@@ -318,7 +318,7 @@ def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes:
 def _form(
     rules: ProtocolRules, of_scenes: Mapping[str, CorrectedScene], with_true_masks: Values | None
 ) -> ProtocolAttribution:
-    """What the errors of the scenes cost under one protocol."""
+    """The cost of the errors of the scenes under one protocol."""
     every = list(of_scenes.values())
     values, corrected = _values(rules, [one.as_is for one in every]), _values(rules, [one.all for one in every])
     causes = {}
@@ -353,7 +353,7 @@ def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:
 
 
 def run_remarks(run: FinishedRun) -> list[str]:
-    """What must be known of a run beside its numbers."""
+    """Caveats to report with a run's numbers."""
     lines = run.elsewhere_lines()
     if run.record.is_partial:
         lines.append(f"PARTIAL: only the first {counted(run.limit, 'frame')} of each scene")

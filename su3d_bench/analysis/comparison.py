@@ -1,8 +1,8 @@
-"""Two runs compared: the changes per metric, scene and class, how sure they are, and how many scenes would show them.
+"""Comparison of two runs: differences per metric, scene and class with intervals and tests, and power analysis.
 
-Numbers are formed over the scenes that both have. What decides is the exact test, which flips the signs of the
-differences of single scenes; the interval is of the differences without each scene in turn. A side of several runs
-stands for their mean, and what seeds alone move is said beside.
+Numbers are computed over the scenes that both runs have. Significance comes from the exact sign-flip test of per-scene
+differences; the interval is a jackknife over scenes. A side of several runs is their mean, reported with the standard
+deviation over seeds.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ SCHEMA = 2
 
 @dataclass(frozen=True)
 class Difference:
-    """One value on both sides, as fractions, NaN where undefined; ``difference`` is the second less the first.
+    """One value on both sides, as fractions, NaN if undefined; ``difference`` is the second minus the first.
 
-    ``per_scene`` holds the difference of each scene in which both have a value, ``mean_of_scenes`` their mean, on which
-    ``test`` is. ``p_of_all``: its p corrected by Holm for all that are compared with it and in which any scene differs:
-    the headline metrics of a comparison, or the classes of a protocol. ``deviations_of_seeds``: by how much, as a
-    standard deviation, the seed alone moves the value of one run of each side; None where a side is one run.
+    ``per_scene`` holds the difference of each scene in which both have a value, ``mean_of_scenes`` their mean, which
+    ``test`` tests. ``p_of_all``: its Holm-corrected p, over all values tested with it in which any scene differs: the
+    headline metrics of a comparison, or the classes of a protocol. ``deviations_of_seeds``: standard deviation of one
+    run's value over seeds, for each side; None if a side is one run.
     """
 
     left: float
@@ -49,11 +49,11 @@ class Difference:
 
     @property
     def disagreement(self) -> str | None:
-        """What a reader must know where the interval and the test seem to say different things; None where they agree.
+        """An explanation if the interval and the test seem to disagree; None if they agree.
 
         >>> test = SignFlipTest(p=0.25, smallest_p=0.25, n_pairs=3, is_exact=True)
         >>> Difference(0.5, 0.6, 0.1, (0.02, 0.18), {}, 0.1, test).disagreement
-        'the interval leaves 0 out, but 3 scenes can give no p below 0.25: no difference is shown'
+        'the interval excludes 0, but the smallest possible p with 3 scenes is 0.25: no significant difference'
         """
         if self.interval is None or self.test is None:
             return None
@@ -62,20 +62,20 @@ class Difference:
             if (self.interval[0] > 0) == (self.mean_of_scenes > 0):
                 return None
             return (
-                f"B - A and the mean over scenes have opposite signs, and neither is chance (p {self.test.p:.2g}): the "
-                "test is of the mean over scenes, the interval of B - A, in which scenes count by what they hold"
+                f"B - A and the mean over scenes have opposite signs, both significant (p {self.test.p:.2g}): the test "
+                "uses the mean over scenes, the interval uses B - A, in which scenes are weighted by their contents"
             )
         if leaves_out_zero == (self.test.p < statistics.ALPHA):
             return None
         if not leaves_out_zero:
             return (
-                f"the test finds a difference (p {self.test.p:.2g}) of the mean over scenes, though the interval of "
-                "B - A holds 0: the interval takes the scenes' differences for normal, the test does not"
+                f"the test finds a difference (p {self.test.p:.2g}) of the mean over scenes, but the interval of B - A "
+                "contains 0: the interval assumes normally distributed differences, the test does not"
             )
         if self.test.smallest_p >= statistics.ALPHA:
             return (
-                f"the interval leaves 0 out, but {counted(self.test.n_pairs, 'scene')} can give no p below "
-                f"{self.test.smallest_p:.3g}: no difference is shown"
+                f"the interval excludes 0, but the smallest possible p with {counted(self.test.n_pairs, 'scene')} is "
+                f"{self.test.smallest_p:.3g}: no significant difference"
             )
         return (
             f"the interval leaves 0 out, but the test does not find a difference (p {self.test.p:.2g}): the interval "
@@ -100,9 +100,9 @@ class ProtocolComparison:
 
 @dataclass(frozen=True)
 class Comparison:
-    """``remarks`` are of the runs as such: partial or incomplete ones, and in which settings they differ.
+    """``remarks`` apply to whole runs: which are partial or incomplete, and in which settings they differ.
 
-    ``seeds``: those of the runs of both sides.
+    ``seeds``: the seeds of the runs of each side.
     """
 
     left: str
@@ -112,7 +112,7 @@ class Comparison:
     protocols: tuple[ProtocolComparison, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values in full precision, null where undefined."""
+        """JSON values in full precision, null if undefined."""
         return {"schema": SCHEMA, **plain_json({**vars(self), "protocols": list(map(_protocol_json, self.protocols))})}
 
 
@@ -125,11 +125,11 @@ def compare(
     per_class: bool = False,
     numbers: sides.SideNumbers | None = None,
 ) -> Comparison:
-    """What ``right`` changes over ``left``, each the folder of a run or ``FOLDER:METHOD``.
+    """The differences of ``right`` from ``left``, each a run folder or ``FOLDER:METHOD``.
 
-    Folders with commas between are one side: runs of one request under several seeds, over which values are averaged.
-    Without methods those of one name are compared, or the only ones; ``numbers`` are shared by calls on the same runs.
-    Raises ``ConfigError`` where the two cannot be compared, naming the first field that differs.
+    Comma-separated folders are one side: runs that differ only in their seed, over which values are averaged. By
+    default, methods of the same name are compared, or the only ones; pass the same ``numbers`` to repeated calls on the
+    same runs. Raises ``ConfigError`` if the two cannot be compared, naming the first field that differs.
     """
     pairs = sides.pair_methods(sides.parse_side(left, method), sides.parse_side(right, method))
     first, second = pairs[0]
@@ -155,8 +155,8 @@ def _compare_methods(
         over_scenes = numbers.over_common(name, every)
         if not over_scenes:
             raise ConfigError(
-                f"{left.name} and {right.name}: no scene in common that is scored under {name}; compare runs of the "
-                "same scenes"
+                f"{left.name} and {right.name}: have no common scene scored under {name}; compare runs of the same "
+                "scenes"
             )
         rules, common = left.run.rules(name), over_scenes[0].result.scenes
         remarks = _remarks_of_scenes(every, name, [numbers.scores(side)[name] for side in every], common)
@@ -187,9 +187,9 @@ def _compare_classes(
 
 
 def _of_all(tables: Sequence[Mapping[str, Difference]]) -> list[dict[str, Difference]]:
-    """The differences of ``tables``, each with its p among all of them.
+    """The differences of ``tables``, each with its p corrected for all of them.
 
-    Where no scene differs, no sign can be turned: such a test counts for nothing.
+    A test in which no scene differs is not counted in the correction: there is no sign to flip.
     Source: Tarone, A modified Bonferroni method for discrete data, Biometrics 46 (1990).
     """
     every = [difference for table in tables for difference in table.values()]
@@ -199,7 +199,7 @@ def _of_all(tables: Sequence[Mapping[str, Difference]]) -> list[dict[str, Differ
 
 
 def difference_of(left: sides.Numbers, right: sides.Numbers, scenes: Sequence[str]) -> Difference:
-    """The difference of a value of two sides."""
+    """The difference of one value between two sides."""
     differences: Float64Array = right.of_scenes - left.of_scenes
     is_known = ~np.isnan(differences)
     without_each = right.without_each - left.without_each
@@ -218,11 +218,11 @@ def difference_of(left: sides.Numbers, right: sides.Numbers, scenes: Sequence[st
 def _remarks_of_scenes(
     every: Sequence[sides.Side], protocol: str, scores: Sequence[Mapping[str, SceneScore]], common: Sequence[str]
 ) -> list[str]:
-    """Which scenes of one run not all have, which failed, and who answered or named."""
+    """Remarks on scenes that not all runs have, failed scenes, and the models that answered or named."""
     lines = []
     for side, own in zip(every, scores, strict=True):
         if alone := [printable(scene, 80) for scene in own if scene not in common]:
-            lines.append(f"only the scenes in common are compared; {side.name} alone has {some(alone, 3)}")
+            lines.append(f"only common scenes are compared; only {side.name} has {some(alone, 3)}")
     for side in every:
         record = side.run.results.get((side.method, protocol))
         if record is not None and record.failed:
@@ -233,20 +233,22 @@ def _remarks_of_scenes(
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
             lines += [f"{side.name}: {start}{printable(said, 200)}" for said in remarks_starting(warnings, start)]
     if every[0].run.rules(protocol).digest != every[0].run.protocols[protocol].digest:
-        lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
+        lines.append(
+            f"the installed rules of {protocol} differ in text from those that scored both runs (same version)"
+        )
     return lines
 
 
 def _caveats(side: sides.Side) -> list[str]:
-    """What must be known of a side's perception, and that the truth is one."""
+    """Caveats on a side's perception, and whether a side is the ground truth itself."""
     if side.method not in side.run.methods:
-        return [f"{side.name} is the truth itself, no system"]
+        return [f"{side.name} is the ground truth itself, not a method"]
     caveats = [record.caveat for (method, _), record in side.run.results.items() if method == side.method]
     return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
 
 
 def _remarks(left: sides.Side, right: sides.Side, methods: Set[str]) -> list[str]:
-    """What must be said of the runs of which ``methods`` are compared."""
+    """Remarks on the runs, of which ``methods`` are compared."""
     lines = []
     for run in {run.name: run for side in (left, right) for run in side.runs}.values():
         if run.record.is_partial:
@@ -261,7 +263,7 @@ def _remarks(left: sides.Side, right: sides.Side, methods: Set[str]) -> list[str
             + (f" and {len(changed) - 6} more" if len(changed) > 6 else "")
         )
     if len({run.record.code for side in (left, right) for run in side.runs}) > 1:
-        lines.append("the runs were made by different versions of the code")
+        lines.append("the runs were produced by different versions of the code")
     return lines
 
 
@@ -275,21 +277,21 @@ def _protocol_json(protocol: ProtocolComparison) -> dict[str, Any]:
 
 
 def _difference_json(difference: Difference) -> dict[str, Any]:
-    """A test that there is none of has no pairs."""
+    """The JSON values of a difference; a missing test has 0 pairs."""
     values = asdict(difference)
     test = values.pop("test") or {"p": None, "smallest_p": None, "n_pairs": 0, "is_exact": None}
     return {**values, **test, "disagreement": difference.disagreement}
 
 
 PLAN_SCHEMA = 1
-SEEDS = (1, 2, 3, 5, 10)  # of which the scenes are told, where runs of several seeds say what these move
+SEEDS = (1, 2, 3, 5, 10)  # numbers of seeds for which scenes are computed, if the runs have several seeds
 
 
 @dataclass(frozen=True)
 class Need:
-    """The scenes, each under ``n_seeds`` seeds, that find a difference of ``points`` per cent; None: no number does.
+    """The number of scenes, each with ``n_seeds`` seeds, that detects a difference of ``points`` per cent.
 
-    ``low`` and ``high``: what it would be at the ends of the 95 % interval of the variance.
+    None if no number does. ``low`` and ``high``: the numbers at the ends of the 95 % interval of the variance.
     """
 
     points: float
@@ -301,9 +303,9 @@ class Need:
 
 @dataclass(frozen=True)
 class MetricPlan:
-    """One metric: the ``difference`` of the second method less the first, as a fraction, with its ``interval`` over the
-    scenes and seeds that were run, how it varies, and what is needed; no variance where nothing varies, or too few
-    scenes count."""
+    """Power analysis of one metric: ``difference`` (second method minus first, a fraction), its ``interval`` over the
+    scenes and seeds that were run, its variance and the scenes needed; no variance if nothing varies or too few scenes
+    count."""
 
     difference: float
     interval: Interval | None
@@ -313,7 +315,7 @@ class MetricPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """``protocols``: protocol -> metric -> plan; ``seeds`` are those of the runs."""
+    """``protocols``: protocol -> metric -> plan; ``seeds``: the seeds of the runs."""
 
     left: str
     right: str
@@ -325,7 +327,7 @@ class Plan:
     remarks: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values in full precision, null where undefined."""
+        """JSON values in full precision, null if undefined."""
         return {"schema": PLAN_SCHEMA, **plain_json(asdict(self))}
 
 
@@ -337,14 +339,14 @@ def plan(
     protocols: Sequence[str] = (),
     power: float = statistics.POWER,
 ) -> Plan:
-    """What shows differences of ``points`` per cent between two methods, from ``runs`` that differ in their seed alone.
+    """Power analysis for differences of ``points`` per cent between two methods, from ``runs`` differing only in seed.
 
-    Without ``methods`` the runs' only two. Raises ``ConfigError`` where the runs do not belong together, hold one seed
-    twice, or too little to tell how differences vary.
+    ``methods`` defaults to the runs' only two. Raises ``ConfigError`` if the runs do not match, have the same seed
+    twice, or have too few scenes to estimate how differences vary.
     """
     for value in points:
         if not 0 < value <= 100:
-            raise ConfigError(f"--points {value:g}: expected per cent above 0 and at most 100")
+            raise ConfigError(f"--points {value:g}: expected a percentage above 0 and at most 100")
     if not 0.05 < power < 1:
         raise ConfigError(f"--power {power:g}: expected a probability above 0.05 and below 1, such as 0.8")
     read = [read_run(path) for path in dict.fromkeys(runs)]
@@ -353,7 +355,7 @@ def plan(
     if len(pair) != 2 or pair[0] == pair[1]:
         known = ", ".join(printable(name, 80) for name in first.methods)
         raise ConfigError(
-            f"{first.name}: a difference is of two methods; name them with --methods A B (it has {known})"
+            f"{first.name}: expected two different methods; name them with --methods A B (available: {known})"
         )
     every = [sides.Side(run, method) for run in read for method in pair]
     sides.check_same_requests(read, set(pair))
@@ -366,7 +368,7 @@ def plan(
         if n_scenes < 2:
             raise ConfigError(
                 f"{first.name}: {counted(n_scenes, 'scene')} {'is' if n_scenes == 1 else 'are'} scored under {name} "
-                "for both methods in every run; at least two tell how a difference varies"
+                "for both methods in every run; at least two scenes are needed"
             )
         over_scenes = list(zip(found[::2], found[1::2], strict=True))
         scenes |= dict.fromkeys(found[0].result.scenes)
@@ -387,7 +389,7 @@ def plan(
 def _plan_metric(
     without_each: Float64Array, of_scenes: Float64Array, points: Sequence[float], power: float
 ) -> MetricPlan:
-    """``without_each`` (R, 1 + G) of each run's difference, ``of_scenes`` (R, S) that of each scene alone."""
+    """``without_each`` (R, 1 + G): each run's jackknifed differences; ``of_scenes`` (R, S): those of single scenes."""
     rows = list(zip(without_each, ~np.isnan(of_scenes), strict=True))
     is_part: BoolArray = np.asarray(np.any([statistics.has_part(*row) for row in rows], axis=0))
     pseudo = np.array([statistics.pseudo_values(values, is_part) for values, _ in rows])

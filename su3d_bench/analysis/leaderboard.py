@@ -1,8 +1,8 @@
-"""Runs below a folder, as a list, and as one ranking where their numbers answer the same question.
+"""Runs below a folder, as a list and as rankings of comparable numbers.
 
-A number enters where its run is whole, its protocol is the one installed here, to the digest, every scene's data have
-the digest that most runs have, it follows from the run's own counts, and it is of as many labels a mask or point as
-most are. Everything else is named with the reason.
+A number is ranked if its run is complete, its protocol is installed here with the same digest, every scene's data have
+the digest that most runs have, the run's counts reproduce it, and it uses the same number of labels per mask or point
+as most. Everything else is excluded with the reason.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from su3d_bench.store.records import MetricsRecord, RunRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
 
 MAX_RUNS = 10_000
-ELSEWHERE = "made elsewhere"  # in the place of a profile
-MAX_NAMED = 4  # methods of what is left out
-MAX_FOLDERS = 1_000_000  # a folder that holds more was not meant
-MAX_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, some minutes at worst
+ELSEWHERE = "made elsewhere"  # shown instead of a profile
+MAX_NAMED = 4  # methods named per line of what is excluded
+MAX_FOLDERS = 1_000_000  # a folder that contains more was given by mistake
+MAX_RANKED = 60  # rows with rank intervals: 1,770 pairwise tests, a few minutes at worst
 
 
 @dataclass(frozen=True)
 class RankingRow:
-    """The numbers of a method of a run under a protocol, as it may stand in a ranking.
+    """The numbers of a method of a run under a protocol, as one row of a ranking.
 
     Values are fractions, in the order of ``headline``.
 
-    ``of_scenes``: the first headline metric of each scene, by which it is told which ranks differ. ``ranks``: the best
-    and the worst that it may have among those that are no ceiling; None where that was not asked for.
+    ``of_scenes``: the first headline metric of each scene, from which rank intervals are computed. ``ranks``: best and
+    worst possible rank among rows that are not ceilings; None if not requested.
     """
 
     run: str
@@ -71,7 +71,7 @@ class RankingRow:
 
     @property
     def ranking(self) -> tuple[str, str, tuple[str, ...]]:
-        """What rows of one ranking share: two people may call their own rules alike, so the rules' digest too."""
+        """What rows of one ranking share; with the rules' digest, as two custom protocols may have the same name."""
         return self.protocol, self.digest, self.scenes
 
 
@@ -80,7 +80,7 @@ AnyRow = TypeVar("AnyRow", bound=RankingRow)
 
 @dataclass(frozen=True)
 class Refused:
-    """What stands in no ranking, and why."""
+    """What is excluded from the rankings, and why."""
 
     run: str
     what: str
@@ -89,16 +89,16 @@ class Refused:
 
 @dataclass(frozen=True)
 class Leaderboard:
-    """One ranking a protocol and set of scenes, the best first."""
+    """One ranking per protocol and set of scenes, the best first."""
 
     boards: tuple[tuple[RankingRow, ...], ...]
     refused: tuple[Refused, ...]
 
 
 def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool = False) -> Leaderboard:
-    """The rankings of all runs below ``folder``, of all protocols or only ``protocols``; links are not followed.
+    """The rankings of all runs below ``folder``, for all protocols or only ``protocols``; links are not followed.
 
-    ``with_ranks``: the ranks that each row of up to ``MAX_RANKED`` may have are found, from tests of all pairs.
+    ``with_ranks``: compute rank intervals from tests of all pairs, for rankings of up to ``MAX_RANKED`` rows.
     """
     entries: list[RankingRow] = []
     refused: list[Refused] = []
@@ -113,8 +113,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
             (entries if isinstance(each, RankingRow) else refused).append(each)  # type: ignore[arg-type]
     if not entries and not refused:
         raise ConfigError(
-            f"{printable(str(folder), 200)}: holds no run below it; su3d-bench run writes one, and evaluate --out "
-            "of predictions made elsewhere"
+            f"{printable(str(folder), 200)}: contains no runs; create one with su3d-bench run, or with evaluate --out "
+            "for predictions made elsewhere"
         )
     boards: list[tuple[RankingRow, ...]] = []
     for key in dict.fromkeys(entry.ranking for entry in entries):
@@ -126,24 +126,24 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
 
 
 def runs_below(folder: Path) -> Iterator[Path]:
-    """The folders of runs below ``folder``, in the order of their names; links are not followed."""
+    """The run folders below ``folder``, sorted by name; links are not followed."""
     if not folder.is_dir():
         if folder.is_file():
-            read_run(folder)  # says what the file is
-        raise ConfigError(f"{printable(str(folder), 200)}: is no folder; name one that holds runs")
+            read_run(folder)  # its error says what the file is
+        raise ConfigError(f"{printable(str(folder), 200)}: is not a folder; name one that contains runs")
     n_runs = 0
     for n_folders, (path, folders, files) in enumerate(os.walk(folder, followlinks=False)):
         if n_folders >= MAX_FOLDERS or n_runs >= MAX_RUNS:
-            raise ConfigError(f"{printable(str(folder), 200)}: holds more than {MAX_RUNS} runs; name a smaller folder")
+            raise ConfigError(f"{printable(str(folder), 200)}: has more than {MAX_RUNS} runs; name a smaller folder")
         folders.sort()
         if "run.json" in files:
-            folders.clear()  # below a run there is no other
+            folders.clear()  # runs are not nested
             n_runs += 1
             yield Path(path)
 
 
 def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[RankingRow | Refused]:
-    """Each number of ``run``, called ``name``, that may stand in a ranking, or why not; of ``protocols`` or all."""
+    """Each number of ``run``, called ``name``, that can be ranked, or why not; for ``protocols`` or all."""
     for (method, protocol), record in run.results.items():
         if protocols and protocol not in protocols:
             continue
@@ -164,7 +164,7 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         recomputed = result.to_json()
         unknown = [scene for scene in result.scenes if scene not in run.record.data_digests]
         if unknown:
-            yield Refused(name, what, f"the data of {printable(unknown[0], 80)} have no digest")
+            yield Refused(name, what, f"no data digest of {printable(unknown[0], 80)}")
             continue
         yield RankingRow(
             run=name,
@@ -186,19 +186,19 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
 
 def _missing_reason(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
     if run.record.is_partial:
-        return f"is partial: the first {counted(run.limit, 'frame')} of each scene"
+        return f"is partial: only the first {counted(run.limit, 'frame')} of each scene"
     if failed:
         return f"is incomplete: {counted(len(failed), 'scene')} failed"
     if protocol in protocol_names() or (protocol in run.protocols and run.protocols[protocol].rules is not None):
         return None
-    return "its protocol is none of those installed here"  # a file that somebody else's run names is not looked for
+    return "its protocol is not installed here"  # protocol files named in a run are not searched for
 
 
 def _alike(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
-    """The entries that may stand in one ranking, and why the others may not.
+    """The entries that can be ranked together, and why the others cannot.
 
-    Their scenes have the data that most have, the first seen of equals, and they give as many labels as most do, but
-    for the ceilings.
+    Their scenes have the data that most entries have (the first on a tie), and except for ceilings they use the number
+    of labels that most use.
     """
     refused = []
     common, _ = Counter(entry.data for entry in entries).most_common(1)[0]
@@ -206,21 +206,21 @@ def _alike(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refuse
     for entry in entries:
         if entry.data != common:
             scene = next(scene for (scene, mine), (_, other) in zip(entry.data, common, strict=True) if mine != other)
-            reason = f"other data of {printable(scene, 80)} than {len(alike)} of {len(entries)} entries have"
+            reason = f"data of {printable(scene, 80)} differ from those of {len(alike)} of {len(entries)} entries"
             refused.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
     rivals = [entry for entry in alike if not entry.is_ceiling]
     if rivals:
         (labels, n), *_ = Counter(entry.labels for entry in rivals).most_common(1)
         for entry in rivals:
             if entry.labels != labels:
-                reason = f"is of {printable(str(entry.labels), 80)}, {n} of {len(rivals)} entries are of {labels}"
+                reason = f"uses {printable(str(entry.labels), 80)}; {n} of {len(rivals)} entries use {labels}"
                 refused.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
         alike = [entry for entry in alike if entry.is_ceiling or entry.labels == labels]
     return alike, refused
 
 
 def in_order(rows: Sequence[AnyRow]) -> tuple[AnyRow, ...]:
-    """The best by the first headline metric first; what was told the truth last."""
+    """Rows sorted by the first headline metric, the best first; rows that use ground truth last."""
 
     def rank(row: RankingRow) -> tuple[bool, float, str, str]:
         first = row.values[0]
@@ -230,7 +230,7 @@ def in_order(rows: Sequence[AnyRow]) -> tuple[AnyRow, ...]:
 
 
 def ranked(board: tuple[AnyRow, ...]) -> tuple[AnyRow, ...]:
-    """The board with the ranks that each row may have; unchanged where nothing competes, or too many rows do."""
+    """The board with rank intervals; unchanged if fewer than two or more than ``MAX_RANKED`` rows are ranked."""
     rivals = [entry for entry in board if not entry.is_ceiling]
     if not 1 < len(rivals) <= MAX_RANKED:
         return board
@@ -242,22 +242,22 @@ def ranked(board: tuple[AnyRow, ...]) -> tuple[AnyRow, ...]:
 
 
 def tables(board_of_runs: Leaderboard, *, intervals: bool) -> list[Table]:
-    """One table a ranking; what was refused stands beneath the last one."""
+    """One table per ranking; excluded numbers are listed in the notes of the last one."""
     made = [_table(board, index, intervals) for index, board in enumerate(board_of_runs.boards)]
     notes = tuple(_left_out(board_of_runs.refused))
     if not made:
-        return [Table("leaderboard", "Leaderboard: no run may stand in a ranking.", "method", (), (), notes)]
+        return [Table("leaderboard", "Leaderboard: no run can be ranked.", "method", (), (), notes)]
     return [*made[:-1], replace(made[-1], notes=(*made[-1].notes, *notes))]
 
 
 def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
-    """One line for what is refused of one run under one protocol for one reason."""
+    """One line per run, protocol and reason for what is excluded."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for refusal in refused:
         method, slash, protocol = refusal.what.rpartition(" / ")
         groups.setdefault((refusal.run, slash + protocol, refusal.reason), []).append(method)
     for (run, where, reason), methods in groups.items():
-        yield f"Left out: {run}, {some(methods, MAX_NAMED)}{where}: {reason}"
+        yield f"Excluded: {run}, {some(methods, MAX_NAMED)}{where}: {reason}"
 
 
 def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
@@ -279,16 +279,16 @@ def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
     scenes = counted(len(first.scenes), "scene")
     notes = [f"Scenes: {', '.join(first.scenes)}."]
     if any(entry.is_ceiling for entry in board):
-        notes.append("Rows that were told the truth stand last and compete with none.")
+        notes.append("Rows that use ground truth are listed last and not ranked.")
     notes += confidence_notes({f"{entry.method} of {entry.run}": entry.confidences for entry in rivals})
     notes += [f"Labels: {said}." for said in {entry.labels: None for entry in rivals if entry.labels}]
     if has_ranks:
         notes.append(
-            f"Rank: from which to which it may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
-            "tests of all pairs, of their means over scenes, corrected by Holm."
+            f"Rank: simultaneous 95 % interval of the rank by {first.headline[0]}, from sign-flip tests of the means "
+            "over scenes of all pairs, corrected by Holm."
         )
     elif intervals and len(rivals) > MAX_RANKED:
-        notes.append(f"No ranks: {len(rivals)} rows are more than the {MAX_RANKED} whose pairs are all tested.")
+        notes.append(f"No ranks: {len(rivals)} rows exceed the limit of {MAX_RANKED} for testing all pairs.")
     if intervals and (rough := few_scenes(len(first.scenes))):
         notes.append(f"{rough[:1].upper()}{rough[1:]}.")
     caption = f"{first.protocol}, version {first.version}, {scenes}; per cent."
@@ -311,7 +311,7 @@ DAMAGED = "run.json is damaged"
 
 @dataclass(frozen=True)
 class Headline:
-    """The first headline metric of a method under a protocol, as a fraction; None where nothing was scored."""
+    """The first headline metric of a method under a protocol, as a fraction; None if nothing was scored."""
 
     method: str
     protocol: str
@@ -321,7 +321,7 @@ class Headline:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """A run in a folder; ``when`` its records were last written, to the minute; ``state`` in words."""
+    """A run in a folder; ``when``: last write of its records, to the minute; ``state``: a readable description."""
 
     name: str
     when: str
@@ -332,15 +332,15 @@ class RunEntry:
 
 
 def list_runs(folder: Path) -> list[RunEntry]:
-    """An entry for each run below ``folder``, the latest last."""
+    """One entry per run below ``folder``, the latest last."""
     found = [(_written(path), run_entry(path, path.relative_to(folder).as_posix())) for path in runs_below(folder)]
     return [entry for _, entry in sorted(found, key=lambda pair: (pair[0], pair[1].name))]
 
 
 def run_entry(path: Path, name: str | None = None) -> RunEntry:
-    """The entry of the run in the folder ``path``; a ``StoreError`` where it holds none."""
+    """The entry of the run in the folder ``path``; ``StoreError`` if there is none."""
     if not any(is_file(path / mark) for mark in MARKS):
-        raise StoreError(f"{shown(path)}: holds no run; a run has a run.json")
+        raise StoreError(f"{shown(path)}: is not a run folder; a run has a run.json")
     record, is_damaged = RunRecord(), False
     try:
         if is_file(path / "run.json"):
@@ -380,11 +380,11 @@ def _state(path: Path, record: RunRecord, metrics: MetricsRecord | None) -> str:
         how_far = f"{counted(len(failed), 'scene')} failed" if record.status == "incomplete" else "complete"
         limit = metrics.limit if metrics is not None else 0
         return f"{how_far}, first {counted(limit, 'frame')} only" if limit else how_far
-    return "not finished"  # a run that was killed still says that it is running
+    return "not finished"  # the record of a killed run still has the status "running"
 
 
 def runs_table(entries: Sequence[RunEntry]) -> Table:
-    """A row a run and method, numbers in per cent."""
+    """One row per run and method, numbers in per cent."""
     rows = []
     for entry in entries:
         first = (entry.when, entry.state, str(len(entry.scenes)))
@@ -398,19 +398,19 @@ def runs_table(entries: Sequence[RunEntry]) -> Table:
 
 
 def removable(path: Path) -> RunFolder:
-    """The run folder at ``path``, which holds a run and nothing else; else a ``StoreError`` that says what keeps it."""
+    """The run folder at ``path``; ``StoreError`` if it must not be removed or contains other files."""
     whole = Path(os.path.abspath(path))
     if whole.is_symlink():
-        raise StoreError(f"{shown(path)}: is a link; name the folder that it leads to, or remove the link yourself")
+        raise StoreError(f"{shown(path)}: is a link; name the folder that it points to, or remove the link yourself")
     if not whole.is_dir() or not any(is_file(whole / mark) for mark in MARKS):
-        raise StoreError(f"{shown(path)}: is no folder of a run, so nothing there is removed")
+        raise StoreError(f"{shown(path)}: is not a run folder; nothing was removed")
     folder = RunFolder(whole)
     if is_locked(whole):
-        raise StoreError(f"{shown(path)}: a run is writing here; end it or wait for it")
+        raise StoreError(f"{shown(path)}: a run is writing here; stop it or wait until it finishes")
     stranger = next(folder.foreign_files(), None)
     if stranger is not None:
         raise StoreError(
-            f"{shown(path)}: holds '{printable(stranger, 200)}', which no run wrote; move it elsewhere first"
+            f"{shown(path)}: contains '{printable(stranger, 200)}', which no run wrote; move it elsewhere first"
         )
     return folder
 

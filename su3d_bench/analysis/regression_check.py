@@ -1,7 +1,7 @@
-"""A run checked against a reference: every number with its tolerance, learnt from earlier runs of the same request.
+"""Regression check of a run against a reference: every number with a tolerance learned from repeats of the run.
 
-A tolerance is what the spread of the taught runs gives: none where they agree to the last bit. What moves a number
-without being one (protocol, data, weights, settings) must not change at all.
+A tolerance comes from the spread of the repeats: zero if they agree to the last bit. Whatever determines the numbers
+(protocol, data, weights, settings) must not change at all.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.verify import wrong_files
 from su3d_bench.store.records import ROUNDING, NumbersRecord, ResultRecord
 
-# Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it,
-# or what is checked slows it: which of them, nobody can tell from inside, so that it excuses a method so far only.
+# If the calibration workload takes this many times the reference's time on the same kind of processor, other processes
+# used it or the checked code slows it. The two cannot be told apart, so the slowdown is only allowed for up to a limit.
 BUSY = 1.5
 MAX_EXCUSED = 2.0
-MAX_CALIBRATION = 1e12  # calibrating pieces of work: many years
-# A part of the whole time must grow by more than this share of all, and by more than one calibrating piece of work: a
-# single call that waited for the processor shows no cost.
+MAX_CALIBRATION = 1e12  # calibration workloads: many years
+# A part of the total time must grow by more than this share of the total, and by more than one calibration workload: a
+# single call that waited for the processor is not a regression.
 MIN_SHARE = 0.05
 MIN_COST_LIMIT = 1.0
 
 Part = Literal["start", "updates", "finish", "whole"]
 SHOWN: Mapping[Part, str] = {
-    "start": f"start and the first {WARM_UP} updates",
-    "updates": f"the updates after {WARM_UP}",
+    "start": f"start and first {WARM_UP} updates",
+    "updates": f"updates after the first {WARM_UP}",
     "finish": "finish",
-    "whole": "all together",
+    "whole": "all stages",
 }
 
 
 class Cost(BaseModel):
-    """Times of a method over all scenes, over the calibrating piece of work of each.
+    """Times of a method summed over all scenes, each in units of its scene's calibration workload.
 
-    ``start``: before the fourth update, what the method did before the first included; ``updates``: the others, as
-    their median times their number; ``finish``: every map and what follows; ``whole``: everything, no median taken.
+    ``start``: setup and the first ``WARM_UP`` updates; ``updates``: the others, as their median times their number;
+    ``finish``: every map and what follows; ``whole``: everything, without medians.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -62,14 +62,14 @@ class Cost(BaseModel):
 
     @classmethod
     def middle(cls, costs: list[Cost]) -> Cost:
-        """The median of the costs of repeats, part by part."""
+        """The median of the costs of repeats, per part."""
         return cls(**{part: float(np.median([getattr(cost, part) for cost in costs])) for part in SHOWN})
 
 
 def method_cost(run: FinishedRun, method: str, most_calibration_ms: float = np.inf) -> Cost | None:
-    """The cost of a method over the scenes with enough updates; None where ``no_cost_reason`` says so.
+    """The cost of a method over the scenes with enough updates; None if ``no_cost_reason`` has a reason.
 
-    ``most_calibration_ms``: more than that of the calibrating work is not believed.
+    ``most_calibration_ms``: the time of the calibration workload is capped at this value.
     """
     if no_cost_reason(run, method) is not None:
         return None
@@ -94,24 +94,24 @@ def _of_scene(times: UpdateTimes, most_calibration_ms: float) -> dict[Part, floa
 
 
 def no_cost_reason(run: FinishedRun, method: str) -> str | None:
-    """Why a run says nothing of the cost of ``method``; None where it does."""
+    """Why a run has no cost of ``method``; None if it has one."""
     if method in run.external:
-        return "was made elsewhere and brings no times"
+        return "was evaluated from predictions made elsewhere, which have no times"
     timed = read_update_times(run, method)
     n_most = max((len(times) for times in timed), default=0)
     if n_most <= WARM_UP:
-        what = f"has {counted(n_most, 'update')} a scene at most" if n_most else "looks at no frame"
-        return f"{what}, and a cost is learnt from {WARM_UP + 1} on"
+        what = f"has at most {counted(n_most, 'update')} per scene" if n_most else "uses no frames"
+        return f"{what}; measuring the cost takes at least {WARM_UP + 1}"
     measured = [times for times in timed if len(times) > WARM_UP]
     if any("method_ms" not in times.columns or None in (times.start_ms, times.close_ms) for times in measured):
         return "was timed by an older version, which did not measure around the method; run it again"
     if not all(times.calibration_ms and times.maps for times in measured):
-        return "was run without the calibrating work; run it again"
+        return "was run without the calibration workload; run it again"
     return None if any(times.ms(MAP).any() for times in measured) else "took no time at all"
 
 
 def calibration_of(run: FinishedRun) -> float | None:
-    """Median milliseconds of the calibrating work over scenes and methods; None where nothing was updated."""
+    """Median milliseconds of the calibration workload over scenes and methods; None if there were no updates."""
     every = [times.calibration_ms for method in run.methods for times in read_update_times(run, method)]
     known = [milliseconds for milliseconds in every if milliseconds]
     return float(np.median(known)) if known else None
@@ -120,7 +120,7 @@ def calibration_of(run: FinishedRun) -> float | None:
 def compare_costs(
     run: FinishedRun, costs: Mapping[str, Cost], calibration_ms: float | None, limit: float
 ) -> tuple[list[Finding], list[Compared]]:
-    """What costs more than ``limit`` times the reference's ``costs`` or was not measured, and each part beside it."""
+    """Findings on costs that exceed ``limit`` times the reference's or were not measured, and all compared parts."""
     findings, numbers = list[Finding](), list[Compared]()
     most = np.inf if calibration_ms is None else MAX_EXCUSED * calibration_ms
     for method, before in costs.items():
@@ -137,31 +137,29 @@ def compare_costs(
             numbers.append(Compared(where, shown, was, cost, times=limit))
             least = MIN_COST_LIMIT if part == "whole" else max(MIN_COST_LIMIT, MIN_SHARE * before.whole)
             if cost > limit * was and cost - was > least:
-                times = f"{cost / was:.2f} times" if was else "what was nothing in"
-                text = f"costs {times} the reference; {limit:g} times are allowed"
+                times = f"takes {cost / was:.2f} times as long as" if was else "takes time, but none in"
+                text = f"{times} the reference; at most {limit:g} times as long is allowed"
                 findings.append(Finding("cost", f"{where} of {shown}", text, was, cost))
     return findings, numbers
 
 
 def busy_remark(run: FinishedRun, calibration_ms: float | None) -> str | None:
-    """That the calibrating work was slow; None where it was not."""
+    """A remark that the calibration workload was slow; None if it was not."""
     now = calibration_of(run)
     if now is None or calibration_ms is None or now <= BUSY * calibration_ms:
         return None
     return (
-        f"the calibrating work took {now:.3g} ms, {now / calibration_ms:.1f} times the reference's: others used "
-        f"the processor, or what is checked slows it; that excuses {MAX_EXCUSED:g} times the cost at most"
+        f"the calibration workload took {now:.3g} ms, {now / calibration_ms:.1f} times the reference's: the processor "
+        f"was busy, or the checked code slows it; costs are corrected for this by at most a factor of {MAX_EXCUSED:g}"
     )
 
 
 SCHEMA: Literal[2] = 2
-SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
-ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
-COST_LIMIT = (
-    1.3  # a method may cost so many times the reference's; `python benchmarks regression_check_repeats` has the scatter
-)
+SPREADS = 2.0  # tolerance in ranges of the learned values: with 1, 2 of 50 unchanged repeats would fail
+ACROSS_MACHINES = 0.02  # 2 points: effect of ONNX Runtime and BLAS kernels of other processors on a headline value
+COST_LIMIT = 1.3  # maximum slowdown factor of a method; `python benchmarks regression_check_repeats` has the scatter
 MAX_COST_LIMIT = 1000.0
-# Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
+# Settings that state the request or change no number; scenes, methods and protocols are compared one by one.
 NOT_COMPARED = frozenset({"scenes", "methods", "protocols", "perception.cache"}) | NEUTRAL_SETTINGS
 
 
@@ -170,7 +168,7 @@ class _Model(BaseModel):
 
 
 class Value(_Model):
-    """A fraction, None where it is undefined, and by how much another run may differ from it."""
+    """A fraction, None if undefined, and by how much another run may differ from it."""
 
     value: float | None = Field(allow_inf_nan=False)
     tolerance: float = Field(default=0.0, ge=0, le=SPREADS * (1 + ROUNDING), allow_inf_nan=False)
@@ -197,17 +195,17 @@ class MethodResult(_Model):
 
     @model_validator(mode="after")
     def _can_fail(self) -> Self:
-        """A reference without a number would pass every run that has none either."""
+        """Reject a reference without numbers: every run without numbers would pass it."""
         if all(value.value is None for value in self.metrics.values()):
             raise ValueError(f"{self.method} under {self.protocol} has no value")
         return self
 
 
 class Reference(_Model):
-    """What a run is held against; ``costs``: of each method, over the calibrating piece of work.
+    """What a run is compared with; ``costs``: per method, in units of the calibration workload.
 
-    ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone. ``calibration_ms``:
-    of that piece of work.
+    ``processor``: digest of the processor's kind; byte-equality is only promised on one kind. ``calibration_ms``: time
+    of the calibration workload.
     """
 
     schema_version: Literal[2]
@@ -226,18 +224,18 @@ class Reference(_Model):
 
 
 def read_reference(path: Path) -> Reference:
-    """The reference in ``path``; ``ConfigError`` where it is none."""
+    """The reference in ``path``; ``ConfigError`` if it is not one."""
     try:
         return Reference.model_validate(read_json(path))
     except StoreError as error:
         raise ConfigError(
-            f"{error.args[0].partition(';')[0]}; make a reference with su3d-bench check --build-from RUN"
+            f"{error.args[0].partition(';')[0]}; create a reference with su3d-bench check --build-from RUN"
         ) from error
     except (ValidationError, RecursionError) as error:
-        what = _fault(error) if isinstance(error, ValidationError) else "is nested too deep"
+        what = _fault(error) if isinstance(error, ValidationError) else "is nested too deeply"
         raise ConfigError(
-            f"{printable(str(path), 200)}: is no reference of this version: {what}; make one with su3d-bench check "
-            "--build-from RUN"
+            f"{printable(str(path), 200)}: is not a reference of this version: {what}; create one with su3d-bench "
+            "check --build-from RUN"
         ) from error
 
 
@@ -251,11 +249,11 @@ def _fault(error: ValidationError) -> str:
 def learn(
     runs: Sequence[FinishedRun], machine_tolerance: float = ACROSS_MACHINES, cost_limit: float = COST_LIMIT
 ) -> Reference:
-    """A reference from complete ``runs`` of one request, which must agree in everything that is not a measurement."""
+    """A reference from complete repeats of one run, which must agree in everything that is not a measurement."""
     first = runs[0]
     for run in runs:
         if run.is_incomplete:
-            raise ConfigError(f"{run.name}: is incomplete; a reference is learnt from complete runs")
+            raise ConfigError(f"{run.name}: is incomplete; a reference can only be learned from complete runs")
         if differing := next(differing_keys(settings_of(first), settings_of(run)), None):
             raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
         if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
@@ -264,7 +262,7 @@ def learn(
             raise ConfigError(f"{run.name}: {where}: {fault}; run its command again")
     tables = [run.results for run in runs]
     if any(set(table) != set(tables[0]) for table in tables):
-        raise ConfigError(f"{first.name}: the runs hold different methods or protocols; learn from repeats of one run")
+        raise ConfigError(f"{first.name}: the runs have different methods or protocols; learn from repeats of one run")
     known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in first.methods}
     calibrations = [milliseconds for run in runs if (milliseconds := calibration_of(run)) is not None]
     return Reference(
@@ -291,7 +289,7 @@ def _learn_result(repeats: Sequence[ResultRecord]) -> MethodResult:
         raise ConfigError(f"{first.method} under {first.protocol}: was not scored; learn from runs with numbers")
     if all(result.metrics.get(name) is None for result in numbers for name in first.headline):
         raise ConfigError(
-            f"{first.method} under {first.protocol}: has no value to hold a run against; learn without this protocol"
+            f"{first.method} under {first.protocol}: has no value to compare with; learn without this protocol"
         )
     scenes = [{scene: _only(row, first.headline) for scene, row in result.per_scene.items()} for result in numbers]
     return MethodResult(
@@ -322,13 +320,13 @@ def _learn_values(repeats: Sequence[Mapping[str, float | None]]) -> dict[str, Va
 
 
 def settings_of(run: FinishedRun) -> dict[str, str]:
-    """The settings that must be those of the reference."""
+    """The settings that must equal those of the reference."""
     keys = {".".join(path): str(value) for path, value in run.settings.items()}
     return {key: value for key, value in sorted(keys.items()) if key not in NOT_COMPARED}
 
 
 def differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
-    """Each key that differs, with what it was and is."""
+    """Each key that differs, with its old and new value."""
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
             yield key, before.get(key, "not set"), now.get(key, "not set")
@@ -340,7 +338,7 @@ _OF_BOXES = ("centroid", "class", "recall25", "recall50", "precision25", "precis
 _OF_LABELS = ("label n", "label n'", "well-merged", "well-merged n'")
 _JUDGED = (*_OF_QUESTIONS, *_OF_LABELS)
 _OF_SEGMENTS = PanopticRules.values_of_metric["panopticapi"]
-# whether yes is said too often or too seldom depends on where one stands
+# yes-rate has no direction: it can be too high or too low
 _OF_PRESENCE = tuple(name for name in PresenceQuestionRules.values_of_metric["pope"] if "yes-rate" not in name)
 HIGHER_IS_BETTER = frozenset(
     {
@@ -351,7 +349,7 @@ HIGHER_IS_BETTER = frozenset(
 
 
 def check(run: FinishedRun, reference: Reference) -> Verdict:
-    """Everything in which ``run`` differs from ``reference``, failures and improvements."""
+    """Everything in which ``run`` differs from ``reference``, both failures and improvements."""
     is_same_machine = run.record.processor == reference.processor
     findings = [*_identity(run, reference)]
     findings += [Finding("changed", where, fault) for where, fault in wrong_files(run)]
@@ -362,7 +360,7 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
         where = f"{printable(expected.method, 80)} / {printable(expected.protocol, 80)}"
         measured = table.get((expected.method, expected.protocol))
         if measured is None or measured.result is None:
-            findings.append(Finding("missing", where, "the run has no score of it"))
+            findings.append(Finding("missing", where, "the run has no score for it"))
             continue
         if measured.profile != expected.profile:
             findings.append(_changed(where, "profile", expected.profile, measured.profile))
@@ -381,24 +379,24 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
     for method in run.methods:
         if method in methods and method not in costs:
             if (reason := no_cost_reason(run, method)) is not None:
-                remarks.append(f"{printable(method, 80)}: no cost is judged: it {reason}")
+                remarks.append(f"{printable(method, 80)}: cost not checked: it {reason}")
             else:
-                text = "the reference holds none and the run measured it; learn a new reference"
+                text = "the run has a cost, but the reference has none; learn a new reference"
                 findings.append(Finding("missing", f"{printable(method, 80)} / cost", text))
     shown = (*numbers, *of_costs) if is_same_machine else tuple(numbers)
     return Verdict(run.name, tuple(findings), len(numbers), tuple(remarks), shown)
 
 
 def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
-    """What was not judged, and why."""
+    """Remarks on what was not checked, and why."""
     if run.record.processor != reference.processor:
         here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
-        which = f"another processor ({here}) than the reference's ({there})"
+        which = f"the processor ({here}) is not the reference's ({there})"
         if here == there:
-            which = f"another processor of the same name as the reference's ({here}), with other instruction sets"
+            which = f"the processor has the same name as the reference's ({here}), but other instruction sets"
         yield (
-            f"{which}: headline values are compared within "
-            f"{100 * reference.machine_tolerance:g} points, scenes and classes by presence, costs are not judged"
+            f"{which}: headline values are compared within {100 * reference.machine_tolerance:g} points, scenes and "
+            "classes only for presence, costs are not checked"
         )
     elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
@@ -407,14 +405,14 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
     others = [*(method for method in run.methods if method not in known)]
     others += [name for name in run.protocols if name not in reference.protocols]
     if others:
-        yield f"the reference does not know, so that nothing holds: {', '.join(printable(name, 80) for name in others)}"
+        yield f"not in the reference, so not checked: {', '.join(printable(name, 80) for name in others)}"
 
 
 def _unknown(where: str, kind: str, known: Collection[str], measured: Collection[str]) -> Iterator[Finding]:
-    """A finding for whatever the run has and the reference has not."""
+    """One finding for each name that the run has and the reference does not."""
     for name in measured:
         if name not in known:
-            text = f"the reference does not have this {kind}; learn a new one"
+            text = f"the reference does not have this {kind}; learn a new reference"
             here = f"{where} / {kind} {printable(name, 80)}"
             yield Finding("changed", here, text, group=f"{where} / {plural(kind)}")
 
@@ -454,10 +452,10 @@ def _short(value: object) -> str:
 
 
 def compared(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
-    """Every number that differs, or that one of the two lacks.
+    """Findings for every number that differs, or that only one of the two has.
 
-    ``across``: the tolerance of headline values of another machine; None on the same one. Where the scenes differ,
-    which fails, what is formed over all of them is not compared.
+    ``across``: tolerance of headline values from another machine; None on the same one. If the scenes differ (itself a
+    failure), values over all scenes are not compared.
     """
     if expected.scenes.keys() == measured.per_scene.keys():
         yield from _compare(where, expected.metrics, measured.metrics, across)
@@ -475,7 +473,7 @@ def _rows(
     rows: Mapping[str, Mapping[str, float | None]],
     across: float | None,
 ) -> Iterator[Finding]:
-    """What differs in the values of each scene or class; on another machine whether they are there."""
+    """Findings for values of scenes or classes that differ; on another machine, only for missing ones."""
     for name, values in tables.items():
         row, here = rows.get(name), f"{where} / {kind} {printable(name, 80)}"
         found: Iterable[Finding] = ()

@@ -1,4 +1,4 @@
-"""Why one prediction has two numbers: the way from one protocol to another, rule by rule, and what each rule adds."""
+"""Rule attribution: how much each rule contributes to the difference between two protocols' scores of a prediction."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1
-# Of these the truth of a dataset is all that is needed, and a prediction is scored without a question.
+# These kinds need only the ground truth of a dataset, and score a prediction without questions.
 KINDS = ("semantic", "instance", "panoptic")
 
 
 @dataclass(frozen=True)
 class Step:
-    """Rules that move together, and by the name of a value what they add to it."""
+    """Rules that change together, and what they add to each value, by its name."""
 
     rules: tuple[str, ...]
     adds: Mapping[str, Share]
@@ -36,9 +36,9 @@ class Step:
 
 @dataclass(frozen=True)
 class RulePath:
-    """From ``start``, the values under the first protocol, to ``end``: those of ``start`` and all shares sum to it.
+    """Rule attribution from ``start``, the values under the first protocol, to ``end``: start plus all shares.
 
-    ``scenes`` are those of ``run`` whose predictions by ``method`` were scored; ``n_orders`` None: all of them.
+    ``scenes``: the scenes of ``run`` whose predictions by ``method`` were scored; ``n_orders`` None: all orders.
     """
 
     run: str
@@ -52,7 +52,7 @@ class RulePath:
 
 @dataclass(frozen=True)
 class RulesApart:
-    """The rules in which two protocols differ, and the walk from one to the other where a prediction was given."""
+    """The rules in which two protocols differ, and their attribution if a prediction was given."""
 
     first: str
     second: str
@@ -60,13 +60,13 @@ class RulesApart:
     walk: RulePath | None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, fractions in full precision."""
+        """JSON values, fractions in full precision."""
         return {"schema": SCHEMA, **plain_json(asdict(self))}
 
 
 @dataclass(frozen=True)
 class _Unit:
-    """What one process scores: a scene under all ``choices`` of rules."""
+    """The work of one process: a scene under all ``choices`` of rules."""
 
     folder: Path
     method: str
@@ -75,18 +75,18 @@ class _Unit:
     choices: tuple[int, ...]
 
 
-# Of a scene, by the choice of rules, as they are packed in files: 256 confusion matrices of 200 classes are 82 MB.
+# Choice of rules -> packed scores of a scene, as in files: 256 confusion matrices of 200 classes are 82 MB.
 Scores = Mapping[int, bytes]
 
 
 def rules_apart(first: ProtocolRules, second: ProtocolRules, walk: RulePath | None = None) -> RulesApart:
-    """In which rules two protocols differ, with a ``walk`` between them; ``ConfigError`` for two kinds."""
+    """The rules in which two protocols differ, with the attribution ``walk``; ``ConfigError`` if their kinds differ."""
     return RulesApart(first.name, second.name, tuple(differing(first, second)), walk)
 
 
 @dataclass(frozen=True)
 class RuleStepper:
-    """A prediction that is to be scored under all protocols between two."""
+    """A prediction to be scored under all protocols between two."""
 
     mixtures: Mixtures
     run: FinishedRun
@@ -97,12 +97,12 @@ class RuleStepper:
     def of(cls, first: ProtocolRules, second: ProtocolRules, prediction: str) -> RuleStepper:
         """For ``prediction``, a ``RUN[:METHOD]``.
 
-        ``ConfigError`` for protocols of two kinds, of two label spaces, or which ask questions, and for a run of which
-        a map is missing.
+        Raises ``ConfigError`` if the protocols have different kinds or label sets or ask questions, or if the run lacks
+        a map.
         """
         mixtures = Mixtures(first, second)
         if first.kind not in KINDS:
-            raise ConfigError(f"--prediction takes protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
+            raise ConfigError(f"--prediction needs protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
         runs, named = parse_side(prediction, None)
         if len(runs) > 1:
             raise ConfigError(f"{printable(prediction, 200)}: names several runs; give one")
@@ -114,10 +114,10 @@ class RuleStepper:
         return cls(mixtures, run, method, run.scenes)
 
     def walk(self, jobs: int = 1, report: Report = lambda event: None) -> RulePath:
-        """Score every choice of rules, ``jobs`` scenes side by side.
+        """Score every choice of rules, ``jobs`` scenes in parallel.
 
-        ``PredictionError`` and ``DataError`` for what cannot be scored under a protocol between the two, or has no
-        value there.
+        Raises ``PredictionError`` or ``DataError`` if a prediction cannot be scored, or has no value, under a protocol
+        between the two.
         """
         mixtures, n = self.mixtures, len(self.mixtures.groups)
         asked = tuple(choices(n))
@@ -137,7 +137,7 @@ class RuleStepper:
             undefined = [name for name in mixtures.values if not math.isfinite(found[name])]
             if undefined:
                 raise PredictionError(
-                    f"{self.run.name}: {undefined[0]} is undefined under {rules.name}; nothing to split"
+                    f"{self.run.name}: {undefined[0]} is undefined under {rules.name}; cannot attribute rules"
                 )
             return found
 

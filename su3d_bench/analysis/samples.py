@@ -1,8 +1,8 @@
-"""Runs taken apart to single instances: what each predicted mask met, which instance of the truth nothing met.
+"""Per-instance rows of runs: the best match of each predicted mask and each ground-truth instance.
 
-A row is what the evaluator itself saw: the masks on the points of the truth, under the names and confidences that
-count; of points, those that it counts, by the object that they are of and by the mask that names them. Counts that
-differ from those of the run are refused, as where errors are explained.
+A row shows what the evaluator itself used: masks on the ground-truth points, with the names and confidences that
+count; for point metrics, the points that it counts, by their object and by the mask that names them. Counts that differ
+from those of the run are an error, as in error attribution.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ EMPTY_MAP_SIMILARITY: Box = (None,) * 6
 
 @dataclass(frozen=True)
 class Samples:
-    """The rows, and ``remarks``: what has none and why, what must be known of the runs."""
+    """The rows, and ``remarks``: what has no rows and why, and caveats of the runs."""
 
     rows: tuple[Sample, ...]
     remarks: tuple[str, ...]
@@ -48,7 +48,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Selection:
-    """Methods, protocols and scenes by name; all that a run has where none is named."""
+    """Methods, protocols and scenes by name; by default all that a run has."""
 
     methods: Sequence[str] = ()
     protocols: Sequence[str] = ()
@@ -60,9 +60,9 @@ def samples(
     chosen: Selection = Selection(),
     report: Report = lambda event: None,
 ) -> Samples:
-    """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of ``KINDS``.
+    """The instances of the runs in the folders ``paths``, scene by scene, under each supported protocol.
 
-    A ``ConfigError`` where nothing has instances, or a name is not one of the run.
+    Raises ``ConfigError`` if nothing has instances or the run does not have a given name.
     """
     rows: list[Sample] = []
     remarks: list[str] = []
@@ -75,18 +75,18 @@ def samples(
             report(Event(f"{run.name} {scene}", SCENE_DONE, n, len(scenes)))
         remarks += run_remarks(run)
     if not rows and remarks:
-        raise ConfigError(f"{remarks[0]}; nothing has instances to list")
+        raise ConfigError(f"{remarks[0]}; there are no instances to list")
     return Samples(tuple(rows), tuple(dict.fromkeys(remarks)))
 
 
 def _chosen_methods(run: FinishedRun, chosen: Selection, remarks: list[str]) -> list[Explained]:
-    """The methods that are listed; ``remarks`` gets why another has no rows."""
+    """The methods that are listed; adds to ``remarks`` why another has no rows."""
     for method in chosen.methods:
         run.check_method(method)
     for scene in chosen.scenes:
         if scene not in run.scenes:
             hint = suggest(scene, run.scenes, "it has")
-            raise ConfigError(f"{run.name}: holds no scene '{printable(scene, 100)}'{hint}")
+            raise ConfigError(f"{run.name}: has no scene '{printable(scene, 100)}'{hint}")
     methods = []
     for method in chosen.methods or run.methods:
         try:
@@ -158,10 +158,10 @@ def _rows(
 
 
 class _OfPoints:
-    """The counted points of a scene by what they are of, and by what named them.
+    """The counted points of a scene, grouped by ground-truth object and by predicted name.
 
-    An object is an instance of one class, or all points of a class that belong to none; a naming is all that one mask
-    names one class, or without masks all that is named so. Both are rows of ``_distinct``.
+    An object is an instance of one class, or all points of a class without an instance; a naming is all points that one
+    mask gives one class, or without masks all points predicted as that class. Both are rows of ``_distinct``.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class _OfPoints:
             self._names = [printable(name, MAX_NAME_CHARACTERS) for name in names_of(prediction)]
 
     def rows(self, where: tuple[str, str, str, str]) -> Iterator[Sample]:
-        """What is named, and then what is there."""
+        """The predicted rows, then the ground-truth rows."""
         names, iou = self._classes, self._overlaps()
         called_as = np.array([called for called, _ in self._namings], np.int64)
         true_class = np.array([true for true, _ in self._objects], np.int64)
@@ -226,7 +226,7 @@ class _OfPoints:
             )  # fmt: skip
 
     def _overlaps(self) -> Float64Array:
-        """The IoU (K, G) of each naming and object over the counted points."""
+        """The IoU (K, G) of each naming with each object over the counted points."""
         n, m = len(self._namings), len(self._objects)
         is_named = self._naming_of >= 0
         shared = np.bincount(self._naming_of[is_named] * m + self._object_of[is_named], minlength=n * m).reshape(n, m)
@@ -238,7 +238,7 @@ class _OfPoints:
         return int(self._is_right[members].sum())
 
     def _error(self, members: Int64Array) -> str:
-        """The cause of most of the wrong points; of as many of two the first that is looked for."""
+        """The cause of most of the wrong points; on a tie, the first in ``CAUSES``."""
         causes = self._cause[members]
         n = np.bincount(causes[causes >= 0], minlength=len(CAUSES))
         return CAUSES[int(n.argmax())] if n.any() else ""
@@ -248,7 +248,7 @@ class _OfPoints:
 
 
 def _distinct(classes: Int64Array, numbers: Int64Array) -> tuple[list[tuple[int, int]], Int64Array]:
-    """The pairs that there are, ascending by number and then class, and which of them each point has."""
+    """The distinct pairs, ascending by number and then class, and the index of each point's pair."""
     pairs, place = np.unique(np.stack([numbers, classes], axis=1), axis=0, return_inverse=True)
     return [(int(one), int(number)) for number, one in pairs], place.reshape(-1)
 
@@ -265,7 +265,7 @@ def _ids(prediction: Instances | Partition, n: int) -> list[int]:
 
 
 def _best(iou: Float64Array) -> tuple[int | None, float]:
-    """Where the highest IoU is, the first of equals, and that; nowhere where it is 0."""
+    """The index of the highest IoU (the first on a tie; None if it is 0), and the IoU."""
     place = int(iou.argmax()) if len(iou) else 0
     best = float(iou[place]) if len(iou) else 0.0
     return (place if best > 0 else None), best

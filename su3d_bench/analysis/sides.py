@@ -1,4 +1,4 @@
-"""The two sides of a comparison: which runs and methods they are, and whether they may be compared at all."""
+"""The two sides of a comparison: their runs and methods, and checks that they are comparable."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from su3d_bench.numerics.statistics import leave_one_out
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
 
-# They move no number of a common scene.
+# Settings that do not change any number of a common scene.
 _SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | NEUTRAL_SETTINGS
 
 
 @dataclass(frozen=True)
 class Side:
-    """A run and one of its methods, and with ``others`` the same method of runs that differ in their seed alone."""
+    """A run and one of its methods; ``others`` are runs with the same method that differ only in their seed."""
 
     run: FinishedRun
     method: str
@@ -41,38 +41,38 @@ class Side:
 
     @property
     def each(self) -> tuple[Side, ...]:
-        """A side for each of the runs."""
+        """One side per run."""
         return tuple(Side(run, self.method) for run in self.runs)
 
 
 def parse_side(text: str, method: str | None) -> tuple[tuple[FinishedRun, ...], str | None]:
-    """The runs of ``FOLDER`` or ``FOLDER,FOLDER``, and the method if one is named behind a colon or by ``method``."""
+    """The runs of ``FOLDER`` or ``FOLDER,FOLDER``, and the method if it is named after a colon or by ``method``."""
     if folders := _folders(text):
         return tuple(map(read_run, folders)), method
     before, colon, name = text.rpartition(":")
     if colon and (folders := _folders(before)):
         if method is not None and method != name:
-            raise ConfigError(f"{printable(text, 200)}: names the method '{name}', --method names '{method}'")
+            raise ConfigError(f"{printable(text, 200)}: names the method '{name}', but --method is '{method}'")
         return tuple(map(read_run, folders)), name
     for path in (Path(text), Path(before)):
         if path.is_file():
-            read_run(path)  # says what the file is
-    raise ConfigError(f"{printable(text, 200)}: there is no such folder; name that of a run, such as runs/my-run")
+            read_run(path)  # its error says what the file is
+    raise ConfigError(f"{printable(text, 200)}: no such folder; give the folder of a run, such as runs/my-run")
 
 
 def _folders(text: str) -> list[Path]:
-    """The folder or folders that ``text`` names; none where one of them is missing."""
+    """The folders named by ``text``; empty if one of them is missing."""
     folders = [Path(text)] if Path(text).is_dir() else [Path(part) for part in text.split(",") if part]
     return folders if all(folder.is_dir() for folder in folders) else []
 
 
-Named = tuple[Sequence[FinishedRun], str | None]  # the runs of a side and the method, where one is named
+Named = tuple[Sequence[FinishedRun], str | None]  # the runs of a side and the method, if one is named
 
 
 def pair_methods(left: Named, right: Named) -> list[tuple[Side, Side]]:
-    """The methods that are compared with each other: those named, else those of one name, else the only ones.
+    """The pairs of methods to compare: those named, otherwise those of the same name, otherwise the only ones.
 
-    A ``ConfigError`` where the runs of a side differ in more than their seed.
+    Raises ``ConfigError`` if the runs of a side differ in more than their seed.
     """
     (run, *more), name = left
     (other, *more_others), other_name = right
@@ -81,7 +81,7 @@ def pair_methods(left: Named, right: Named) -> list[tuple[Side, Side]]:
     if is_one_run and name == other_name:
         shown = run.name if name is None else f"{run.name}:{name}"
         raise ConfigError(
-            f"{shown}: both sides are the same; name two runs, or two methods of one as {run.name}:METHOD"
+            f"{shown}: both sides are the same; name two runs, or two methods of one run as {run.name}:METHOD"
         )
     methods = [(each, each) for each in run.methods if each in other.methods]
     if name is not None or other_name is not None or (not methods and len(run.methods) == len(other.methods) == 1):
@@ -94,8 +94,8 @@ def pair_methods(left: Named, right: Named) -> list[tuple[Side, Side]]:
             raise ConfigError(f"{run.name}:{name}: both sides are the same; name two methods of the run")
     if not methods:
         raise ConfigError(
-            f"{run.name} has {', '.join(run.methods)} and {other.name} {', '.join(other.methods)}: no method in "
-            f"common; name one of each, such as {run.name}:{run.methods[0]}"
+            f"{run.name} has {', '.join(run.methods)} and {other.name} has {', '.join(other.methods)}: no common "
+            f"method; name one of each, such as {run.name}:{run.methods[0]}"
         )
     for (runs, _), names in zip((left, right), zip(*methods, strict=True), strict=True):
         check_same_requests(runs, set(names))
@@ -107,22 +107,22 @@ def _same_or_only(run: FinishedRun, name: str) -> str:
 
 
 def check_same_requests(runs: Sequence[FinishedRun], methods: Set[str]) -> None:
-    """A ``ConfigError`` where a run differs from the first in more than the seed, or has a seed that another has."""
+    """Raise a ``ConfigError`` if a run differs from the first in more than the seed, or two runs have the same seed."""
     seen: dict[int, FinishedRun] = {}
     first = runs[0]
     for run in runs:
         for method in methods:
             run.check_method(method)
         if run.record.is_partial != first.record.is_partial or run.limit != first.limit:
-            raise ConfigError(f"{run.name}: has other frames than {first.name}; name runs that differ in --seed alone")
+            raise ConfigError(f"{run.name}: has other frames than {first.name}; name runs that differ only in --seed")
         if changed := settings_that_differ(first, run, methods, aside=("seed",)):
             raise ConfigError(
-                f"{run.name}: differs from {first.name} in {changed[0]}; name runs that differ in --seed alone"
+                f"{run.name}: differs from {first.name} in {changed[0]}; name runs that differ only in --seed"
             )
         seed = run.record.seed or 0
         if seed in seen:
             raise ConfigError(
-                f"{run.name}: has the seed {seed}, as {seen[seed].name} has; a repeat tells nothing of other seeds"
+                f"{run.name}: has the same seed ({seed}) as {seen[seed].name}; name runs with different seeds"
             )
         seen[seed] = run
 
@@ -130,7 +130,7 @@ def check_same_requests(runs: Sequence[FinishedRun], methods: Set[str]) -> None:
 def settings_that_differ(
     left: FinishedRun, right: FinishedRun, methods: Set[str], aside: Sequence[str] = ()
 ) -> list[str]:
-    """What moves numbers and is set otherwise in the two runs, with both values, but for the keys ``aside``."""
+    """The number-changing settings that differ between the two runs, with both values, except the keys ``aside``."""
     if bool(left.record.predictions) != bool(right.record.predictions):
         return []  # predictions made elsewhere have no settings here
     changed = []
@@ -143,7 +143,7 @@ def settings_that_differ(
 
 
 def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[str]:
-    """The protocols ``wanted``, or else all, that scored every run of both sides."""
+    """The protocols ``wanted``, by default all, that scored every run of both sides."""
     runs = [*left.runs, *right.runs]
     common = [name for name in left.run.protocols if all(name in run.protocols for run in runs)]
     for name in wanted:
@@ -152,16 +152,16 @@ def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[st
     if not common:
         raise ConfigError(
             f"{left.run.name} was scored under {', '.join(left.run.protocols) or 'nothing'}, {right.run.name} under "
-            f"{', '.join(right.run.protocols) or 'nothing'}: no protocol in common; score one again with --protocols"
+            f"{', '.join(right.run.protocols) or 'nothing'}: no common protocol; score one again with --protocols"
         )
     return list(dict.fromkeys(wanted)) or common
 
 
 def check_comparable(left: Side, right: Side, protocol: str, scenes: Sequence[str]) -> None:
-    """A ``ConfigError`` that names the first field in which the two differ and that forbids to compare them.
+    """Raise a ``ConfigError`` naming the first differing field that makes the two sides incomparable.
 
-    The encoder counts where it named the instances of both, unless predictions were made elsewhere: there it is the
-    method's own.
+    The encoder is checked if it named the instances of both, unless predictions were made elsewhere: there it belongs
+    to the method.
     """
     where = f"{left.name} and {right.name} cannot be compared"
     rules, others = left.run.protocols[protocol], right.run.protocols[protocol]
@@ -182,19 +182,19 @@ def check_comparable(left: Side, right: Side, protocol: str, scenes: Sequence[st
     truths = [side.run.record.ground_truth for side in (left, right)]
     queries = [None if truth is None else truth.queries for truth in truths]
     if queries[0] != queries[1] and left.run.rules(protocol).ground_truth == QUERY_OBJECTS:
-        raise ConfigError(f"{where}: their queries are of different files; evaluate both with the same --queries")
+        raise ConfigError(f"{where}: their queries come from different files; evaluate both with the same --queries")
     if CEILING_METHOD not in (left.method, right.method):
         given = [side.run.labels(side.method, protocol, left.run.rules(protocol)) for side in (left, right)]
         if None not in given and given[0] != given[1]:
             raise ConfigError(
-                f"{where}: {protocol} is of {given[0]} and of {given[1]}; give both predictions as many labels"
+                f"{where}: {protocol} uses {given[0]} and {given[1]}; give both predictions the same number of labels"
             )
     records = [side.run.results.get((side.method, protocol)) for side in (left, right)]
     named = [record for record in records if record is not None and record.encoder is not None]
     are_elsewhere = left.method in left.run.external or right.method in right.run.external
     if len(named) == 2 and not are_elsewhere and named[0].encoder_digest != named[1].encoder_digest:
         shown = [f"{record.encoder} ({_short(record.encoder_digest)})" for record in named]
-        raise ConfigError(f"{where}: encoder is {printable(' and '.join(shown), 200)}; run both with the same one")
+        raise ConfigError(f"{where}: encoder is {printable(' and '.join(shown), 200)}; run both with the same encoder")
 
 
 def _short(value: int | str | None) -> str:
@@ -202,7 +202,7 @@ def _short(value: int | str | None) -> str:
 
 
 class SideNumbers:
-    """What sides give, made once for all pairs that they are in."""
+    """The numbers of sides, computed once for all pairs that they are part of."""
 
     def __init__(self) -> None:
         self._scores: dict[tuple[Path, str], dict[str, dict[str, SceneScore]]] = {}
@@ -216,10 +216,10 @@ class SideNumbers:
         return self._scores[key]
 
     def over_common(self, protocol: str, sides: Sequence[Side]) -> list[OverScenes]:
-        """Of each of ``sides`` the numbers over the scenes that all have.
+        """The numbers of each of ``sides`` over the scenes that all have; empty if there is no such scene.
 
-        None for no scene; a ``ConfigError`` where one cannot be compared with the first, a ``DataError`` where counts
-        are of other classes than the rules here have.
+        Raises ``ConfigError`` if one cannot be compared with the first, ``DataError`` if counts have other classes than
+        the installed rules.
         """
         scores = [self.scores(side).get(protocol, {}) for side in sides]
         common = [scene for scene in scores[0] if all(scene in of_side for of_side in scores)]
@@ -254,16 +254,16 @@ class OverScenes:
     without_each: Mapping[str, Float64Array]
 
     def of_scenes(self, metric: str) -> Float64Array:
-        """The metric (S,) of each scene alone, NaN where undefined."""
+        """The metric (S,) of each scene, NaN if undefined."""
         return np.array([self.result.per_scene[scene][metric] for scene in self.result.scenes], np.float64)
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """A value of a side: over all scenes, of each scene alone (S,), and over all but each in turn (1 + G,).
+    """A value of a side: over all scenes, of each single scene (S,), and over all, then all but each (1 + G,).
 
-    Of several runs it is their mean, and ``deviation_of_seeds`` how far a single run's value over all scenes lies from
-    it, as a standard deviation; None of one run.
+    For several runs it is their mean, and ``deviation_of_seeds`` the standard deviation of the runs' values over all
+    scenes; None for one run.
     """
 
     value: float
@@ -275,7 +275,7 @@ class Numbers:
 def over_seeds(
     values: Sequence[float], of_scenes: Sequence[Float64Array], without_each: Sequence[Float64Array]
 ) -> Numbers:
-    """The mean over runs, of which each sequence has an entry; undefined where it is undefined in one.
+    """The mean over runs, with one entry per run in each sequence; undefined if it is undefined in one run.
 
     >>> alone, left_out = np.array([0.4, 0.6]), np.array([0.5, 0.6, 0.4])
     >>> found = over_seeds([0.5, 0.7], [alone, alone + 0.2], [left_out, left_out + 0.2])
@@ -289,7 +289,7 @@ def over_seeds(
 
 
 def headline_numbers(side: Sequence[OverScenes], metric: str) -> Numbers:
-    """A headline metric of the runs of a side."""
+    """A headline metric of a side, over its runs."""
     return over_seeds(
         [of_run.result.metrics[metric] for of_run in side],
         [of_run.of_scenes(metric) for of_run in side],
@@ -298,7 +298,7 @@ def headline_numbers(side: Sequence[OverScenes], metric: str) -> Numbers:
 
 
 def class_numbers(rules: ProtocolRules, side: Sequence[OverScenes]) -> dict[tuple[str, str], Numbers]:
-    """(class, column) -> the value of the runs of a side, of what all of them have."""
+    """(class, column) -> the value of a side, for the classes that all its runs have."""
     metric = metric_of(rules)
     n_scenes = len(side[0].result.scenes)
     alone = np.eye(n_scenes, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The numbers of finished runs that a table may show side by side, and what a paper's cells must say of them."""
+"""Numbers of finished runs for tables, and checks of a paper's table cells against them."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _COMMENT = re.compile(r"(?<!\\)%.*")
 
 
 def measured_results(folders: Sequence[Path]) -> list[Measured]:
-    """Every method and protocol of the runs, after it is known that those of one protocol may stand together.
+    """The results of every method and protocol of the runs, after a check that those of one protocol are comparable.
 
-    A folder or file of ``scores.json`` gives what people judged.
+    A folder or file of ``scores.json`` gives the scores by annotators.
 
-    Raises ``ConfigError`` where data, rules or encoder of two runs differ.
+    Raises ``ConfigError`` if data, rules or encoder of two runs differ.
     """
     paths = dict.fromkeys(folders)
     runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
@@ -60,13 +60,13 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
 
 
 def check_scored(measured: Sequence[Measured], paths: Sequence[Path]) -> None:
-    """A ``ConfigError`` where no row has a scene with a score."""
+    """Raise a ``ConfigError`` if no row has a scene with a score."""
     if not any(row.per_scene for row in measured):
-        raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing for a table")
+        raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing to put in a table")
 
 
 def found_tables(paths: Sequence[Path], methods: Sequence[str] = (), datasets: Sequence[str] = ()) -> list[Table]:
-    """A table a run of what its methods found where nothing scores it."""
+    """One table per run of what its methods found in scenes without scores."""
     runs = [read_run(path) for path in dict.fromkeys(paths) if not is_scores(path)]
     tables = []
     for run in runs:
@@ -88,7 +88,7 @@ def is_scores(path: Path) -> bool:
 
 
 def _annotated_rows(path: Path) -> list[Measured]:
-    """What people say of each method and dataset."""
+    """The annotators' scores of each method and dataset."""
     scores = read_scores(path)
     groups: dict[tuple[str, str], list[ScoreCell]] = {}
     for cell in scores.cells:
@@ -126,7 +126,7 @@ def _annotated_rows(path: Path) -> list[Measured]:
 
 
 def _tests_of(scores: Scores, dataset: str, method: str) -> dict[tuple[str, str], SignFlipTest]:
-    """The tests of a method by metric and the other method; that of its own two labels by itself."""
+    """The tests of a method, by metric and other method; the test of its own two labels has its own name as key."""
     found = {}
     labels = [f"{method} {name}" for name in LABEL_METRICS]
     for test in scores.tests:
@@ -141,7 +141,7 @@ def _annotator_summary(scores: Scores, cells: Sequence[ScoreCell]) -> str:
     n_people = len(scores.annotators)
     n_items = max(cell.n_items for cell in cells)
     of = "" if scores.n_judged == scores.n_items else f", {scores.n_judged} of the set's {scores.n_items} judged"
-    return f"judged by {counted(n_people, 'person')}, {counted(n_items, 'item')}{of}"
+    return f"judged by {counted(n_people, 'annotator')}, {counted(n_items, 'item')}{of}"
 
 
 def _results_of(name: str, run: FinishedRun) -> list[Measured]:
@@ -150,7 +150,7 @@ def _results_of(name: str, run: FinishedRun) -> list[Measured]:
 
 
 def _measured(name: str, run: FinishedRun, record: ResultRecord, names: Iterable[str]) -> Measured:
-    """``names``: the protocol's metrics, which are without a value of a method that has none."""
+    """``names``: the protocol's metrics, None for a method without numbers."""
     nothing = dict.fromkeys(names)
     numbers = record.result or NumbersRecord(scenes=(), metrics=nothing, intervals={}, per_scene={}, per_class={})
     return Measured(
@@ -178,7 +178,7 @@ def _measured(name: str, run: FinishedRun, record: ResultRecord, names: Iterable
 
 
 def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) -> list[AnytimePoint]:
-    """The maps midway and the last one of a method in one of ``runs``, where that scored some midway."""
+    """The intermediate maps and the final one of a method in one of ``runs``, if intermediate maps were scored."""
     run = next(run for run in runs if run.name == times[0].run)
     method = times[0].method
     points = []
@@ -190,7 +190,7 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
         if any(len(of_scene.maps) != len(maps) for of_scene in times):
             continue  # the record of a scene's maps is damaged
         for index, (share, metrics) in enumerate(maps):
-            seconds = 0.0  # of the updates before the map, and of its own making
+            seconds = 0.0  # of the updates before the map, and of finishing it
             for of_scene in times:
                 made = of_scene.maps[index]
                 seconds += float(of_scene.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
@@ -202,7 +202,7 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
 def choose(
     measured: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str], datasets: Sequence[str] = ()
 ) -> list[Measured]:
-    """Those of ``methods``, ``protocols`` and ``datasets``, all where none is named, methods in the order asked for."""
+    """The rows of ``methods``, ``protocols`` and ``datasets`` (by default all), methods in the order asked for."""
     for wanted, known, what in (
         (datasets, {scene.partition("/")[0] for row in measured for scene in row.per_scene}, "dataset"),
         (methods, {row.method for row in measured}, "method"),
@@ -211,7 +211,7 @@ def choose(
         for name in wanted:
             if name not in known:
                 hint = suggest(name, sorted(known), "they have")
-                raise ConfigError(f"these runs hold no scores of the {what} '{printable(name, 80)}'{hint}")
+                raise ConfigError(f"these runs have no scores of the {what} '{printable(name, 80)}'{hint}")
     kept = [row for row in measured if not datasets or _is_of(row, datasets)]
     kept = [row for row in kept if not protocols or row.protocol in protocols]
     kept = [row for name in methods for row in kept if row.method == name] if methods else kept
@@ -219,18 +219,18 @@ def choose(
 
 
 def _is_of(row: Measured, datasets: Sequence[str]) -> bool:
-    """Whether all its scenes are of ``datasets``; refused where only some are, for its numbers are of all together."""
+    """Whether all its scenes are of ``datasets``; an error if only some are, because its numbers cover all of them."""
     own = {scene.partition("/")[0] for scene in (*row.per_scene, *row.failed, *row.unscored)}
     if own & set(datasets) and not own <= set(datasets):
         raise ConfigError(
-            f"{row.protocol}: its numbers are of {row.datasets} together; name all of these or none, or run them apart"
+            f"{row.protocol}: its numbers cover {row.datasets} together; name all or none of them, or run each alone"
         )
     return bool(own) and own <= set(datasets)
 
 
 @dataclass(frozen=True)
 class CellCheck:
-    """A cell of a paper: what it shows, what the run gives (None: nothing), and why it fails, None where it holds."""
+    """A cell of a paper: the number shown, the number from the run (None: none), and the fault, None if correct."""
 
     file: str
     line: int
@@ -240,7 +240,7 @@ class CellCheck:
 
 
 class _Recomputed:
-    """Numbers from the counts of runs, each run and protocol scored once."""
+    """Numbers recomputed from the counts of runs, each run and protocol once."""
 
     def __init__(self, roots: Sequence[Path]) -> None:
         self._roots = roots
@@ -253,15 +253,15 @@ class _Recomputed:
         return self._runs[name]
 
     def _place(self, name: str, is_it: Callable[[Path], bool]) -> Path:
-        """Where the run or the scores ``name`` are."""
+        """The path of the run or the scores ``name``."""
         places = [root / name for root in self._roots]
         return next(filter(is_it, places), places[0])
 
     def numbers(self, origin: Origin) -> ProtocolResult | Measured:
-        """Raises ``Su3dError`` where they cannot be had, or are of another version than the cell."""
+        """The numbers of a cell; ``Su3dError`` if they cannot be computed or have another version than the cell."""
         result = self._of_people(origin) if origin.protocol.endswith(ANNOTATED_SUFFIX) else self._result(origin)
         if result.version != origin.version:
-            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {result.version}")
+            raise ConfigError(f"the cell has version {origin.version} of {origin.protocol}, the run {result.version}")
         return result
 
     def _of_people(self, origin: Origin) -> Measured:
@@ -269,7 +269,7 @@ class _Recomputed:
         for row in _annotated_rows(path):
             if (row.protocol, row.method) == (origin.protocol, origin.method):
                 return row
-        raise ConfigError(f"{path}: holds no scores of '{printable(origin.method, 80)}' by people")
+        raise ConfigError(f"{path}: has no scores of '{printable(origin.method, 80)}' by annotators")
 
     def _result(self, origin: Origin) -> ProtocolResult:
         key = (origin.run, origin.method, origin.protocol, "ceiling" if origin.what == "ceiling" else "value")
@@ -288,10 +288,10 @@ class _Recomputed:
 
 
 def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
-    """Every cell of a LaTeX source that names its run, held against what the run's counts give now.
+    """A check of every cell of a LaTeX source that names its run against the run's recomputed numbers.
 
-    What the source reads by ``\\input`` or ``\\include`` from its own folder is part of it. Runs are looked for from
-    ``root``, else from here and then from the folder of ``file``. Raises ``ConfigError`` where no cell names a run.
+    Files included with ``\\input`` or ``\\include`` from the source's folder are checked too. Runs are searched for in
+    ``root``, by default in the current folder, then in that of ``file``. Raises ``ConfigError`` if no cell names a run.
     """
     recomputed = _Recomputed([root] if root is not None else [Path(), file.parent])
     checks = []
@@ -300,12 +300,12 @@ def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
         checks += [_check(cell, shown, recomputed) for cell in printed_cells(text)]
     if not checks:
         shown = printable(str(file), 200)
-        raise ConfigError(f"{shown}: no cell names its run; make the tables with: su3d-bench report tables")
+        raise ConfigError(f"{shown}: no cell names its run; create the tables with: su3d-bench report tables")
     return checks
 
 
 def _sources(file: Path) -> Iterator[tuple[Path, str]]:
-    """The source itself, then what it reads, each file once."""
+    """The source itself, then the files it includes, each once."""
     waiting, known = [file], {os.path.realpath(file)}
     while waiting:
         source = waiting.pop(0)
@@ -319,12 +319,12 @@ def _sources(file: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _read_from(folder: Path, name: str) -> Path | None:
-    """The file in ``folder`` that LaTeX takes for ``name``; None where it is none, or lies elsewhere."""
+    """The file in ``folder`` that LaTeX finds as ``name``; None if there is none or it lies elsewhere."""
     try:
         for path in (folder / name, folder / f"{name}.tex"):
             if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
                 return path
-    except (OSError, ValueError):  # no name that this system can have
+    except (OSError, ValueError):  # not a valid file name on this system
         return None
     return None
 
@@ -361,7 +361,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
 
 
 def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] | None:
-    """What the cell should show: a share in its unit or a count, then its interval; None where the run lacks it."""
+    """The numbers the cell should show: a fraction in its unit or a count, then its interval; None if missing."""
     if origin.what == "scenes":
         return [float(len(result.scenes))]
     value = result.metrics.get(origin.metric)
@@ -382,7 +382,7 @@ def numbered_tables(
     *,
     with_published: bool,
 ) -> list[Table]:
-    """A table or more for each of ``numbers``; ``runs`` are those of ``measured``, among them the sweep of Table I."""
+    """One or more tables per entry of ``numbers``; ``runs``: those of ``measured``, including the sweep of Table I."""
     tables: list[Table] = []
     for number in numbers:
         if number == "I":

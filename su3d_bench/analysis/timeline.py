@@ -1,6 +1,6 @@
-"""Frames, masks, maps and truth of a scene of a run as they came one after another, on one timeline.
+"""Frames, masks, maps and ground truth of a scene of a run on one timeline.
 
-It is a recording of rerun's viewer (``.rrd``), made without a viewer, a display or a network.
+The result is a recording for the rerun viewer (``.rrd``), written without a viewer, a display or a network.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 
-MAX_FRAMES = 60  # of a scene, unless a stride is given
-MAX_WIDTH = 480  # pixels of an image; wider ones are made smaller
-MAX_POINTS = 60_000  # of a map, and of the truth
-NEAR_SPACINGS = 3.0  # a pixel is the instance's whose point lies within so many spacings of the points
-EVERY_PIXEL = 2  # of both axes is asked whose it is
-SEEN_M = 0.05  # between a point and what the camera saw there
-MAX_IDS = 0xFFFF  # rerun's ids have 16 bits, of which 0 says nobody's
+MAX_FRAMES = 60  # per scene, unless a stride is given
+MAX_WIDTH = 480  # pixels of an image; wider ones are downscaled
+MAX_POINTS = 60_000  # of a map, and of the ground truth
+NEAR_SPACINGS = 3.0  # maximum distance of a pixel to its instance's nearest point, in point spacings
+EVERY_PIXEL = 2  # pixel step on both axes at which instances are looked up
+SEEN_M = 0.05  # maximum distance between a point and the measured surface
+MAX_IDS = 0xFFFF  # rerun's ids have 16 bits; 0 means no instance
 UInt16Array = NDArray[np.uint16]
-# A place is a path through these; names of methods stand below them and so can take no other's place.
+# Entity paths; names of methods are only appended below them, so that they cannot collide.
 CAMERA = ("world", "camera")
 MASKS, TRUE_MASKS = (*CAMERA, "masks"), (*CAMERA, "truth")
 MAP, TRUTH, GROWTH, ABOUT = ("world", "map"), ("world", "truth"), ("growth",), ("about",)
 INSTANCES, CLASSES, BOXES = "instances", "classes", "boxes"
-ROOM, TOP = "room", "ceiling"  # parts of a cloud: what is below the ceiling, and the rest
-CURVES = ("instances", "points", "milliseconds an update")
+ROOM, TOP = "room", "ceiling"  # parts of a cloud: below the ceiling, and the rest
+CURVES = ("instances", "points", "milliseconds per update")
 APPLICATION = "su3d-bench"
-MIN_VERSION = (0, 41)  # the first that the project was tried with
+MIN_VERSION = (0, 41)  # the first version that the project was tested with
 UNITS_PER_METRE = 1000.0  # of depth: 16 bits reach 65 m
 JPEG_QUALITY = 80
-CAMERA_M = 0.4  # how far before the camera its picture stands in the room
+CAMERA_M = 0.4  # distance of the image plane from the camera in the 3D view
 INSTALL = "pip install 'su3d-bench[rerun]'"
-COLUMNS = dict(zip(("n_instances", "n_points", "total_ms"), CURVES, strict=True))  # of updates, and their curves
+COLUMNS = dict(zip(("n_instances", "n_points", "total_ms"), CURVES, strict=True))  # column of updates -> curve
 Tell = Callable[[int, int], None]
 
 
 def rerun_sdk() -> Any:
-    """The module of rerun; a ``ModelMissing`` where it is not installed, too old, or switched off."""
+    """The module of rerun; ``ModelMissing`` if it is not installed, too old, or disabled."""
     try:
         import rerun
     except ImportError as error:
@@ -69,16 +69,17 @@ def rerun_sdk() -> Any:
     numbers = re.match(r"(\d+)\.(\d+)", version)
     if numbers is None or (int(numbers[1]), int(numbers[2])) < MIN_VERSION:
         least = ".".join(map(str, MIN_VERSION))
-        raise ModelMissing(f"report rerun needs rerun-sdk {least} or later, here is {version or 'another'}: {INSTALL}")
+        raise ModelMissing(f"report rerun needs rerun-sdk {least} or later, found {version or 'another'}: {INSTALL}")
     if not rerun.RecordingStream(APPLICATION, send_properties=False).is_enabled():
-        raise ModelMissing("RERUN in the environment switches rerun off, and nothing would be written; unset RERUN")
+        raise ModelMissing("the environment variable RERUN disables rerun, so nothing would be written; unset RERUN")
     return rerun
 
 
 class Recording:
-    """The recording of one scene, which goes piece by piece into ``stream``; ``sdk`` is ``rerun_sdk()``.
+    """The recording of one scene, written to ``stream`` piece by piece; ``sdk`` is ``rerun_sdk()``.
 
-    A place is a path of names. What is logged holds from the frame of the last ``at`` on, and always before the first.
+    A place is an entity path, as a sequence of names. Content is logged at the frame of the last call of ``at``, or
+    without time before the first call.
     """
 
     def __init__(self, sdk: Any, scene: str, methods: Sequence[str], stream: IO[bytes]) -> None:
@@ -92,13 +93,13 @@ class Recording:
         self.log(CAMERA[:1], sdk.ViewCoordinates.RIGHT_HAND_Z_UP)
 
     def at(self, frame: int, seconds: float) -> None:
-        """Go to a moment: a frame's index at full rate, and seconds since the first that is shown."""
+        """Set the time: a frame's index at full rate, and seconds since the first frame shown."""
         self._recording.set_time("frame", sequence=frame)
         self._recording.set_time("seconds", duration=seconds)
         self._is_static = False
 
     def photo(self, frame: Frame) -> None:
-        """Where the camera is, what it saw and how far that was."""
+        """Log the camera pose, the image and the depth."""
         height, width = frame.depth_m.shape
         pose = frame.camera_to_world
         pinhole = self.sdk.Pinhole(
@@ -116,7 +117,7 @@ class Recording:
         self.log((*CAMERA, "depth"), depth)
 
     def close(self, about: str) -> None:
-        """End the recording with plain words about all of it."""
+        """End the recording with the text ``about``."""
         made_with = f"Made with rerun {self.sdk.__version__}; other versions may not read this file."
         self._is_static = True
         self.log(ABOUT, self.sdk.TextDocument(f"{about}\n\n{made_with}", media_type="text/plain"))
@@ -131,12 +132,12 @@ class Recording:
 
 
 def _path(place: Sequence[str]) -> list[str]:
-    """A place as rerun takes it, which escapes each part itself."""
+    """A place in rerun's form; rerun escapes each part itself."""
     return [printable(part, 100) for part in place]
 
 
 def _panels(sdk: Any, methods: Sequence[str]) -> Any:
-    """The photo with its masks above the curves, the maps by instance and by class, the truth."""
+    """The view layout: photo with masks above the curves; maps by instance and by class; ground truth."""
     rrb = sdk.blueprint
 
     def at(*parts: str) -> str:
@@ -156,12 +157,12 @@ def _panels(sdk: Any, methods: Sequence[str]) -> Any:
         boxes = at(*MAP, method, BOXES)
         rooms.append(room(f"{method}: instances", f"{at(*MAP, method, INSTANCES, ROOM)}/**", boxes))
         rooms.append(room(f"{method}: classes", f"{at(*MAP, method, CLASSES, ROOM)}/**"))
-    truths = [room(f"truth: {kind}", f"{at(*TRUTH, kind, ROOM)}/**") for kind in (CLASSES, INSTANCES)]
+    truths = [room(f"ground truth: {kind}", f"{at(*TRUTH, kind, ROOM)}/**") for kind in (CLASSES, INSTANCES)]
     left = rrb.Vertical(
-        rrb.Tabs(*photos, photo("masks of the truth", at(*TRUE_MASKS)), depth),
+        rrb.Tabs(*photos, photo("ground-truth masks", at(*TRUE_MASKS)), depth),
         rrb.Tabs(
             *(rrb.TimeSeriesView(origin=at(*GROWTH, curve), name=curve) for curve in CURVES),
-            rrb.TextDocumentView(origin=at(*ABOUT), name="what this is"),
+            rrb.TextDocumentView(origin=at(*ABOUT), name="about"),
         ),
     )
     right = rrb.Vertical(rrb.Tabs(*rooms), rrb.Tabs(*truths))
@@ -172,9 +173,9 @@ def _panels(sdk: Any, methods: Sequence[str]) -> Any:
 
 @dataclass(frozen=True)
 class OwnedPoints:
-    """Points that are drawn and whose each is: (n,) of ``instance`` and ``label``, -1 for nobody's.
+    """Drawn points with the ``instance`` and ``label`` (n,) of each, -1 for none.
 
-    ``names`` and ``corners`` (k, 2, 3) m are those of the instances, ``labels`` those of the classes.
+    ``names`` and ``corners`` (k, 2, 3) m describe the instances, ``labels`` are the names of the classes.
     """
 
     cloud: Cloud
@@ -189,9 +190,9 @@ class OwnedPoints:
         return canvas.instance_colours(self.names)
 
     def named(self) -> list[tuple[str, Sequence[tuple[int, str, canvas.Colour]], Int64Array]]:
-        """Of instances and of classes: the place, what its ids mean and their colours, and whose each point is."""
+        """For instances and for classes: the place, ids with names and colours, and the owner of each point."""
         tints = canvas.class_colours(self.labels)
-        instances = [(k + 1, f"{name or 'without a name'} #{k}", self.colours[k]) for k, name in enumerate(self.names)]
+        instances = [(k + 1, f"{name or 'unnamed'} #{k}", self.colours[k]) for k, name in enumerate(self.names)]
         classes = [(k + 1, name, tints[name]) for k, name in enumerate(self.labels)]
         return [
             (INSTANCES, instances[: MAX_IDS - 1], self.instance),
@@ -199,7 +200,7 @@ class OwnedPoints:
         ]
 
     def log_names(self, recording: Recording, place: tuple[str, ...], masks: tuple[str, ...]) -> None:
-        """What ids mean below ``place`` of the map, where id 0 is grey, and at ``masks``, where it cannot be seen."""
+        """Log names and colours of ids below ``place`` (id 0 is grey) and at ``masks`` (id 0 is transparent)."""
         places = [((*place, kind), entries, canvas.NO_INSTANCE) for kind, entries, _ in self.named()]
         for where, entries, nobody in (*places, (masks, places[0][1], (0, 0, 0, 0))):
             infos = [
@@ -209,11 +210,11 @@ class OwnedPoints:
             recording.log(where, recording.sdk.AnnotationContext(infos))
 
     def log_masks(self, recording: Recording, place: tuple[str, ...], frame: Frame) -> None:
-        """Whose each pixel of ``frame`` is, by ids."""
+        """Log the instance id of each pixel of ``frame``."""
         recording.log(place, recording.sdk.SegmentationImage(self.masks(frame), opacity=0.6))
 
     def masks(self, frame: Frame) -> UInt16Array:
-        """Whose each pixel of ``frame`` is: the instance's whose point is nearest to what the camera saw there."""
+        """The instance id of each pixel of ``frame``: that of the map point nearest to the measured surface."""
         height, width = frame.depth_m.shape
         is_asked = np.zeros((height, width), np.bool_)
         is_asked[::EVERY_PIXEL, ::EVERY_PIXEL] = True
@@ -227,7 +228,7 @@ class OwnedPoints:
 
     @cached_property
     def is_top(self) -> BoolArray:
-        """Which points are of the ceiling or hang from it, as in the pictures, which look into the room from above."""
+        """Which points belong to the ceiling or hang from it; the pictures from above omit them as well."""
         if not len(self.cloud.points):
             return np.zeros(0, np.bool_)
         low, high = canvas.room_bounds(self.cloud.points)[:, 2]
@@ -236,7 +237,7 @@ class OwnedPoints:
         return is_top
 
     def log_points(self, recording: Recording, place: tuple[str, ...], shown: BoolArray, own: str) -> None:
-        """The points that are ``shown``, in places called ``own``, so that those logged before stay."""
+        """Log the points that are ``shown`` at places called ``own``, so that points logged before are kept."""
         for kind, _, owner in self.named():
             for part, is_there in ((ROOM, shown & ~self.is_top), (TOP, shown & self.is_top)):
                 if is_there.any():
@@ -254,26 +255,26 @@ class OwnedPoints:
 
 
 class Growth:
-    """A finished map as it came into the camera's view: what was seen by then of the instances that were known."""
+    """A finished map, revealed over time: the points seen so far of the instances known so far."""
 
     def __init__(
         self, recording: Recording, place: tuple[str, ...], owned: OwnedPoints, first_frame: Sequence[int]
     ) -> None:
         self._recording, self._place, self._owned = recording, place, owned
-        self._first_frame = np.append(np.array(first_frame, np.int64), 0)  # the last one: nobody's
+        self._first_frame = np.append(np.array(first_frame, np.int64), 0)  # the last entry: no instance
         self._is_seen = np.zeros(len(owned.cloud.points), np.bool_)
         self._is_out = self._is_seen.copy()
         self._own = "all"
 
     def step(self, frame: Frame) -> None:
-        """What ``frame`` adds to the map."""
+        """Log what ``frame`` adds to the map."""
         self._own = f"from frame {frame.index:06}"
         self._is_seen |= in_view(self._owned.cloud.points, frame)
         is_known = self._first_frame[self._owned.instance] <= frame.index
         self._show(self._is_seen & is_known)
 
     def end(self) -> None:
-        """What no frame showed, so that the whole map stands at the end."""
+        """Log the points that no frame showed, so that the map is complete at the end."""
         self._own = "all" if self._own == "all" else "in no frame"
         self._show(np.ones_like(self._is_out))
 
@@ -290,7 +291,7 @@ class Growth:
 
 
 class SceneTimeline:
-    """What is shown of a scene of a run; ``remarks``: what is not, known once it was written."""
+    """The timeline of one scene of a run; ``remarks``: what could not be shown, complete after ``write``."""
 
     def __init__(self, run: FinishedRun, scene: str, methods: Sequence[str], stride: int, spaces: Spaces) -> None:
         self._run, self.scene, self._methods, self._stride = run, scene, methods, stride
@@ -300,7 +301,7 @@ class SceneTimeline:
         self.n_frames = self.n_maps = 0
 
     def write(self, recording: Recording, tell: Tell = lambda n_done, n: None) -> None:
-        """All of it into ``recording`` in the order of time; ``tell`` hears how many frames are done."""
+        """Write everything to ``recording`` in order of time; ``tell`` is called with the number of frames done."""
         frames = self._frames()
         rules = shown_rules(self._run)
         truth = None if rules is None else self._reader.truth(rules)
@@ -338,7 +339,7 @@ class SceneTimeline:
         recording.close(self._about())
 
     def _frames(self) -> list[int]:
-        """The frames that are shown: of those that the methods were given, else of all."""
+        """The frames to show: a selection of those that the methods were given, otherwise of all."""
         fed = {index for method in self._methods for index in fed_frames(self._run, self.scene, method)}
         n_frames = len(self._reader.sequence)
         there = sorted(index for index in fed if 0 <= index < n_frames) or range(n_frames)
@@ -354,13 +355,13 @@ class SceneTimeline:
                 return self._reader.dataset.sketch(name, index, MAX_WIDTH)
             return smaller(self._reader.sequence[index], MAX_WIDTH)
 
-        frame: Frame | None = self._reader.had("a frame is left out", read)
+        frame: Frame | None = self._reader.had("a frame is omitted", read)
         return frame
 
     def _maps(
         self, rules: ProtocolRules | None, truth: GroundTruth | None
     ) -> dict[str, tuple[OwnedPoints, Sequence[int]]]:
-        """Each method's map, and the first frame in which each of its instances was seen, 0 where nobody knows."""
+        """Each method's map, and the first frame in which each of its instances was seen (0 if unknown)."""
         maps: dict[str, tuple[OwnedPoints, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
@@ -390,7 +391,7 @@ class SceneTimeline:
         return OwnedPoints(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
 
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
-        """Frame -> curve -> value, of what the updates of a method say."""
+        """Frame -> curve -> value, from the update records of a method."""
         file = self._run.folder.job(self.scene, method).updates
         columns = self._reader.had(f"no growth of {printable(method, 80)}", lambda: read_updates(file, file.name)) or {}
         known = {column: curve for column, curve in COLUMNS.items() if column in columns}
@@ -404,20 +405,19 @@ class SceneTimeline:
         lines = [
             f"{printable(self.scene, 200)}, {self._run.name}: {', '.join(printable(m, 80) for m in self._methods)}",
             f"{counted(self.n_frames, 'frame')} shown, images at most {MAX_WIDTH} pixels wide, colour as JPEG, depth "
-            f"in millimetres; of each map and of the truth at most {MAX_POINTS:,} points.",
-            "The maps are the finished ones. A point stands from the frame on in which the camera saw it, and not "
-            "before its instance was seen first; what no frame shows comes with the last. The curves are what the "
-            "method's map held after each update.",
-            f"The ceiling and what hangs from it stand in places of their own, called '{TOP}', which are not shown at "
-            "first.",
-            "Masks are the map's instances seen from the camera: a pixel is that of the nearest point.",
+            f"in millimetres; at most {MAX_POINTS:,} points per map and of the ground truth.",
+            "The maps are the final maps. A point appears when the camera first saw it, but not before its instance "
+            "was first seen; points that no frame shows appear with the last frame. The curves show the size of the "
+            "method's map after each update.",
+            f"The ceiling and what hangs from it are separate entities, called '{TOP}', which are hidden initially.",
+            "Masks are the map's instances seen from the camera: each pixel has the instance of the nearest map point.",
             *self.remarks,
         ]
         return "\n\n".join(lines)
 
 
 def ids_of(rows: Int64Array) -> UInt16Array:
-    """Ids of rows: row 0 is 1; 0 for no row, and for rows beyond what 16 bits can tell.
+    """Ids of rows: row 0 is 1; 0 for no row, and for rows that do not fit into 16 bits.
 
     >>> ids_of(np.array([0, 2, -1, 65535])).tolist()
     [1, 3, 0, 0]
@@ -426,7 +426,7 @@ def ids_of(rows: Int64Array) -> UInt16Array:
 
 
 def in_view(points: Float32Array, frame: Frame) -> BoolArray:
-    """Which of ``points`` (n,) the camera sees: in its image, and no farther than what it measured there."""
+    """Which of ``points`` (n, 3) the camera sees: inside its image and close to the measured depth."""
     height, width = frame.depth_m.shape
     relative = (points.astype(np.float64) - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, :3]
     rows = np.flatnonzero(relative[:, 2] > 0)
@@ -441,7 +441,7 @@ def in_view(points: Float32Array, frame: Frame) -> BoolArray:
 
 
 def smaller(frame: Frame, width: int) -> Frame:
-    """A frame at most ``width`` pixels wide; one that is wider is made smaller, depth by the nearest pixel."""
+    """A frame at most ``width`` pixels wide; wider ones are downscaled, depth by nearest pixel."""
     import cv2
 
     height, full = frame.depth_m.shape
@@ -449,7 +449,7 @@ def smaller(frame: Frame, width: int) -> Frame:
         return frame
     size = width, max(1, round(width * height / full))
     scale = np.diag([size[0] / full, size[1] / height, 1.0])
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # whole numbers are the middles of pixels
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # integer coordinates are pixel centres
     intrinsics: Float64Array = np.linalg.inv(half) @ scale @ half @ frame.intrinsics
     return replace(
         frame,
@@ -460,7 +460,7 @@ def smaller(frame: Frame, width: int) -> Frame:
 
 
 def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> OwnedPoints:
-    """The truth as a map: its instances, named by their classes, and the classes of ``rules``."""
+    """The ground truth as a map: its instances, named by their classes, and the classes of ``rules``."""
     cloud = thinned(truth.points, MAX_POINTS)
     own, first, instance = np.unique(truth.instance, return_index=True, return_inverse=True)
     place = np.cumsum(own > 0) - 1
@@ -479,7 +479,7 @@ def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> OwnedPoints:
 
 
 def _corners(points: Float32Array, owner: Int64Array, n: int) -> Float32Array:
-    """Lowest and highest corner (n, 2, 3) of the points of each of ``n`` owners, who all have some."""
+    """Lowest and highest corner (n, 2, 3) of the points of each of ``n`` owners; each must have points."""
     low, high = np.full((n + 1, 3), np.inf, np.float32), np.full((n + 1, 3), -np.inf, np.float32)
     np.minimum.at(low, owner, points)
     np.maximum.at(high, owner, points)
@@ -496,7 +496,7 @@ def _corners_of(prediction: Prediction) -> Float32Array:
 
 
 def check_not_empty(timelines: Sequence[SceneTimeline], where: str) -> None:
-    """A ``StoreError`` where no frame and no map could be shown."""
+    """Raise a ``StoreError`` if no frame and no map could be shown."""
     if not any(one.n_frames or one.n_maps for one in timelines):
         why = next((line for one in timelines for line in one.remarks), "it has neither frames nor maps")
-        raise StoreError(f"{where}: there is nothing to show: {why}")
+        raise StoreError(f"{where}: nothing to show: {why}")

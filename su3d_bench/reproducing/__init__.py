@@ -1,1 +1,1 @@
-"""A paper's experiments as recipes: what they need, their runs, measured beside reported, the bundle."""
+"""Reproduction of a paper's experiments from recipes: requirements, runs, measured and reported numbers, bundles."""

@@ -1,7 +1,7 @@
-"""Runs as one archive, with SHA-256 and for a reproduction its recipe and tables, and how an archive is verified.
+"""Bundles: runs in one archive with SHA-256 digests (and recipe and tables of a reproduction), and their verification.
 
-A zip without compression, its members in the order of their names, with one date and one mode: the same folder gives
-the same bytes on every machine. What is in a prediction is compressed already.
+A zip without compression, with members sorted by name and a fixed date and mode: the same folder gives the same bytes
+on every machine. Predictions are already compressed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from su3d_bench.store.run_folder import RECORDS, RunFolder
 
 MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.json", "tables.md"
 RUNS = "runs"
-DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can have
+DATE = (1980, 1, 1, 0, 0, 0)  # the earliest date of the zip format
 MODE = (stat.S_IFREG | 0o644) << 16
 MAX_MEMBERS = 200_000
 MAX_MANIFEST = 64 << 20
@@ -69,10 +69,10 @@ class Entry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What a bundle holds: ``runs`` are the folders of its runs.
+    """The contents of a bundle; ``runs`` are the folders of its runs.
 
-    ``recipe`` is empty where no recipe asked for them; ``trained_on``: what their weights were trained on, as whoever
-    made the bundle says.
+    ``recipe`` is empty if the runs are not from a recipe; ``trained_on``: training data of the weights, as stated by
+    the creator of the bundle.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -86,21 +86,21 @@ class Manifest(BaseModel):
 
 
 def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Path], out: Path) -> None:
-    """The archive at ``place`` of the ``runs`` of a recipe and of what ``out`` holds beside them, whole or not."""
+    """Write the archive of a recipe's ``runs``, with the tables in ``out``, to ``place`` (atomic)."""
     temporary_path = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
     _write(place, runs, {**temporary_path, RECIPE: recipe_file}, {"recipe": recipe})
 
 
 def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
-    """The archive of any finished ``runs`` at ``place``; a ``StoreError`` where two of their folders share a name."""
+    """Write the archive of any finished ``runs`` to ``place``; ``StoreError`` if two folders have the same name."""
     whole = [Path(os.path.abspath(folder)) for folder in runs]
     names = [folder.name for folder in whole]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise StoreError(f"two runs are called '{printable(twice, 100)}'; rename one of their folders")
+        raise StoreError(f"two runs have the name '{printable(twice, 100)}'; rename one of their folders")
     bad = next((name for name in names if not is_safe(name)), None)
     if bad is not None:
-        raise StoreError(f"'{printable(bad, 100)}': a run of this name is on no other system; rename its folder")
+        raise StoreError(f"'{printable(bad, 100)}': this run name is not valid on other systems; rename its folder")
     said = {"trained_on": printable(trained_on, MAX_REMARK_CHARACTERS)} if trained_on else {}
     _write(place, whole, {}, {"recipe": "", **said})
 
@@ -132,17 +132,17 @@ def _member(name: str) -> zipfile.ZipInfo:
 
 
 def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
-    """A file in pieces; a ``StoreError`` where it changes meanwhile."""
+    """Add a file in pieces; ``StoreError`` if it changes meanwhile."""
     info = _member(name)
     info.file_size = file.stat().st_size
     with opened(file) as source, archive.open(info, "w") as member:
         digest = copy_pieces(source, member)
     if digest != sha256:
-        raise StoreError(f"{shown(file)}: changed while it was packed; pack again when its run has ended")
+        raise StoreError(f"{shown(file)}: changed while it was packed; pack again when its run has finished")
 
 
 def _files_of(folder: Path) -> Iterator[Path]:
-    """What of a run goes into a bundle: records, maps, counts, times and the replies of language models."""
+    """The files of a run that go into a bundle: records, maps, counts, times and replies of language models."""
     yield from (folder / name for name in RECORDS if is_file(folder / name))
     for job in RunFolder(folder).jobs():
         yield from sorted(file for file in job.path.iterdir() if is_file(file) and _JOB_OPTIONS.fullmatch(file.name))
@@ -150,13 +150,13 @@ def _files_of(folder: Path) -> Iterator[Path]:
 
 
 def is_bundle(path: Path) -> bool:
-    """Whether a file is called as a bundle is."""
+    """Whether a file has the suffix of a bundle."""
     return path.suffix.lower() == ".zip"
 
 
 @dataclass(frozen=True)
 class Unpacked:
-    """A bundle in a folder, all of its files those of its manifest."""
+    """A bundle in a folder, with exactly the files of its manifest."""
 
     folder: Path
     manifest: Manifest
@@ -167,10 +167,10 @@ class Unpacked:
 
 
 def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: True) -> Unpacked:
-    """The files of ``bundle`` in the empty folder ``into``; ``keep``: those that are written, all are looked at.
+    """Unpack ``bundle`` into the empty folder ``into``; all files are checked, only those with ``keep(name)`` written.
 
-    A ``StoreError`` where it is no bundle, a name leads out of the folder, a file is not the one of the manifest, is
-    missing or beside it, or it would unpack to more than it is.
+    Raises ``StoreError`` if it is not a bundle, a name leads out of the folder, a file differs from the manifest, is
+    missing or not listed there, or the files are far larger than the archive.
     """
     where = shown(bundle)
     try:
@@ -184,7 +184,7 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
     except OSError as error:
         raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
     except atomic.DAMAGE as error:
-        raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
+        raise StoreError(f"{where}: is not a bundle, or damaged: {printable(str(error), 160)}") from error
     return Unpacked(into, manifest)
 
 
@@ -197,18 +197,18 @@ def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]
         name = info.filename
         kind = stat.S_IFMT(info.external_attr >> 16)
         if info.orig_filename != name or not is_safe(name) or kind not in (0, stat.S_IFREG):
-            raise StoreError(f"{where}: '{printable(name, 120)}' is no plain file below its folder; not unpacked")
+            raise StoreError(f"{where}: '{printable(name, 120)}' is not a plain file below its folder; not unpacked")
         if name.casefold() in members:
-            raise StoreError(f"{where}: holds '{printable(name, 120)}' twice; not unpacked")
+            raise StoreError(f"{where}: contains '{printable(name, 120)}' twice; not unpacked")
         members[name.casefold()] = info
     manifest = members.get(MANIFEST)
     if manifest is None or manifest.filename != MANIFEST or manifest.file_size > MAX_MANIFEST:
-        raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench report bundle RUN")
+        raise StoreError(f"{where}: has no {MANIFEST} of a bundle; create one with su3d-bench report bundle RUN")
     return {info.filename: info for info in members.values()}
 
 
 def is_safe(name: str) -> bool:
-    """Whether a name leads to a file below the folder that it is unpacked into, on every system.
+    """Whether a name is a file below the folder that it is unpacked into, on every system.
 
     >>> is_safe("runs/a/run.json"), is_safe("../a"), is_safe("/a"), is_safe("a//b"), is_safe("C:a")
     (True, False, False, False, False)
@@ -222,19 +222,19 @@ def _manifest(content: bytes, where: str) -> Manifest:
         return Manifest.model_validate_json(content)
     except ValidationError as error:
         key = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
-        raise StoreError(f"{where}: {MANIFEST}: {key or 'it'} is not as a bundle has it") from error
+        raise StoreError(f"{where}: {MANIFEST}: {key or 'content'} is invalid for a bundle") from error
 
 
 def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
     named = {*manifest.files, MANIFEST}
-    wrong = {"of its manifest missing": named - set(members), "beside its manifest": set(members) - named}
+    wrong = {"of its manifest missing": named - set(members), "not in its manifest": set(members) - named}
     for what, names in wrong.items():
         if names:
             raise StoreError(f"{where}: {counted(len(names), 'file')} {what}, such as {printable(min(names), 120)}")
     for name in manifest.runs:
         if not is_safe(name) or f"{name}/run.json" not in manifest.files:
             raise StoreError(
-                f"{where}: its manifest names the run '{printable(name, 100)}', of which it holds no record"
+                f"{where}: its manifest names the run '{printable(name, 100)}', but it has no run.json of it"
             )
 
 
@@ -246,9 +246,9 @@ def _unpack_one(
     allowance: atomic.Allowance,
     where: str,
 ) -> None:
-    """``into`` None: the member is compared with its entry and not written."""
+    """Check a member against its entry and write it; ``into`` None: only check."""
     if info.file_size != entry.n_bytes:
-        said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
+        said = f"has {info.file_size} bytes, but {entry.n_bytes} in its manifest"
         raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
     atomic.check_member(info, allowance)
     place = Path(os.devnull)
@@ -258,11 +258,11 @@ def _unpack_one(
     with archive.open(info) as member, place.open("wb" if into is None else "xb") as out:
         digest = copy_pieces(member, out)
     if digest != entry.sha256:
-        raise StoreError(f"{where}: {printable(info.filename, 120)} is not the file of its manifest (other SHA-256)")
+        raise StoreError(f"{where}: {printable(info.filename, 120)} differs from its manifest (other SHA-256)")
 
 
 def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
-    """Copy a file; the SHA-256 of its content."""
+    """Copy a file; return the SHA-256 of its content."""
     digest = hashlib.sha256()
     while piece := source.read(PIECE):
         digest.update(piece)
@@ -270,7 +270,7 @@ def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
     return digest.hexdigest()
 
 
-TOLERANCE = 1e-9  # of a value on another machine
+TOLERANCE = 1e-9  # of a value computed on another machine
 VERIFIER_SETTINGS = {
     "profile": "embedded",
     "executor": "auto",
@@ -282,7 +282,7 @@ VERIFIER_SETTINGS = {
 
 @dataclass
 class Verified:
-    """What was looked at in a bundle: ``faults`` are lines, none where it holds; ``is_to_the_bit``: every count was."""
+    """The result of verifying a bundle: ``faults``: lines, empty if valid; ``is_to_the_bit``: all counts identical."""
 
     bundle: str
     n_files: int = 0
@@ -293,9 +293,9 @@ class Verified:
 
 
 def verify_bundle(bundle: Path) -> Verified:
-    """Unpack, look at every digest, score every map anew, and form every number again.
+    """Unpack a bundle, check every digest, score every map again, and recompute every number.
 
-    A ``StoreError`` where it cannot be unpacked or holds no run.
+    Raises ``StoreError`` if it cannot be unpacked or has no run.
     """
     with TemporaryFolder("su3d-bundle-") as folder:
         unpacked = unpack(bundle, folder)
@@ -318,7 +318,7 @@ def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]
 
 
 def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
-    """Every count that is not what the map gives when it is scored anew."""
+    """Faults for all counts that differ from those of the map when it is scored again."""
     is_same_machine = run.record.processor == processor_digest()
     anew = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
     for scene, method, scores in anew:
@@ -329,13 +329,13 @@ def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
         fault = difference(kept, ours, to_the_bit=is_same_machine)
         found.is_to_the_bit &= difference(kept, ours, to_the_bit=True) is None
         if fault is not None:
-            yield f"{printable(scene, 100)} by {printable(method, 80)}: its counts are not those of its map: {fault}"
+            yield f"{printable(scene, 100)} by {printable(method, 80)}: its counts do not match its map: {fault}"
 
 
 def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]], *, to_the_bit: bool) -> str | None:
-    """The first array in which two files of counts differ; None where they agree.
+    """The first array in which two files of counts differ; None if they agree.
 
-    Integers are the same; other numbers to the bit, or within ``TOLERANCE``.
+    Integers must be equal; other numbers equal to the bit, or within ``TOLERANCE``.
 
     >>> one, other = {"a": np.array([0.1])}, {"a": np.array([0.1 + 1e-12])}
     >>> difference(one, other, to_the_bit=False), difference(one, other, to_the_bit=True)
@@ -343,7 +343,7 @@ def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]
     """
     if sorted(kept) != sorted(ours):
         odd = sorted(set(kept) ^ set(ours))[0]
-        return f"'{printable(odd, 100)}' is {'kept' if odd in kept else 'found'} alone"
+        return f"'{printable(odd, 100)}' is only in the {'stored' if odd in kept else 'recomputed'} counts"
     for name, before in kept.items():
         now = ours[name]
         if before.dtype != now.dtype or before.shape != now.shape:
@@ -365,18 +365,18 @@ def _verify_one(array: NDArray[Any], k: int) -> str:
 
 
 def _of_maps(run: FinishedRun, folder: Path) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
-    """The scores of the maps of a run that was made here or elsewhere by this program."""
+    """The scores of the maps of a run by this program, on this machine or another."""
     check_no_custom_code(run)
     encoder = encoder_of(run.folder, device_of(run))
     for job in _jobs(run, folder):
-        run.dataset(job.scene)  # raises where the data here are others
+        run.dataset(job.scene)  # raises if the data here differ
         for part in job.methods:
             if is_file(run.folder.job(job.scene, part.name).counts):
                 yield job.scene, part.name, scores_again(job, part, encoder)
 
 
 def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
-    """The jobs of a run with its folder here; nothing of where it ran is kept, and no model is loaded to see images."""
+    """The jobs of a run with its folder here; machine settings are dropped, no image model is loaded."""
     settings = tuple(
         entry for entry in run.data.settings.entries
         if entry.path[0] not in NEUTRAL_SETTINGS and entry.path[:3] != ("perception", "models", "device")
@@ -386,12 +386,12 @@ def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
     wanted = set(run.scenes)
     missing = wanted - {job.scene for job in plan.jobs}
     if missing:
-        raise StoreError(f"{counted(len(missing), 'scene')} of the run not here, such as {printable(min(missing), 80)}")
+        raise StoreError(f"{counted(len(missing), 'scene')} of the run missing, such as {printable(min(missing), 80)}")
     return [replace(job, folder=run.folder.path) for job in plan.jobs if job.scene in wanted]
 
 
 def device_of(run: FinishedRun) -> str:
-    """Where the run encoded texts, for other bits come of another device; the CPU where there is none such here."""
+    """The device on which the run encoded texts (other devices give other bits); the CPU if it is not available."""
     try:
         return device_for(str(run.settings.get(("perception", "models", "device"), "cpu")), 0)
     except Su3dError:
@@ -399,25 +399,25 @@ def device_of(run: FinishedRun) -> str:
 
 
 def check_no_custom_code(run: FinishedRun) -> None:
-    """A ``StoreError`` where scoring would load a file of code that the bundle names."""
+    """Raise a ``StoreError`` if scoring would load a code file named in the bundle."""
     asked = {name: run.settings.get((name,), ()) for name in ("methods", "scenes", "protocols")}
     for name, texts in asked.items():
         for text in texts if isinstance(texts, list | tuple) else (texts,):
             base = str(text).partition("@")[0].partition("/")[0]
             known = registry.METHODS if name == "methods" else registry.DATASETS if name == "scenes" else None
             if ".py" in str(text) or str(text).endswith(".toml") or (known is not None and base not in known):
-                raise StoreError(f"names somebody's own '{printable(str(text), 80)}', which a bundle does not bring")
+                raise StoreError(f"uses the user-defined '{printable(str(text), 80)}', which a bundle cannot contain")
 
 
 def check_dataset_ground_truth(run: FinishedRun) -> None:
-    """A ``StoreError`` where predictions were held against files of ground truth in place of a dataset."""
+    """Raise a ``StoreError`` if predictions were scored against ground-truth files instead of a dataset."""
     truth = run.record.ground_truth
     if run.record.predictions and (truth is None or truth.dataset is None):
-        raise StoreError("was scored against files of ground truth, which a bundle does not bring; use --dataset")
+        raise StoreError("was scored against ground-truth files, which a bundle does not contain; use --dataset")
 
 
 def _of_predictions(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
-    """The scores of predictions that were made elsewhere, from the maps that the run kept of them."""
+    """The scores of predictions made elsewhere, from the maps stored in the run."""
     check_dataset_ground_truth(run)
     truth = run.record.ground_truth
     assert truth is not None
@@ -436,19 +436,19 @@ def _of_predictions(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, Scen
 
 
 def _cells(unpacked: Unpacked, found: Verified) -> Iterator[str]:
-    """Every cell of ``compared.json`` that the runs do not give."""
+    """A fault for the first cell of ``compared.json`` that the runs do not reproduce."""
     if not is_file(unpacked.folder / COMPARED):
         return
     recipe = parse_recipe(file_bytes(unpacked.folder / RECIPE), RECIPE)
     kept = atomic.read_json(unpacked.folder / COMPARED)
     cells = kept.get("cells") if isinstance(kept, dict) else None
     if not isinstance(cells, list) or not all(isinstance(cell, dict) for cell in cells):
-        raise StoreError(f"{COMPARED} is not as a reproduction writes it")
+        raise StoreError(f"{COMPARED} does not have the format of a reproduction")
     names = [one.name for one in recipe.experiments if any(cell.get("experiment") == one.name for cell in cells)]
     again = compared_json(recipe, compared_all(recipe.chosen(names) if names else (), Results(unpacked.runs)))["cells"]
     found.n_cells = len(cells)
     if len(again) != len(cells):
-        yield f"{COMPARED}: has {counted(len(cells), 'cell')}, the recipe and runs give {len(again)}"
+        yield f"{COMPARED}: has {counted(len(cells), 'cell')}, but the recipe and runs give {len(again)}"
         return
     for before, now in zip(cells, again, strict=True):
         for key in ("reported", "measured", "interval", "difference", "protocol", "n_scenes"):

@@ -1,4 +1,4 @@
-"""Each printed number beside the measured one: the difference with its interval, and what may have caused it."""
+"""Comparison of reported and measured numbers: the difference with its interval, and possible causes."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Compared:
-    """A printed cell. ``reported`` as printed in per cent; ``measured``, ``interval`` and ``difference`` in points of
-    per cent, None where nothing was measured, and ``incompatibility`` says why; ``causes`` in the order of their weight."""
+    """A printed cell. ``reported``: as printed, in per cent; ``measured``, ``interval``, ``difference``: in percentage
+    points, None if nothing was measured (``incompatibility`` has the reason); ``causes``: in order of importance."""
 
     experiment: str
     method: str
@@ -87,9 +87,9 @@ class Results:
         return measured_results(self.folders)
 
     def of(self, experiment: Experiment) -> Results:
-        """The runs that an experiment looks at: those of its encoder and stride, and predictions made elsewhere.
+        """The runs of an experiment: those with its encoder and stride, and predictions made elsewhere.
 
-        All where none is, for then others were asked for in place of the recipe's.
+        If no run matches, all runs, because then other values were requested instead of the recipe's.
         """
         made = {name: run.settings for name, run in self.runs.items() if _ENCODER in run.settings}
         wanted = experiment.encoder, experiment.stride
@@ -137,7 +137,7 @@ def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results
 
 
 def _measured(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> Measured | None:
-    """The row that stands beside a figure: under its own protocol, else the first of the experiment that has it."""
+    """The row to compare with a figure: under its own protocol, otherwise the experiment's first with the metric."""
     wanted = list(dict.fromkeys([*([figure.protocol] if figure.protocol else []), *experiment.protocols]))
     wanted = [name for name in wanted if name in experiment.protocols]
     for protocol in wanted:
@@ -150,7 +150,7 @@ def _measured(experiment: Experiment, figure: Figure, method: str, metric: str, 
 
 def _missing_reason(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> str:
     if figure.method in experiment.predictions:
-        return f"no method here: give its predictions with --predictions '{figure.method}=DIR'"
+        return f"not implemented here: give its predictions with --predictions '{figure.method}=DIR'"
     mine = [row for row in results.measured if row.method == method and row.protocol in experiment.protocols]
     if not mine:
         return f"no run has {printable(method, 60)} under {some(experiment.protocols, 3)}"
@@ -166,9 +166,9 @@ def _missing_reason(experiment: Experiment, figure: Figure, method: str, metric:
 
 
 def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
-    """In what the row of a run was made otherwise than the printed number, as far as both sides say."""
+    """The known differences between how the row of a run and the printed number were produced."""
     if "judged by a person" in figure.setup and not row.is_by_people:
-        yield "judges: the ground truth in place of a person, on questions of its own"
+        yield "judges: ground truth instead of an annotator, on other questions"
     yield from _of_protocol(figure, row)
     yield from _of_scenes(figure, row)
     yield from _of_encoder(figure, row)
@@ -183,18 +183,18 @@ def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
     if figure.protocol is None or figure.protocol == row.protocol:
         return
     if not {figure.protocol, row.protocol} <= set(protocol_names()):
-        yield f"protocol rule: {row.protocol} in place of {figure.protocol}"
+        yield f"protocol rule: {row.protocol} instead of {figure.protocol}"
         return
     theirs, ours = (load_protocol(name).as_json for name in (figure.protocol, row.protocol))
     keys = [key for key in dict.fromkeys([*theirs, *ours]) if key not in _NAMES and theirs.get(key) != ours.get(key)]
     said = f" (other {', '.join(keys[:MAX_RULES])}{' and more' if len(keys) > MAX_RULES else ''})" if keys else ""
-    yield f"protocol rule: {row.protocol} in place of {figure.protocol}{said}"
+    yield f"protocol rule: {row.protocol} instead of {figure.protocol}{said}"
 
 
 def _of_scenes(figure: Figure, row: Measured) -> Iterator[str]:
     made = next((part for part in (row.caveat or "").split("; ") if part.startswith("made rooms")), None)
     if made is not None:
-        yield f"scenes: {counted(len(row.scenes), 'room')} made by the program, not {figure.dataset}'s scenes"
+        yield f"scenes: {counted(len(row.scenes), 'procedurally generated room')}, not {figure.dataset}'s scenes"
         return
     papers = {f"{row.datasets}/{name}" for name in PAPER_SCENES.get(row.datasets, ())}
     if papers and figure.dataset == row.datasets and row.scenes != papers:
@@ -209,24 +209,24 @@ def _of_encoder(figure: Figure, row: Measured) -> Iterator[str]:
     name = figure.protocol or row.protocol
     wanted = load_protocol(name).encoder if name in protocol_names() else None
     if "ncoder is open" in figure.setup:
-        yield f"encoder: {row.encoder}; which the paper took is open"
+        yield f"encoder: {row.encoder}; the paper does not state which it used"
     elif wanted is not None and row.encoder != wanted:
-        yield f"encoder: {row.encoder} in place of {wanted}"
+        yield f"encoder: {row.encoder} instead of {wanted}"
     elif "OVSeg" in figure.setup:
-        yield f"encoder: {row.encoder} in place of OVSeg's"
+        yield f"encoder: {row.encoder} instead of OVSeg's"
 
 
 def _of_proposals(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
     theirs = figure.system.proposals
     own = None if run is None else run.settings.get(("method", row.method, "proposals"))
     if isinstance(own, str):
-        yield f"proposals: {toml_value(own)} of {row.method} in place of {_open(theirs)}"
+        yield f"proposals: {toml_value(own)} of {row.method} instead of {_open(theirs)}"
     elif row.profile is not None and row.profile != PAPER_PROFILE:
-        yield f"proposals: masks of the profile '{row.profile}' in place of {_open(theirs)}"
+        yield f"proposals: masks of the profile '{row.profile}' instead of {_open(theirs)}"
 
 
 def _open(fact: str) -> str:
-    return "what the paper leaves open" if fact == OPEN else fact
+    return "those of the paper (not stated)" if fact == OPEN else fact
 
 
 def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
@@ -239,7 +239,7 @@ def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterat
         return
     wanted = 1 if theirs.startswith("all") else int(every[1]) if every else None
     if wanted is not None and wanted != ours:
-        yield f"stride: one frame in {ours} in place of {theirs}"
+        yield f"stride: one frame in {ours} instead of {theirs}"
 
 
 def _stride(row: Measured, run: FinishedRun) -> int | None:
@@ -256,14 +256,14 @@ def _of_labels(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterat
     record = run.results.get((row.method, row.protocol))
     ours = None if record is None else record.labels
     if ours is not None and ours != theirs:
-        yield f"labels a mask: {ours} in place of {theirs}"
+        yield f"labels per mask: {ours} instead of {theirs}"
 
 
 # ---- tables
 
 
 def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table:
-    """A row a printed row and dataset; of each metric what was printed, measured, and the difference."""
+    """One row per printed row and dataset; for each metric the reported and measured value and their difference."""
     metrics = list(dict.fromkeys(cell.metric for cell in cells))
     marks: dict[tuple[str, ...], str] = {}
     rows = []
@@ -279,13 +279,13 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
     n_within = sum(cell.is_within for cell in cells)
     return Table(
         name=f"compared-{experiment.name}",
-        caption=f": {experiment.title}; reported beside measured, per cent; difference = measured - reported.",
+        caption=f": {experiment.title}; reported and measured values, per cent; difference = measured - reported.",
         head="row",
         columns=tuple(f"{metric} {what}" for metric in metrics for what in ("reported", "measured", "difference")),
         rows=tuple(rows),
         notes=(
             f"{n_measured} of {counted(n, 'printed cell')} measured, {n_within} printed within the 95 % interval of "
-            "the measured; that of a difference is the interval over scenes of the measured number alone",
+            "the measured value; intervals of differences only include variation of the measured value over scenes",
             *notes,
             *([experiment.note] if experiment.note else []),
         ),
@@ -296,7 +296,7 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
 def _said(cell: Compared) -> list[str]:
     if cell.measured is None:
         return [f"not measured: {cell.incompatibility}"]
-    what = list(cell.causes) or ["nothing is known to differ: protocol, encoder, proposals and stride are the paper's"]
+    what = list(cell.causes) or ["no known differences: protocol, encoder, proposals and stride are the paper's"]
     return [f"under {cell.protocol}", *what]
 
 
@@ -319,7 +319,7 @@ def compared_all(experiments: Sequence[Experiment], results: Results) -> dict[st
 
 
 def tables_of(experiment: Experiment, results: Results) -> list[Table]:
-    """The paper's own table of an experiment, as ``report tables --table`` makes it; none where it has none."""
+    """The paper's own table of an experiment, as in ``report tables --table``; empty if it has none."""
     if experiment.table is None:
         return []
     results = results.of(experiment)
@@ -336,7 +336,7 @@ def tables_of(experiment: Experiment, results: Results) -> list[Table]:
 def result_tables(
     experiments: Sequence[Experiment], cells: Mapping[str, Sequence[Compared]], results: Results
 ) -> list[Table | Prose]:
-    """Of each experiment the paper's own table, and under it reported beside measured; of timing its tables."""
+    """For each experiment the paper's own table, the comparison of reported and measured values, and timing tables."""
     tables: list[Table | Prose] = []
     for experiment in experiments:
         tables += tables_of(experiment, results)
@@ -360,7 +360,7 @@ def _timing(experiment: Experiment, results: Results) -> Sequence[Table | Prose]
 
 
 def compared_json(recipe: Recipe, cells: Mapping[str, Sequence[Compared]]) -> dict[str, Any]:
-    """Every printed cell with what was measured, as it is kept."""
+    """Every printed cell with the measured value, as stored."""
     rows = [
         {**asdict(cell), "difference": cell.difference, "difference_interval": cell.difference_interval}
         for each in cells.values()
@@ -369,11 +369,11 @@ def compared_json(recipe: Recipe, cells: Mapping[str, Sequence[Compared]]) -> di
     return {"schema": SCHEMA, "recipe": recipe.name, "cells": rows}
 
 
-SHOWN = 5  # instances that are listed beneath a picture
+SHOWN = 5  # instances listed below a picture
 
 
 def draw_queries(experiments: Sequence[Experiment], results: Results, out: Path, device: str) -> Iterator[Path]:
-    """A picture a text and method, of the first scene of the run; maps without instances have none."""
+    """One picture per text and method, of the first scene of the run; maps without instances have none."""
     for experiment in experiments:
         if not experiment.queries:
             continue

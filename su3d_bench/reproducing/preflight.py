@@ -1,4 +1,4 @@
-"""What a reproduction needs: what of it is here, what is missing, how large it is and how to get it."""
+"""Preflight check of a reproduction: what is available, what is missing, its size and how to get it."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from su3d_bench.runs.scenes import data_root
 
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
-OPTIONAL_MODELS = (TAGGER,)  # without RAM++ a list of words names what is looked for
+OPTIONAL_MODELS = (TAGGER,)  # without RAM++, a word list provides the detector's prompts
 
 
 @dataclass(frozen=True)
 class Need:
-    """One thing that runs need: ``kind`` is package, model, scene, mesh or truth.
+    """One requirement of runs: ``kind`` is package, model, scene, mesh or truth.
 
-    ``n_bytes``: the size of the download; None where it is unknown.
-    ``is_required`` false: the run does without it, and ``remark`` says how.
+    ``n_bytes``: download size, None if unknown.
+    ``is_required`` false: the run works without it, and ``remark`` explains how.
     """
 
     kind: str
@@ -47,7 +47,7 @@ class Need:
 
 @dataclass(frozen=True)
 class Preflight:
-    """Everything that is needed."""
+    """All requirements."""
 
     needs: tuple[Need, ...]
 
@@ -60,7 +60,7 @@ class Preflight:
 
 
 def preflight(runs: Sequence[RecipeRun]) -> Preflight:
-    """What ``runs`` need; no frame is read, nothing is written and no server is contacted."""
+    """The requirements of ``runs``; no frames are read, nothing is written and no server is contacted."""
     needs: dict[tuple[str, str], Need] = {}
     for run in runs:
         for need in (*_models(run), *_data(run)):
@@ -69,7 +69,7 @@ def preflight(runs: Sequence[RecipeRun]) -> Preflight:
 
 
 def _fetched(dataset: str) -> tuple[float | None, str]:
-    """Mean size in bytes of a scene of ``dataset`` as it is fetched, None where unknown, and the command for it."""
+    """Mean download size in bytes of a scene of ``dataset``, None if unknown, and the command for it."""
     for source in built_in().entries.values():
         if source.group == dataset and source.scenes is not None:
             mean = None if source.n_bytes is None else source.n_bytes / source.scenes.n_scenes
@@ -78,13 +78,13 @@ def _fetched(dataset: str) -> tuple[float | None, str]:
 
 
 def _data(run: RecipeRun) -> Iterator[Need]:
-    """A need a scene, and one a truth that its protocols ask for."""
+    """One need per scene, and one per missing mesh or ground truth that its methods or protocols require."""
     dataset = dataset_named(run.dataset)
     known = known_scenes(dataset)
     n_bytes, how = _fetched(run.dataset)
     for scene in scene_names(run.dataset, run.scenes):
         address = f"{run.dataset}/{scene}"
-        fault = "" if scene in known else f"not below {data_root()}"
+        fault = "" if scene in known else f"not found in {data_root()}"
         if not fault:
             try:
                 dataset.info(scene, 1)
@@ -99,7 +99,7 @@ def _data(run: RecipeRun) -> Iterator[Need]:
 
 
 def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
-    """The scan's mesh, where it is missing and a method cannot do without."""
+    """The scan's mesh, if it is missing and a method requires it."""
     named = [named_method(text) for text in run.methods]
     settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
     methods = {one.name: build_method(method_part(one, settings)) for one in named}
@@ -109,12 +109,12 @@ def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Nee
     try:
         surface_of(dataset, scene)
     except Su3dError as error:
-        remark = f"{error}; {', '.join(asking)} cannot do without"
+        remark = f"{error}; required by {', '.join(asking)}"
         yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_available=False, how=how, remark=remark)
 
 
 def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
-    """The truths that are missing; one that another protocol of the run can do without is not required."""
+    """The missing ground truths; one is not required if another protocol of the run works without it."""
     variants: dict[str, list[str]] = {}
     for name in run.protocols:
         variants.setdefault(load_protocol(name).ground_truth, []).append(name)
@@ -126,14 +126,14 @@ def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need
             missing[variant] = str(error)
     for variant, why in missing.items():
         left = [other for other in variants if other not in missing]
-        remark = f"{why}; without it {', '.join(variants[variant])} scores nothing"
+        remark = f"{why}; without it there is no score under {', '.join(variants[variant])}"
         name = f"{run.dataset}/{scene}: {variant}"
-        brings = how if "su3d-bench datasets fetch" in why else ""  # labels of others are not among what is fetched
+        brings = how if "su3d-bench datasets fetch" in why else ""  # third-party labels cannot be fetched
         yield Need("truth", name, is_available=False, how=brings, is_required=not left, remark=remark)
 
 
 def _models(run: RecipeRun) -> Iterator[Need]:
-    """Packages and weights of the profile ``paper``; an encoder beside any other."""
+    """Packages and weights of the profile ``paper``, and any encoder other than the embedded one."""
     methods = {named_method(method).base for method in run.methods}
     settings = read_assignments(run.settings, tuple({*methods, *run.methods}), (run.dataset,))
     config = resolve(settings, ("perception",), PerceptionConfig)
@@ -155,10 +155,10 @@ def _models(run: RecipeRun) -> Iterator[Need]:
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     forms: tuple[FormName, ...] | None = None
-    if name == TAGGER:  # its own checkpoint runs by its own package alone
+    if name == TAGGER:  # its original checkpoint requires its own package
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
-    remark = "" if is_required else "without it the words of a list are looked for"
+    remark = "" if is_required else "without it, objects from a word list are detected"
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
@@ -172,7 +172,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
 
 
 def size(n_bytes: float | None) -> str:
-    """Bytes as people read them.
+    """A human-readable size.
 
     >>> size(2_564_000_000.0), size(1500.0), size(None)
     ('2.56 GB', '0.00 GB', 'unknown')
@@ -181,15 +181,15 @@ def size(n_bytes: float | None) -> str:
 
 
 def preflight_tables(known: Preflight) -> list[Table]:
-    """What is here and what is not."""
-    rows = [["what", "name", "is here", "bytes", "how to get it"]]
+    """The table of available and missing requirements."""
+    rows = [["what", "name", "available", "bytes", "how to get it"]]
     rows += [[need.kind, need.name, _state(need), _bytes(need), need.how or "-"] for need in known.needs]
     remarks = [f"{need.name}: {need.remark}" for need in known.needs if need.remark and not need.is_available]
-    return [text_table("needs", rows, heading="Needed", caption=f": {_said(known)}", notes=remarks)]
+    return [text_table("needs", rows, heading="Requirements", caption=f": {_said(known)}", notes=remarks)]
 
 
 def _state(need: Need) -> str:
-    return "yes" if need.is_available else "no" if need.is_required else "no, can do without"
+    return "yes" if need.is_available else "no" if need.is_required else "no (optional)"
 
 
 def _bytes(need: Need) -> str:
@@ -202,8 +202,8 @@ def _said(known: Preflight) -> str:
     missing = known.missing
     n_bytes = sum(need.n_bytes or 0.0 for need in missing if need.kind in ("model", "scene"))
     if not missing:
-        return "everything that is required is here."
-    return f"{counted(len(missing), 'thing')} missing, about {size(n_bytes)} to fetch."
+        return "all requirements are available."
+    return f"{counted(len(missing), 'requirement')} missing, about {size(n_bytes)} to fetch."
 
 
 def summary(known: Preflight) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""A paper's experiments as a recipe, a small TOML with methods, scenes, protocols and printed figures, and its runs."""
+"""Recipes of a paper's experiments (TOML files with methods, scenes, protocols and printed figures) and their runs."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class Experiment(BaseModel):
-    """What a paper did for one table, figure or number.
+    """A paper's experiment for one table, figure or number.
 
-    ``methods``: as ``run --methods`` takes them; ``vary``: a sweep over settings of ``varied``, as ``ablate --vary``
-    takes it. ``scenes`` are addresses, several datasets may be among them. ``protocols``: the first that scored stands
-    beside the figure. ``encoder``: a model's name, None for the recipe's own. ``stride`` 0: each method's own.
-    ``table``: the table of OpenSU3D's paper whose form it has. ``figures``: which of ``published.toml`` stand beside,
-    each by the fields that it must have. ``metrics``: printed row ('*': every one) -> printed metric -> the protocol's
-    name of it. ``predictions``: printed methods that are none here, whose predictions are taken. ``queries``: texts
-    whose heat maps are drawn. ``timing``: the times of updates are its answer.
+    ``methods``: as in ``run --methods``; ``vary``: a sweep over settings of ``varied``, as in ``ablate --vary``.
+    ``scenes``: addresses, possibly of several datasets. ``protocols``: the first that has a score is compared with the
+    figure. ``encoder``: a model's name, None for the recipe's. ``stride`` 0: each method's own. ``table``: the table of
+    OpenSU3D's paper whose layout is used. ``figures``: the figures of ``published.toml`` to compare with, each selected
+    by its fields. ``metrics``: printed row ('*': every row) -> printed metric -> the protocol's name of it.
+    ``predictions``: printed methods that are not implemented here, for which predictions are accepted. ``queries``:
+    texts whose heat maps are drawn. ``timing``: whether the result is the times of updates.
     """
 
     model_config = _STRICT
@@ -76,11 +76,11 @@ class Experiment(BaseModel):
     @model_validator(mode="after")
     def _has_work(self) -> Experiment:
         if not (self.methods or self.vary or self.predictions):
-            raise ValueError("names no methods, no vary and no predictions, so that there is nothing to do")
+            raise ValueError("has no methods, vary or predictions, so there is nothing to do")
         return self
 
     def printed(self) -> list[Figure]:
-        """The figures that stand beside, each once; a ``ConfigError`` where a choice finds none."""
+        """The figures to compare with, each once; ``ConfigError`` if a selection matches none."""
         known = set(Figure.model_fields)
         found: list[Figure] = []
         for choice in self.figures:
@@ -92,18 +92,18 @@ class Experiment(BaseModel):
             figures = [one for one in published() if all(getattr(one, key) == said for key, said in choice.items())]
             if not figures:
                 said = ", ".join(f"{key} = {value}" for key, value in choice.items())
-                raise ConfigError(f"experiment {self.name}: published.toml holds no figure of {printable(said, 200)}")
+                raise ConfigError(f"experiment {self.name}: published.toml has no figure with {printable(said, 200)}")
             found += [figure for figure in figures if figure not in found]
         return found
 
     def metric(self, figure: Figure, printed: str) -> str:
-        """What the protocol calls the metric that is ``printed`` in a row."""
+        """The protocol's name of the metric ``printed`` in a row."""
         named = {**self.metrics.get(EVERY_ROW, {}), **self.metrics.get(figure.row or "", {})}
         return named.get(printed, printed)
 
 
 class Rehearsal(BaseModel):
-    """The same on rooms that the program makes: their names, options of them, and whose perception."""
+    """A rehearsal on procedurally generated rooms: their names, their options, and the perception backend."""
 
     model_config = _STRICT
 
@@ -113,7 +113,7 @@ class Rehearsal(BaseModel):
 
 
 class Recipe(BaseModel):
-    """A paper's experiments. ``settings`` are KEY=VALUE as ``run --set`` takes them, of all its runs."""
+    """A paper's experiments. ``settings``: KEY=VALUE as in ``run --set``, for all its runs."""
 
     model_config = _STRICT
 
@@ -131,12 +131,11 @@ class Recipe(BaseModel):
         names = [one.name for one in self.experiments]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
-            raise ValueError(f"two experiments are called '{twice}'")
+            raise ValueError(f"two experiments have the name '{twice}'")
         return self
 
     def chosen(self, names: Sequence[str]) -> tuple[Experiment, ...]:
-        """The experiments of these names, all where none is named, each with its encoder; a ``ConfigError`` for an
-        unknown one."""
+        """The experiments of these names (default: all), each with its encoder; ``ConfigError`` for unknown names."""
         known = {one.name: one.model_copy(update={"encoder": one.encoder or self.encoder}) for one in self.experiments}
         for name in names:
             if name not in known:
@@ -145,12 +144,12 @@ class Recipe(BaseModel):
 
 
 def recipe_names() -> tuple[str, ...]:
-    """The recipes that the program brings."""
+    """The built-in recipes."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
 
 
 def load_recipe(name: str) -> Recipe:
-    """The recipe of this name, or the one in this file of somebody's own; ``ConfigError`` where it is none."""
+    """The recipe of this name, or the user-defined one in this file; ``ConfigError`` if it is invalid."""
     path = recipe_file(name)
     with reading(printable(str(path), 200), ConfigError):
         content = file_bytes(path)
@@ -160,21 +159,21 @@ def load_recipe(name: str) -> Recipe:
 
 
 def recipe_file(name: str) -> Path:
-    """The file of a recipe, of the program's own or by path."""
+    """The file of a recipe, built-in or by path."""
     if not name.endswith(".toml") and name not in recipe_names():
         hint = suggest(name, recipe_names())
-        raise ConfigError(f"no recipe is called '{printable(name, 80)}'{hint}; or name a file of your own, mine.toml")
+        raise ConfigError(f"no recipe has the name '{printable(name, 80)}'{hint}; or give a recipe file, mine.toml")
     return Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
 
 
 def parse_recipe(content: bytes, shown: str) -> Recipe:
-    """The recipe that ``content`` is; ``shown`` begins the line of a ``ConfigError`` where it is none."""
+    """The recipe in ``content``; ``shown`` is the prefix of the ``ConfigError`` if it is invalid."""
     try:
         table = parse_toml(content.decode("utf-8"))
     except ValueError as error:
-        raise ConfigError(f"{shown}: is no TOML: {printable(str(error), 200)}") from error
+        raise ConfigError(f"{shown}: is not valid TOML: {printable(str(error), 200)}") from error
     try:
-        recipe = Recipe.model_validate_json(json.dumps(table, default=str))  # JSON has lists where tuples are meant
+        recipe = Recipe.model_validate_json(json.dumps(table, default=str))  # strict mode accepts JSON lists as tuples
         for experiment in recipe.experiments:
             experiment.printed()
     except ValidationError as error:
@@ -203,10 +202,10 @@ RUNS = "runs"
 
 @dataclass(frozen=True)
 class RecipeRequest:
-    """How the recipe is carried out this time: None stands for what it says itself.
+    """Options for running a recipe; None means the recipe's own value.
 
-    ``values`` are further values of a run by key (``jobs``, ``limit``, ``executor`` and the like), ``assignments`` as
-    ``run --set`` takes them. ``scenes``: dataset -> addresses in place of the recipe's, as a rehearsal has them.
+    ``values``: further values of a run by key (``jobs``, ``limit``, ``executor`` and others), ``assignments``: as in
+    ``run --set``. ``scenes``: dataset -> addresses that replace the recipe's, as in a rehearsal.
     """
 
     profile: str | None = None
@@ -219,7 +218,7 @@ class RecipeRequest:
 
 @dataclass(frozen=True)
 class RecipeRun:
-    """One run: ``name`` is its folder's below ``runs/``; ``rows`` are those of sweeps."""
+    """One run; ``name``: the name of its folder below ``runs/``; ``rows``: the rows of sweeps."""
 
     name: str
     dataset: str
@@ -240,17 +239,17 @@ class RecipeRun:
 
 
 def sweep_rows(experiment: Experiment) -> tuple[SweepRow, ...]:
-    """The rows of an experiment that varies settings; none of another."""
+    """The rows of an experiment that varies settings; empty for others."""
     return ablation_rows(experiment.varied, experiment.vary, is_grid=False) if experiment.vary else ()
 
 
 def methods_of(experiment: Experiment) -> tuple[str, ...]:
-    """What an experiment runs, a sweep's variants first."""
+    """The methods that an experiment runs, a sweep's variants first."""
     return tuple(dict.fromkeys([*(row.method for row in sweep_rows(experiment)), *experiment.methods]))
 
 
 def method_of_row(experiment: Experiment, method: str, row: str | None) -> str:
-    """What stands for a printed row: a variant of a sweep, ``METHOD@ROW`` where that is run, else the method."""
+    """The method of a printed row: a variant of a sweep, ``METHOD@ROW`` if that is run, otherwise the method."""
     for swept in sweep_rows(experiment):
         if row == f"{swept.parameter}={swept.value.strip('[]')}".replace(" ", ""):
             return swept.method
@@ -259,9 +258,9 @@ def method_of_row(experiment: Experiment, method: str, row: str | None) -> str:
 
 
 def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest) -> tuple[RecipeRun, ...]:
-    """The runs that give all ``experiments``; those of one dataset, encoder and stride are one.
+    """The runs for all ``experiments``; those with the same dataset, encoder and stride are merged into one.
 
-    A ``ConfigError`` for a method, protocol or dataset that is not known.
+    Raises ``ConfigError`` if a method, protocol or dataset is unknown.
     """
     parts: dict[tuple[str, str, int], list[tuple[Experiment, tuple[str, ...]]]] = {}
     for experiment in experiments:
@@ -302,7 +301,7 @@ def _by_dataset(experiment: Experiment, asked: RecipeRequest) -> dict[str, tuple
     for address in experiment.scenes:
         dataset, scene = split_address(address)
         if not scene or (dataset not in registry.names("dataset") and ".py:" not in dataset):
-            raise ConfigError(f"experiment {experiment.name}: '{printable(address, 100)}' is no scene of a dataset")
+            raise ConfigError(f"experiment {experiment.name}: '{printable(address, 100)}' is not a scene of a dataset")
         by_dataset[dataset] = (*by_dataset.get(dataset, ()), address)
     if asked.scenes is None:
         return by_dataset
@@ -310,7 +309,7 @@ def _by_dataset(experiment: Experiment, asked: RecipeRequest) -> dict[str, tuple
 
 
 def _fitting(experiment: Experiment, dataset: str) -> tuple[str, ...]:
-    """The experiment's protocols that score a dataset; a ``ConfigError`` where none does."""
+    """The experiment's protocols that can score a dataset; ``ConfigError`` if there is none."""
     truth = TruthFacts.of_dataset(registry.load("dataset", dataset))
     names = tuple(name for name in experiment.protocols if truth_incompatibility(load_protocol(name), truth) is None)
     if experiment.protocols and not names:
@@ -330,7 +329,7 @@ def known_scenes(dataset: Any) -> tuple[str, ...]:
 
 
 def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
-    """The scenes that ``addresses`` of a dataset name; a group's members, and what of a pattern is here."""
+    """The scenes named by ``addresses`` of a dataset; groups are expanded, patterns match available scenes."""
     dataset = dataset_named(dataset_name)
     groups = dataset.groups() if isinstance(dataset, HasGroups) else {}
     for address in addresses:
@@ -342,7 +341,7 @@ def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
 
 
 def plan_of(run: RecipeRun, out: Path) -> Plan:
-    """The plan of a run; what its folder holds already is joined with, so that a table more makes it longer."""
+    """The plan of a run; it extends a run already in its folder, so that tables can be added later."""
     values = dict(run.values) | {
         "scenes": run.scenes,
         "methods": run.methods,
@@ -358,7 +357,7 @@ def plan_of(run: RecipeRun, out: Path) -> Plan:
 
 
 def execute(run: RecipeRun, plan: Plan, report: Report) -> RunResult:
-    """Do what of ``plan`` is not done yet; the rows of a sweep are left beside its metrics."""
+    """Run the unfinished part of ``plan``; the rows of a sweep are written next to its metrics."""
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
         write_rows(plan.folder.path, run.rows, joins=True)
@@ -368,7 +367,7 @@ def execute(run: RecipeRun, plan: Plan, report: Report) -> RunResult:
 
 @contextmanager
 def environment(**values: str) -> Iterator[None]:
-    """Variables of the environment, which the workers inherit, for the time of the block."""
+    """Set environment variables, which workers inherit, for the duration of the block."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -383,7 +382,7 @@ def environment(**values: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class GivenPredictions:
-    """The predictions of one method: where they lie, and what its encoder makes of texts, where that is given."""
+    """The predictions of one method: their folder, and its encoder's text features if given."""
 
     place: Path
     text_features: Path | None = None
@@ -392,10 +391,9 @@ class GivenPredictions:
 def named_predictions(
     experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
 ) -> dict[str, GivenPredictions]:
-    """What ``METHOD=DIR`` and ``METHOD=FILE`` give, by printed method.
+    """The predictions given by ``METHOD=DIR`` and ``METHOD=FILE``, by printed method.
 
-    Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, and for what is
-    not there.
+    Raises ``ConfigError`` if no experiment accepts predictions of a method, it is named twice, or a path is missing.
     """
     places = _named(
         "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
@@ -412,11 +410,11 @@ def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[st
             raise ConfigError(f"{flag} {printable(text, 80)}: expected METHOD={kind}")
         if method not in known:
             hint = suggest(method, known, "it takes") if known else "; name its --predictions too"
-            raise ConfigError(f"{flag}: this recipe takes none of '{printable(method, 60)}'{hint}")
+            raise ConfigError(f"{flag}: this recipe takes no '{printable(method, 60)}'{hint}")
         if method in named:
             raise ConfigError(f"{flag}: '{printable(method, 60)}' is given twice; give it once")
         if not Path(path).exists():
-            raise ConfigError(f"{flag} {printable(method, 60)}: there is no {printable(path, 200)}")
+            raise ConfigError(f"{flag} {printable(method, 60)}: {printable(path, 200)} does not exist")
         named[method] = Path(path)
     return named
 
@@ -424,7 +422,7 @@ def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[st
 def evaluate_predictions(
     named: Mapping[str, GivenPredictions], experiments: Sequence[Experiment], asked: RecipeRequest, out: Path
 ) -> list[Path]:
-    """The run folders of predictions, one a method and dataset; a folder that holds the same stays as it is."""
+    """Evaluate predictions into one run folder per method and dataset, which stays as it is if nothing changed."""
     folders: list[Path] = []
     for method, given in named.items():
         mine = [one for one in experiments if method in one.predictions]
@@ -441,7 +439,7 @@ def evaluate_predictions(
 
 
 def _scenes(experiments: Sequence[Experiment], asked: RecipeRequest, dataset: str) -> tuple[str, ...]:
-    """The recipe's scenes of ``dataset``: what else was predicted is of no row of its tables."""
+    """The recipe's scenes of ``dataset``; other predicted scenes are in none of its tables."""
     addresses = asked.scenes.get(dataset) if asked.scenes else None
     if addresses is None:
         addresses = tuple(scene for one in experiments for scene in one.scenes if split_address(scene)[0] == dataset)

@@ -1,4 +1,4 @@
-"""A registry of results: a folder of bundles of many people, compared with each other and ranked, one row per score."""
+"""A registry of results: a folder of bundles from many contributors, compared and ranked, one row per score."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import JOBS, RECORDS
 
-UNKNOWN = "not known: run.toml is not whole"
+UNKNOWN = "unknown: run.toml is incomplete"
 MAX_CHARACTERS = 2000
 
 
 def command_of(run: FinishedRun, method: str) -> str:
-    """A line for a shell that does what gave the rows of ``method``: ``run`` of it alone, or ``evaluate``.
+    """A shell command that reproduces the rows of ``method``: ``run`` with only this method, or ``evaluate``.
 
-    What moves no number is left out, and so is what nobody asked for.
+    Settings that change no number are omitted, and so are defaults.
     """
     if method in run.external:
         return printable(_evaluation(run, method), MAX_CHARACTERS)
@@ -56,7 +56,7 @@ def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Itera
 
 
 def _settings(asked: Mapping[KeyPath, Any], method: str) -> Iterator[str]:
-    """``--set`` of what was asked of this method, the datasets and perception; a variant's name says its own."""
+    """``--set`` with requested settings of this method, datasets and perception; a variant's name has its own."""
     base = method.partition("@")[0]
     pairs = []
     for path, value in asked.items():
@@ -77,16 +77,16 @@ def _evaluation(run: FinishedRun, method: str) -> str:
     return shlex.join([*words, "--protocols", *run.protocols])
 
 
-NOT_STATED = "not said"
-USES_GROUND_TRUTH = "none: it was told the truth"
-NO_WEIGHTS = {"oracle": "none: masks of the ground truth", "stored": f"{NOT_STATED}: detections of another program"}
-ROW_FILES = ("counts.npz", "updates.csv", "done.json")  # what of a job a row needs; its map stays in the archive
+NOT_STATED = "not stated"
+USES_GROUND_TRUTH = "none: it uses ground truth"
+NO_WEIGHTS = {"oracle": "none: ground-truth masks", "stored": f"{NOT_STATED}: detections of another program"}
+ROW_FILES = ("counts.npz", "updates.csv", "done.json")  # files of a job that a row needs; its map stays in the archive
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the first line of the specification's pointer files
 
 
 @dataclass(frozen=True)
 class BundleFacts:
-    """An archive in a registry: the name of its file without suffix, and what its manifest says."""
+    """An archive in a registry: its file name without suffix, and facts from its manifest."""
 
     name: str
     sha256: str
@@ -97,7 +97,7 @@ class BundleFacts:
 
 @dataclass(frozen=True)
 class ModelWeights:
-    """A model that a row needed; ``files`` is SHA-256 by file name, as far as the run recorded it."""
+    """A model that a row used; ``files``: file name and SHA-256, as far as the run recorded it."""
 
     model: str
     trained_on: str
@@ -108,9 +108,9 @@ class ModelWeights:
 class Row(RankingRow):
     """A method of a run under a protocol.
 
-    ``update_s`` and ``map_s``: the median over its frames after the first ones of a scene, with perception and without;
-    None where no frame was timed. ``encoder``: whose features named the instances, None where the method did.
-    ``values_of_scenes``: scene -> a value for each headline metric.
+    ``update_s`` and ``map_s``: median time per frame after the first ones of a scene, with and without perception; None
+    if no frame was timed. ``encoder``: the encoder whose features named the instances, None if the method did.
+    ``values_of_scenes``: scene -> one value per headline metric.
     """
 
     bundle: BundleFacts
@@ -135,21 +135,21 @@ class Row(RankingRow):
 
     @property
     def trained_on(self) -> str:
-        """What all weights were trained on, in a line."""
+        """The training data of all weights, on one line."""
         known = [f"{one.model}: {one.trained_on}" for one in self.weights]
         return self.stated_training_data or "; ".join(known) or (USES_GROUND_TRUTH if self.is_ceiling else NOT_STATED)
 
 
 def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
-    """The rows of the bundle in ``file``, and what of it can stand in no ranking.
+    """The rows of the bundle in ``file``, and its scores that cannot be ranked.
 
-    A ``StoreError`` where it is no bundle, a ``DataError`` where only a link or a pointer of Git LFS is here.
+    Raises ``StoreError`` if it is not a bundle, ``DataError`` if it is only a link or a Git LFS pointer.
     """
     with reading(shown(file), StoreError), opened(file) as stream:
         if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise DataError(f"{shown(file)}: is a pointer of Git LFS, not the bundle itself; get it with: git lfs pull")
+            raise DataError(f"{shown(file)}: is a Git LFS pointer, not the bundle itself; get it with: git lfs pull")
     if file.is_symlink():
-        raise DataError(f"{shown(file)}: is a link; name or copy the bundle itself")
+        raise DataError(f"{shown(file)}: is a link; give or copy the bundle itself")
     with TemporaryFolder("su3d-bundle-") as folder:
         unpacked = unpack(file, folder, keep=_is_row_file)
         manifest = unpacked.manifest
@@ -179,7 +179,7 @@ def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
         name = printable(place.name, 120)
         try:
             run = read_run(place)
-            # what a protocol does not score, such as the instances of dense features, is no row and no fault
+            # what a protocol cannot score, such as instances of dense features, is neither a row nor a fault
             unscored = {
                 f"{printable(method, 80)} / {printable(protocol, 80)}"
                 for (method, protocol), record in run.results.items()
@@ -192,19 +192,19 @@ def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
                 elif (entry.method, entry.protocol) in run.results and is_plain(entry.method):
                     yield _row(run, entry, unpacked, bundle)
                 else:
-                    yield Refused(name, entry.method, "this is no name of a method; call it by letters and digits")
+                    yield Refused(name, entry.method, "invalid method name; use letters and digits")
         except Su3dError as error:
             yield Refused(name, "run", printable(str(error), 300))
 
 
 def is_plain(name: str) -> bool:
-    """Whether a method is called as methods can be, without what no page shows as it is."""
+    """Whether a method's name is valid and can be shown unchanged on a page."""
     return printable(name, 120) == name and name.strip(". ") != "" and "/" not in name
 
 
 def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: BundleFacts) -> Row:
     record = run.results[entry.method, entry.protocol]
-    assert record.result is not None  # or it were no entry
+    assert record.result is not None  # otherwise there would be no entry
     times = read_update_times(run, entry.method)
     stages = {stage.name: stage for stage in summarise(times, WARM_UP).stages} if times else {}
     per_scene = record.result.per_scene
@@ -236,7 +236,7 @@ def _seconds(ms: float) -> float | None:
 
 
 def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iterator[ModelWeights]:
-    """The models of the profile and those that the run recorded, and the one whose features named the instances."""
+    """The models of the profile, those that the run recorded, and the encoder that named the instances."""
     parts = (profile or "").split(", ")
     yield from (ModelWeights(f"profile {part}", NO_WEIGHTS[part]) for part in parts if part in NO_WEIGHTS)
     known = encoder_known_as(encoder)
@@ -252,11 +252,11 @@ def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iter
             yield ModelWeights(printable(model, 80), MODELS[model].trained_on if model in MODELS else NOT_STATED, files)
 
 
-N_DIGITS = 12  # of a digest, in a message
+N_DIGITS = 12  # shown digits of a digest
 
 
 def conflict_with(row: Row, held: Sequence[Row]) -> str | None:
-    """Why ``row`` cannot stand in a registry that holds the rows ``held``, with what to do; None where it can."""
+    """Why ``row`` cannot be added to a registry with the rows ``held``, and what to do; None if it can."""
     return next((f"{row.what}: {fault}" for other in held for fault in _faults_beside(row, other)), None)
 
 
@@ -265,55 +265,55 @@ def _faults_beside(row: Row, other: Row) -> Iterator[str]:
     is_of_protocol, is_of_ranking = row.protocol == other.protocol, row.ranking == other.ranking
     if is_of_protocol and (row.version, row.digest) != (other.version, other.digest):
         yield (
-            f"its protocol is version {row.version}, digest {row.digest[:N_DIGITS]}, that of {where} is version "
-            f"{other.version}, digest {other.digest[:N_DIGITS]}; score it again by those rules, or begin another "
+            f"its protocol has version {row.version}, digest {row.digest[:N_DIGITS]}, that of {where} has version "
+            f"{other.version}, digest {other.digest[:N_DIGITS]}; score it again with those rules, or start another "
             "registry"
         )
     theirs = dict(other.data)
     for scene, digest in row.data:
         if theirs.get(scene, digest) != digest:
             yield (
-                f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {where} "
-                f"{theirs[scene][:N_DIGITS]}; run it on the same data, settings of the dataset included"
+                f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {where} have "
+                f"{theirs[scene][:N_DIGITS]}; run it on the same data with the same dataset settings"
             )
-    # features are compared with those of texts: under a protocol that names an encoder, of one encoder alone
+    # features are compared with text features: a protocol that names an encoder allows only one encoder
     if is_of_protocol and None not in (row.encoder, other.encoder) and _names_encoder(row.protocol):
         if row.encoder != other.encoder:
             yield (
-                f"its features are of the encoder {row.encoder}, those of {where} of {other.encoder}, and the "
-                "protocol is of one encoder; run it with that one"
+                f"its features are from the encoder {row.encoder}, those of {where} from {other.encoder}, but the "
+                "protocol requires one encoder; run it with that one"
             )
         mine, known = ({one.model: one.files for one in each.weights if one.files} for each in (row, other))
         for model in mine.keys() & known.keys() & MODELS.keys():
             if MODELS[model].kind == "encoder" and mine[model] != known[model]:
-                yield f"its weights of {model} are not those of {where} (other SHA-256); run it with the same file"
+                yield f"its weights of {model} differ from those of {where} (other SHA-256); run it with the same file"
     if is_of_ranking and row.method.casefold() == other.method.casefold():
         yield (
-            f"that name is taken by {where} over the same scenes; give the variant its own name, such as "
+            f"the name is taken by {where} on the same scenes; give the variant its own name, such as "
             f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
         )
     if is_of_ranking and not (row.is_ceiling or other.is_ceiling) and row.labels != other.labels:
-        yield f"is of {row.labels}, {where} of {other.labels}; score it with as many labels"
+        yield f"uses {row.labels}, {where} uses {other.labels}; score it with the same number of labels"
 
 
 def _names_encoder(protocol: str) -> bool:
     try:
         return protocol in protocol_names() and load_protocol(protocol).encoder is not None
-    except ConfigError:  # somebody's own rules, which their run keeps
+    except ConfigError:  # user-defined rules, which are stored in their run
         return False
 
 
 BUNDLES = "bundles"
 SUFFIX = ".zip"
 MAX_BUNDLES = 2000
-MAX_NAMED = 3  # reasons of one bundle in its line
+MAX_NAMED = 3  # reasons listed per bundle
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_ANY = "bundle"  # what reproduce calls every one of its archives
+_ANY = "bundle"  # the name of all archives written by reproduce
 
 
 @dataclass(frozen=True)
 class Registry:
-    """All that a folder of bundles holds: rankings, the best first, and what stands in none with its reason."""
+    """The contents of a folder of bundles: rankings, the best first, and what is excluded with its reason."""
 
     n_bundles: int
     boards: tuple[tuple[Row, ...], ...]
@@ -325,32 +325,32 @@ class Registry:
 
 
 def bundle_files(folder: Path) -> list[Path]:
-    """The bundles of a registry by name: those in its folder ``bundles``, or beside each other in ``folder``.
+    """The bundles of a registry by name: those in its folder ``bundles`` if it exists, otherwise those in ``folder``.
 
-    A ``ConfigError`` where it is no folder.
+    Raises ``ConfigError`` if it is not a folder.
     """
     if not folder.is_dir():
-        raise ConfigError(f"{shown(folder)}: is no folder; begin a registry with: su3d-bench dev registry new DIR")
+        raise ConfigError(f"{shown(folder)}: is not a folder; create a registry with: su3d-bench dev registry new DIR")
     place = folder / BUNDLES if (folder / BUNDLES).is_dir() else folder
     try:
         files = sorted(place / name for name in os.listdir(place) if name.lower().endswith(SUFFIX))
     except OSError as error:
         raise StoreError(f"{shown(place)}: cannot be read: {error.strerror or error}") from error
     if len(files) > MAX_BUNDLES:
-        raise ConfigError(f"{shown(place)}: holds {len(files)} bundles; a registry has at most {MAX_BUNDLES}")
+        raise ConfigError(f"{shown(place)}: has {len(files)} bundles; a registry has at most {MAX_BUNDLES}")
     return files
 
 
 def read_registry(folder: Path) -> Registry:
-    """What the bundles of ``folder`` hold, each file held against its manifest and each number against its counts.
+    """The registry in ``folder``, with each file checked against its manifest and each number against its counts.
 
-    Their maps are not scored anew: ``add_bundle`` does. Of two rows that do not go together that of the later name is
-    left out. A ``ConfigError`` where the folder holds no bundle and has no place for any.
+    Maps are only scored again in ``add_bundle``. Of two conflicting rows, the one with the later bundle name is
+    excluded. Raises ``ConfigError`` if the folder has neither bundles nor a ``bundles`` folder.
     """
     files = bundle_files(folder)
     if not files and not (folder / BUNDLES).is_dir():
         raise ConfigError(
-            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench dev registry add BUNDLE --to DIR"
+            f"{shown(folder)}: contains no bundles; add one with: su3d-bench dev registry add BUNDLE --to DIR"
         )
     rows: list[Row] = []
     refused: list[Refused] = []
@@ -376,7 +376,7 @@ def _read(file: Path) -> tuple[list[Row], list[Refused]]:
 
 
 def _boards(rows: Sequence[Row]) -> Iterator[tuple[Row, ...]]:
-    """The rankings by protocol, those of the most scenes first."""
+    """The rankings by protocol, those with the most scenes first."""
     rankings = sorted({row.ranking for row in rows}, key=lambda key: (key[0], -len(key[2]), key))
     for ranking in rankings:
         yield ranked(in_order([row for row in rows if row.ranking == ranking]))
@@ -384,7 +384,7 @@ def _boards(rows: Sequence[Row]) -> Iterator[tuple[Row, ...]]:
 
 @dataclass(frozen=True)
 class Added:
-    """What became of a bundle: ``reasons`` are why it was refused, none where it is in the registry at ``place``."""
+    """The result of adding a bundle: ``reasons`` why it was rejected, empty if it is in the registry at ``place``."""
 
     bundle: str
     place: str
@@ -395,24 +395,24 @@ class Added:
 
 
 def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
-    """Take ``file`` into ``registry`` after it was scored anew, or say why not.
+    """Add ``file`` to ``registry`` after scoring it again, or return why it was rejected.
 
-    It is refused where its numbers are not what its maps give by the rule of ``verify_bundle``, where a row of it can
-    stand in no ranking, or does not go with the rows that are there. One that lies in the registry already, as in a
-    pull request, is held against all others and stays. A ``StoreError`` or ``DataError`` where it is no bundle, a
-    ``ConfigError`` where ``name`` is none or the registry holds a damaged bundle.
+    It is rejected if its maps do not reproduce its numbers (see ``verify_bundle``), if a row of it cannot be ranked, or
+    conflicts with existing rows. A bundle already in the registry, as in a pull request, is checked against all others
+    and stays. Raises ``StoreError`` or ``DataError`` if it is not a bundle, ``ConfigError`` if ``name`` is invalid or
+    the registry contains a damaged bundle.
     """
     others = [one for one in bundle_files(registry) if not _is_same_file(one, file)]
     is_there = len(others) < len(bundle_files(registry))
     before = _digest(file)
     rows, refused = rows_of_bundle(file)
     if is_there and name is not None:
-        raise ConfigError(f"--name: {shown(file)} is in the registry already; rename the file itself")
+        raise ConfigError(f"--name: {shown(file)} is already in the registry; rename the file itself")
     place = file if is_there else _place(registry, file, rows, name)
     found = Added(printable(file.name, 120), printable(str(place), 300), len(rows))
     reasons = [f"{one.what}: {one.reason}" for one in refused]
     if not rows and not refused:
-        reasons.append("holds no run; pack one with: su3d-bench report bundle RUN")
+        reasons.append("contains no runs; create a bundle with: su3d-bench report bundle RUN")
     reasons = reasons or list(_beside(rows, others, before))
     if not reasons and not is_there and os.path.lexists(place):
         reasons.append(f"{printable(place.name, 120)} is taken by another bundle; choose another with --name")
@@ -430,18 +430,18 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
 
 
 def _beside(rows: Sequence[Row], others: Sequence[Path], digest: str) -> Iterator[str]:
-    """Why the rows of a bundle of this digest cannot stand beside each other and the bundles ``others``."""
+    """Why the rows of a bundle of this digest conflict with each other or with the bundles ``others``."""
     held: list[Row] = []
     for other in others:
         mine, refused = _read(other)
         if refused:
             first = refused[0]
             raise ConfigError(
-                f"{shown(other)}: is in the registry and cannot stand there: {first.what}: {first.reason}; remove it "
-                "or make it anew first"
+                f"{shown(other)}: is an invalid bundle in the registry: {first.what}: {first.reason}; remove it or "
+                "create it again first"
             )
         if mine and mine[0].bundle.sha256 == digest:
-            yield f"is there already as {mine[0].bundle.name}{SUFFIX}"
+            yield f"is already in the registry as {mine[0].bundle.name}{SUFFIX}"
             return
         held += mine
     for row in rows:
@@ -458,7 +458,7 @@ def _is_same_file(one: Path, other: Path) -> bool:
 
 
 def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) -> Path:
-    """Where a bundle goes; one that has no name of its own is called after its recipe or run, and its digest."""
+    """The path of a bundle in the registry; one with the default name is named after its recipe or run, and digest."""
     if name is None:
         name = file.name[: -len(SUFFIX)] if file.name.lower().endswith(SUFFIX) else file.name
         if name == _ANY and rows:
@@ -466,8 +466,8 @@ def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) ->
             name = f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.run)}-{first.bundle.sha256[:8]}"
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"'{printable(name, 100)}' cannot be the name of a bundle: letters, digits, '.', '_' and '-' alone; choose "
-            "one with --name"
+            f"'{printable(name, 100)}' is not a valid bundle name (only letters, digits, '.', '_' and '-'); choose one "
+            "with --name"
         )
     folder = registry / BUNDLES if (registry / BUNDLES).is_dir() or not bundle_files(registry) else registry
     return folder / f"{name}{SUFFIX}"
@@ -479,7 +479,7 @@ def _digest(file: Path) -> str:
 
 
 def _copy(file: Path, place: Path, digest: str) -> None:
-    """The file at ``place``, whole or not at all; a ``StoreError`` where it is not the one that was scored."""
+    """Copy the file to ``place`` (atomic); ``StoreError`` if it is not the one that was scored."""
     make_folder(place.absolute().parent)
     with reading(shown(file), StoreError), opened(file) as source, replacing(place) as out:
         copied = copy_pieces(source, out)
@@ -489,11 +489,11 @@ def _copy(file: Path, place: Path, digest: str) -> None:
 
 
 def lines_of(found: Added) -> list[str]:
-    """What is told of a bundle that was added or refused, a line a reason."""
+    """The output lines for a bundle that was added or rejected, one line per reason."""
     if not found.reasons:
-        how = "to the last bit" if found.is_to_the_bit else "integers the same, values within 1e-9"
-        scores = f"{counted(found.n_scores, 'score')} made anew, {how}"
+        how = "identical to the last bit" if found.is_to_the_bit else "identical integers, values within 1e-9"
+        scores = f"{counted(found.n_scores, 'score')} recomputed, {how}"
         return [f"{found.bundle}: in the registry as {found.place}: {counted(found.n_rows, 'row')}; {scores}"]
-    told = [f"{found.bundle}: refused: {reason}" for reason in found.reasons[:MAX_NAMED]]
+    told = [f"{found.bundle}: rejected: {reason}" for reason in found.reasons[:MAX_NAMED]]
     more = len(found.reasons) - len(told)
-    return [*told, *([f"{found.bundle}: refused: and {counted(more, 'reason')} more"] if more else [])]
+    return [*told, *([f"{found.bundle}: rejected: and {counted(more, 'reason')} more"] if more else [])]

@@ -1,4 +1,4 @@
-"""A registry as a static site: one page of all rankings, one a method and one a scene, and all of it as JSON."""
+"""A registry as a static site: one page of all rankings, one page per method and per scene, and everything as JSON."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
 SCHEMA = 1
-KIND = "su3d-bench dev registry"  # by which an earlier site is known
+KIND = "su3d-bench dev registry"  # identifies an earlier site
 MAX_ADDRESS_CHARACTERS = 500
 TITLE = "Registry of results"
-ROW_FIELDS = (  # what a page says of a row as it is
+ROW_FIELDS = (  # fields of a row that pages show unchanged
     "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
     "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run",
 )  # fmt: skip
 
 
 def write_site(registry: Registry, out: Path, title: str = TITLE, bundle_url: str | None = None) -> list[Path]:
-    """The pages of ``registry`` in the folder ``out``, in the place of an earlier site; what was written, by name.
+    """Write the pages of ``registry`` to the folder ``out``, replacing an earlier site; return the written files.
 
-    ``bundle_url``: the https address below which the bundles lie; None: they are named and not linked. A
-    ``ConfigError`` where ``out`` holds something else.
+    ``bundle_url``: the https address of the bundles' folder; None: bundles are named but not linked. Raises
+    ``ConfigError`` if ``out`` contains anything else.
     """
     earlier = _earlier_pages(out)
     address = _checked_address(bundle_url)
@@ -45,7 +45,7 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundle_url: st
             pages[one["page"]] = registry_page_html(kind, one["name"], {**make(value, one), "registry": title})
     for folder in ("", METHODS, SCENES):
         make_folder(out / folder)
-    # first of all, so that the site is known for one however this ends
+    # written first, so that the folder is recognised as a site even if this is interrupted
     write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted({*pages, *earlier}), **value})
     for name, text in pages.items():
         write_text(out / name, text)
@@ -56,18 +56,18 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundle_url: st
 
 
 def _earlier_pages(out: Path) -> set[str]:
-    """The pages of the site that ``out`` holds already."""
+    """The pages of the site that ``out`` already contains."""
     if not os.path.lexists(out):
         return set()
     if not out.is_dir():
-        raise ConfigError(f"{shown(out)}: is no folder; name another with --out")
+        raise ConfigError(f"{shown(out)}: is not a folder; name another with --out")
     if all(is_unfinished(name) for _, _, names in os.walk(out) for name in names):
         return set()
     value = read_json(out / DATA) if is_file(out / DATA) else None
     pages = value.get("pages") if isinstance(value, dict) and value.get("kind") == KIND else None
     if not isinstance(pages, list):
         raise ConfigError(
-            f"{shown(out)}: holds something that is no site of a registry; name an empty folder with --out"
+            f"{shown(out)}: contains something other than a registry site; name an empty folder with --out"
         )
     return {name for name in pages if isinstance(name, str) and _is_page(name)}
 
@@ -81,7 +81,7 @@ def _checked_address(text: str | None) -> str | None:
     if text is None:
         return None
     if not text.startswith("https://") or len(text) > MAX_ADDRESS_CHARACTERS or printable(text, 10_000) != text:
-        raise ConfigError(f"--bundle-url '{printable(text, 100)}': expected an address that begins with https://")
+        raise ConfigError(f"--bundle-url '{printable(text, 100)}': expected an address that starts with https://")
     return text.rstrip("/") + "/"
 
 
@@ -90,7 +90,7 @@ def _page(folder: str, name: str) -> str:
 
 
 def _value(registry: Registry, title: str, address: str | None) -> dict[str, Any]:
-    """All of the site as plain values; links lead from the root of the site."""
+    """The whole site as JSON values; links are relative to the root of the site."""
     boards = [_board(board, address) for board in registry.boards]
     rows = registry.rows
     digests = {scene: digest for row in rows for scene, digest in row.data}
@@ -114,7 +114,7 @@ def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
     known = load_protocol(first.protocol) if first.protocol in protocol_names() else None
     return {
         **{name: getattr(first, name) for name in ("protocol", "version", "digest", "scenes", "headline")},
-        "summary": "somebody's own" if known is None else known.summary,
+        "summary": "user-defined" if known is None else known.summary,
         "datasets": sorted({scene.partition("/")[0] for scene in first.scenes}),
         "notes": list(_notes(board)),
         "rows": [_row(row, address) for row in board],
@@ -122,25 +122,25 @@ def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
 
 
 def _notes(board: Sequence[Row]) -> Iterator[str]:
-    """What must stand beneath a ranking."""
+    """The notes below a ranking."""
     first = board[0]
     rivals = [row for row in board if not row.is_ceiling]
     yield from confidence_notes({f"{row.method} of {row.bundle.name}": row.confidences for row in rivals})
     yield from dict.fromkeys(f"labels: {row.labels}" for row in rivals if row.labels)
     encoders = dict.fromkeys(row.encoder for row in rivals if row.encoder)
     if len(encoders) > 1:
-        yield f"features of several encoders, which the protocol leaves open: {some(list(encoders), 6)}"
+        yield f"features of several encoders, as the protocol does not fix one: {some(list(encoders), 6)}"
     if any(row.ranks for row in board):
         yield (
-            f"rank: from which to which a row may go by {first.headline[0]}, with 95 % for all rows together: sign-"
-            "flip tests of all pairs, of their means over scenes, corrected by Holm"
+            f"rank: simultaneous 95 % interval of the rank by {first.headline[0]}, from sign-flip tests of the means "
+            "over scenes of all pairs, corrected by Holm"
         )
     elif len(rivals) > 1:
-        yield f"no ranks: {len(rivals)} rows are more than are tested in pairs"
+        yield f"no ranks: {len(rivals)} rows are too many for testing all pairs"
     if rough := few_scenes(len(first.scenes)):
         yield rough
     if len(rivals) < len(board):
-        yield "rows that were told the truth stand last and compete with none"
+        yield "rows that use ground truth are listed last and not ranked"
 
 
 def _row(row: Row, address: str | None) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def _row(row: Row, address: str | None) -> dict[str, Any]:
 
 
 def _index(value: Mapping[str, Any]) -> dict[str, Any]:
-    """What the first page needs: all but the numbers of single scenes."""
+    """The data of the first page: everything except the numbers of single scenes."""
     boards = [
         {**board, "rows": [{k: v for k, v in row.items() if k != "of_scenes"} for row in board["rows"]]}
         for board in value["boards"]
@@ -191,7 +191,7 @@ def _scene_page(value: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str,
 
 
 def _plain_tables(registry: Registry) -> Table | Prose:
-    """What the first page shows where no script runs."""
+    """The content of the first page if scripts are disabled."""
     rows = [
         TableRow(
             row.method,
@@ -210,8 +210,8 @@ def _plain_tables(registry: Registry) -> Table | Prose:
         for row in registry.rows
     ]
     if not rows:
-        return Prose(("No row stands in this registry.",))
-    columns = ("protocol", "values", "rank", "scenes", "s a frame", "hardware", "weights trained on", "bundle")
+        return Prose(("This registry has no rows.",))
+    columns = ("protocol", "values", "rank", "scenes", "s per frame", "hardware", "weights trained on", "bundle")
     return Table("registry", "All rows, in per cent.", "method", columns, tuple(rows), ())
 
 

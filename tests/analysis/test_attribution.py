@@ -1,4 +1,4 @@
-"""Where the points of a score are lost: errors made on purpose are found, and nothing else is."""
+"""Error attribution: planted errors are found, and nothing else is."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of
 from su3d_bench.metrics.semantic import confusion as semantic
 
-SIZE = 200  # points an instance
+SIZE = 200  # points per instance
 CLASSES = (3, 3, 3, 4, 4, 5)
 RULES = ScoringRules((3, 4, 5))
 N_VOID = 300
@@ -65,7 +65,7 @@ def labelled(masks: list[Int32Array], classes: list[int], scores: list[float]) -
 
 
 def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> tuple[dict[str, float], dict[str, int]]:
-    """The gain in AP50 of each kind, after checks that hold always."""
+    """The gain in AP50 of each kind, after checks that always hold."""
     corrected = correct_scene(truth(), labelled(masks, classes, scores), RULES)
     base = instance_ap.combine([corrected.as_is])
     found = {kind: instance_ap.combine([counts]) for kind, counts in corrected.alone.items()}
@@ -75,7 +75,7 @@ def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> t
     return {kind: ap.ap50 - base.ap50 for kind, ap in found.items()}, dict(corrected.n)
 
 
-def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
+def test_mask_on_void_is_background_unless_void_is_ignored() -> None:
     masks, classes, scores = perfect()
     on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150, dtype=np.int32)], [*classes, 3], [*scores, 0.95])
     for forgives, n in ((True, 0), (False, 1)):
@@ -86,7 +86,7 @@ def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
         assert instance_ap.combine([corrected.all]).ap50 == 1
 
 
-def test_a_perfect_prediction_loses_nothing() -> None:
+def test_perfect_prediction_has_no_errors() -> None:
     gain, n = gains(*perfect())
     assert set(gain.values()) == {0.0}
     assert set(n.values()) == {0}
@@ -103,7 +103,7 @@ def with_error(kind: str) -> tuple[list[Int32Array], list[int], list[float]]:
     elif kind == "mislabelled":
         classes[0] = 4
     elif kind == "background":
-        # three tenths of two instances each and the rest void: on nothing, yet not ignored
+        # 30 % of two instances each and the rest void: matches nothing, but is not ignored
         blob = np.concatenate([points(0, 0.3), points(3, 0.3), np.arange(1200, 1300, dtype=np.int32)])
         masks, classes, scores = [*masks, blob], [*classes, 3], [*scores, 0.95]
     else:
@@ -112,7 +112,7 @@ def with_error(kind: str) -> tuple[list[Int32Array], list[int], list[float]]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_error_made_on_purpose_is_found_alone_and_mending_it_gives_a_perfect_score(kind: str) -> None:
+def test_only_the_planted_error_is_found_and_correcting_it_gives_a_perfect_score(kind: str) -> None:
     gain, n = gains(*with_error(kind))
     assert n == {name: int(name == kind) for name in KINDS}
     assert gain.pop(kind) > 0
@@ -121,11 +121,11 @@ def test_an_error_made_on_purpose_is_found_alone_and_mending_it_gives_a_perfect_
     assert instance_ap.combine([corrected.alone[kind]]).ap == instance_ap.combine([corrected.all]).ap == 1
 
 
-def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
+def test_mask_is_a_part_if_it_raises_the_iou_and_a_duplicate_if_half_of_it_is_covered() -> None:
     void = np.arange(1200, 1300, dtype=np.int32)
     first = points(0, 0.6)  # 120 of 200 points, IoU 0.6
-    with_new = np.concatenate([points(0, 0.3, 0.375), void[:40]])  # 45 of its 100 points known, 15 new: 135 / 240
-    half_known = np.concatenate([points(0, 0.4, 0.4)])  # 40 of its 80 points known
+    with_new = np.concatenate([points(0, 0.3, 0.375), void[:40]])  # 45 of its 100 points covered, 15 new: 135 / 240
+    half_known = np.concatenate([points(0, 0.4, 0.4)])  # 40 of its 80 points covered
     better = points(0, 0.2, 0.6)  # 40 new points: 160 / 200
     overlaps = overlaps_of(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
     assert overlaps.parts[0].parts == (0, 3)
@@ -136,25 +136,25 @@ SPLITS = {
     "two halves": ([(0.5, 0.0, 3), (0.5, 0.5, 3)], True),
     "one mask": ([(0.6, 0.0, 3)], False),
     "two halves of another class": ([(0.5, 0.0, 4), (0.5, 0.5, 4)], False),
-    "together just half of it": ([(0.25, 0.0, 3), (0.25, 0.25, 3)], False),
+    "exactly half together": ([(0.25, 0.0, 3), (0.25, 0.25, 3)], False),
     # 110 points of the match, 130 of the others
     "a match of the right class and others": ([(0.55, 0.0, 3), (0.35, 0.4, 4), (0.3, 0.7, 4)], True),
     "a match of the wrong class and others": ([(0.55, 0.0, 4), (0.35, 0.4, 3), (0.3, 0.7, 3)], False),
-    # none matches: 100 points of the one class, 110 of the other
+    # no match: 100 points of one class, 110 of the other
     "most points of the right class": ([(0.5, 0.0, 4), (0.3, 0.45, 3), (0.25, 0.75, 3)], True),
     "most points of the wrong class": ([(0.5, 0.0, 3), (0.3, 0.45, 4), (0.25, 0.75, 4)], False),
 }
 
 
 @pytest.mark.parametrize("name", SPLITS)
-def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(name: str) -> None:
+def test_instance_is_split_if_its_parts_together_match_it_with_its_class(name: str) -> None:
     parts, is_split = SPLITS[name]
     masks = [points(0, share, start) for share, start, _ in parts]
     predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
     assert (0 in overlaps_of(truth(), predicted, RULES).split) == is_split
 
 
-def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
+def test_true_labels_are_from_the_instance_that_shares_most_points() -> None:
     void = np.arange(1200, 1300, dtype=np.int32)
     masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]
     predicted = labelled(masks, [3, 3, 3], [0.9, 0.8, 0.7])
@@ -165,7 +165,7 @@ def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_wit
     assert of_none.class_ids.tolist() == [3, 3, 3]
 
 
-def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> None:
+def test_best_fitting_duplicate_is_kept_with_the_highest_confidence() -> None:
     masks, classes, scores = perfect()
     masks, classes, scores = [*masks, points(0, 0.7)], [*classes, 3], [*scores, 0.99]
     corrected = correct_scene(truth(), labelled(masks, classes, scores), RULES)
@@ -185,7 +185,7 @@ def scoring(rules: ProtocolRules) -> ScoringRules:
 
 
 def made_scene(seed: int) -> tuple[Int64Array, LabelledMasks]:
-    """A scene with errors of every kind: cut, joined, repeated, renamed, lost, and masks on what is no object."""
+    """A scene with errors of every kind: split, merged, duplicated, mislabelled, missed, and masks on no object."""
     rng = np.random.default_rng(seed)
     ids = [entry.id for entry in MASK_RULES.scored][:4]
     n_objects = int(rng.integers(3, 9))
@@ -215,7 +215,7 @@ def made_scene(seed: int) -> tuple[Int64Array, LabelledMasks]:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_single_mendings_never_lower_ap50_and_change_nothing_where_there_is_no_error(seed: int) -> None:
+def test_single_corrections_never_lower_ap50_and_change_nothing_without_errors(seed: int) -> None:
     truth, predicted = made_scene(seed)
     corrected = correct_scene(truth, predicted, scoring(MASK_RULES))
     base = instance_ap.combine([corrected.as_is])
@@ -232,7 +232,7 @@ def reported(rules: ProtocolRules, counts: Sequence[instance_ap.InstanceCounts])
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
 @pytest.mark.parametrize("forgives_void", [True, False])
-def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: str, forgives_void: bool) -> None:
+def test_gain_of_a_corrected_mask_equals_that_of_a_full_evaluation(aggregate: str, forgives_void: bool) -> None:
     rules = MASK_RULES.model_copy(update={"aggregate": aggregate})
     scored = replace(scoring(rules), forgives_void=forgives_void)
     kinds = dict.fromkeys(KINDS, 0)
@@ -254,7 +254,7 @@ def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: st
     assert all(n >= 2 for n in kinds.values()), kinds
 
 
-def test_an_error_is_told_by_its_masks_and_objects() -> None:
+def test_single_error_has_its_masks_objects_and_gain() -> None:
     scored = scoring(MASK_RULES)
     first, second = scored.class_ids[:2]
     truth = np.concatenate([np.repeat([first * 1000 + 1, second * 1000 + 2], 100), np.zeros(50, np.int64)])
@@ -282,7 +282,7 @@ def synthetic_points(seed: int) -> LabelledPoints:
 
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
-def test_the_gain_of_mended_points_is_that_of_the_whole_evaluation(aggregate: str) -> None:
+def test_gain_of_corrected_points_equals_that_of_a_full_evaluation(aggregate: str) -> None:
     rules = POINT_RULES.model_copy(update={"aggregate": aggregate})
     metric, n_classes = metric_of(rules), len(rules.classes)
     is_counted = np.arange(n_classes) < 5

@@ -1,4 +1,4 @@
-"""Where a run loses its points: causes of wrong points, the evaluator's own arrays, and the verb on painted scenes."""
+"""Error attribution of runs: causes of wrong points, the evaluator's own arrays, and the command on painted scenes."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ CASES = [
 ]
 
 
-# the arrays are those that the evaluator has
+# arrays equal those of the evaluator
 
 
 def predictions(truth: GroundTruth, labelled: Instances) -> dict[str, Prediction]:
-    """One prediction of every sort, on other points than the truth's."""
+    """One prediction of every sort, on other points than the ground truth's."""
     rng = np.random.default_rng(3)
     named = truth_as_prediction(truth, with_labels=False)
     assert named.features is not None
@@ -69,7 +69,7 @@ def predictions(truth: GroundTruth, labelled: Instances) -> dict[str, Prediction
 
 
 @pytest.mark.parametrize(("name", "sort"), CASES)
-def test_the_counts_as_they_are_are_those_of_scoring(name: str, sort: str) -> None:
+def test_uncorrected_counts_equal_those_of_scoring(name: str, sort: str) -> None:
     rules = load_protocol(name)
     truth, labelled = noisy(1)
     truth = replace(truth, variant=rules.ground_truth)
@@ -91,7 +91,7 @@ def test_the_counts_as_they_are_are_those_of_scoring(name: str, sort: str) -> No
 
 
 def causes(prediction: Prediction) -> dict[str, int]:
-    """Points of each cause that has any, after the checks that hold always."""
+    """Number of points of each non-empty cause, after checks that always hold."""
     found = scored_points(ROOM_RULES, room(), prediction, ENCODER)
     corrected = correct_points(found.points, found.is_counted, has_masks=found.has_masks)
     cause = causes_of(found.points, has_masks=found.has_masks)
@@ -105,11 +105,11 @@ def causes(prediction: Prediction) -> dict[str, int]:
     return {name: n for name, n in corrected.n.items() if n}
 
 
-def test_the_cause_of_points_that_are_wrong_is_told() -> None:
+def test_causes_of_wrong_points_are_found() -> None:
     truth, names, points = truth_as_prediction(room(), with_labels=True), list(NAMES), room().points
     masks = [truth.mask(k) for k in range(len(truth))]
     fewer, called = [*masks[:4], *masks[5:]], [*names[:4], *names[5:]]
-    assert causes(instances(points, fewer, called)) == {"background": 150}, "in the map and in no mask"
+    assert causes(instances(points, fewer, called)) == {"background": 150}, "in the map but in no mask"
     kept = np.setdiff1d(np.arange(len(points)), masks[4])
     place = np.full(len(points), -1)
     place[kept] = np.arange(len(kept))
@@ -120,13 +120,13 @@ def test_the_cause_of_points_that_are_wrong_is_told() -> None:
 
 
 def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
-    """Points by true class, object, mask, distance to the mask and whether they are scored; all are called 0."""
+    """Points by true class, object, mask, distance to the mask and whether they are scored; all predicted as 0."""
     true_class, objects, mask, distance_m, is_scored = (np.array(column) for column in zip(*rows, strict=True))
     near = np.zeros(len(rows))
     return LabelledPoints(true_class, np.zeros(len(rows), np.int64), is_scored, objects, mask, near, distance_m)
 
 
-def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
+def test_object_of_a_mask_comes_from_nearby_scored_points_only() -> None:
     near, far, void = (1, 7, 0, 0.05, True), (2, 8, 0, 0.051, True), (3, 9, 0, 0.0, False)
     far_of_another = (2, 8, 1, 0.051, True)
     found = row_of_points(near, far, far, void, void, far_of_another)
@@ -143,10 +143,10 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
         [0, 0, 0],
         [0, 1, 0],
         [1, 2, 0],
-    ]  # mask 0 is called 1 throughout
+    ]  # mask 0 is class 1 everywhere
 
 
-def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() -> None:
+def test_geometry_is_the_first_cause_beyond_five_centimetres() -> None:
     wrong = row_of_points(*[(1, 7, 0, 0.0, True)] * 2, (1, 7, -1, np.inf, True), (1, 7, -1, np.inf, True))
     found = replace(wrong, map_distance_m=np.array([0.05, 0.051, 0.05, 0.051]))
     names = [CAUSES[cause] for cause in causes_of(found).tolist()]
@@ -158,7 +158,7 @@ def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``whole``: all found; ``dropped``: one object of each scene is not; ``oracle``: what the truth gives."""
+    """``whole``: all objects found; ``dropped``: one object per scene is missing; ``oracle``: the oracle profile."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -182,7 +182,7 @@ def attributed(run: str, **more: Any) -> dict[str, Any]:
     return {one["protocol"]: one for one in found.to_json()["protocols"]}
 
 
-def test_a_run_without_errors_loses_nothing() -> None:
+def test_perfect_run_has_no_errors() -> None:
     for one in attributed("whole").values():
         assert {cause["n"] for cause in one["causes"].values()} == {0}
         for name, value in one["values"].items():
@@ -190,10 +190,10 @@ def test_a_run_without_errors_loses_nothing() -> None:
             assert one["rest"][name] == one["overlap"][name] == 0.0
 
 
-def test_an_object_that_a_method_drops_is_missed() -> None:
+def test_dropped_object_is_missed() -> None:
     found = attributed("dropped")["rooms-instance"]
     counted = {name: cause["n"] for name, cause in found["causes"].items() if cause["n"]}
-    assert counted == {"missed": 2}  # one a scene
+    assert counted == {"missed": 2}  # one per scene
     assert found["causes"]["missed"]["gains"]["AP"] == pytest.approx(1 - found["values"]["AP"])
 
 
@@ -204,7 +204,7 @@ def test_values_gains_overlap_and_rest_add_up_to_one() -> None:
             assert value + gains + one["overlap"][name] + one["rest"][name] == pytest.approx(1, abs=1e-12)
 
 
-def test_perfect_2d_masks_come_from_the_oracle_s_run() -> None:
+def test_ground_truth_2d_masks_come_from_the_oracle_run() -> None:
     found = attributed("dropped", oracle=Path("oracle"))["rooms-instance"]
     assert found["stages"]["2D masks"] == {"AP": 1.0, "AP50": 1.0, "AP25": 1.0}
     assert found["stages"]["labels"] == found["values"]
@@ -212,16 +212,18 @@ def test_perfect_2d_masks_come_from_the_oracle_s_run() -> None:
         attributed("dropped", oracle=Path("whole"))
 
 
-def test_other_counts_than_the_run_s_are_refused() -> None:
+def test_counts_that_differ_from_the_run_are_an_error() -> None:
     shutil.copytree("dropped", "mixed")
     for scene in "ab":
         here = f"scenes/painted.{scene}/collector/prediction.npz"
         shutil.copy(Path("whole", here), Path("mixed", here))
-    with pytest.raises(PredictionError, match="the counts of the run are not those that its prediction gives here"):
+    with pytest.raises(
+        PredictionError, match="the run's stored counts differ from those recomputed from its prediction"
+    ):
         attributed("mixed")
 
 
-def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
+def test_attribution_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| missed "))

@@ -1,4 +1,4 @@
-"""Two runs side by side: differences, intervals and tests that can be worked out by hand, and what is refused."""
+"""Comparison of two runs: differences, intervals and tests with hand-computed values, and incomparable runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from su3d_bench.store.run_folder import RunFolder
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes."""
+    """``a``: all objects found; ``b``: one object dropped; ``few``: as ``b``, two scenes."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -66,7 +66,7 @@ def metrics(run: str) -> dict[str, Any]:
     return {one["protocol"]: one["result"] for one in loaded["results"]}
 
 
-def test_differences_are_those_of_the_two_runs() -> None:
+def test_differences_match_the_metrics_of_both_runs() -> None:
     found = compare("a", "b")
     assert [one.protocol for one in found.protocols] == ["rooms-semantic", "rooms-instance"]
     for one in found.protocols:
@@ -78,17 +78,17 @@ def test_differences_are_those_of_the_two_runs() -> None:
             singles = {s: after["per_scene"][s][name] - before["per_scene"][s][name] for s in one.scenes}
             assert value.per_scene == singles
             assert value.mean_of_scenes == pytest.approx(sum(singles.values()) / 3)
-            if value.interval is not None:  # the scenes' differences may be equal
+            if value.interval is not None:  # None if all scenes differ equally
                 middle = sum(value.interval) / 2
                 assert -1 in value.interval or 1 in value.interval or middle == pytest.approx(value.difference)
             assert value.test == sign_flip_test(np.array(list(singles.values())))
     assert found.protocols[1].metrics["AP"].difference < 0
 
 
-def test_an_interval_is_of_the_differences_without_each_scene_in_turn() -> None:
+def test_interval_is_a_jackknife_over_scenes() -> None:
     counts: list[dict[str, dict[str, SceneScore]]] = []
     is_inside = []
-    for run, first in (("a", 0), ("b", 3)):  # the painted scenes are alike: these differ, and more in one run
+    for run, first in (("a", 0), ("b", 3)):  # painted scenes are too similar: these differ, more in one run
         shutil.copytree(run, f"noisy-{run}")
         made = {
             name: list(noisy_scores(name, first + 3).values())[first:] for name in ("rooms-semantic", "rooms-instance")
@@ -114,11 +114,11 @@ def test_an_interval_is_of_the_differences_without_each_scene_in_turn() -> None:
     assert any(is_inside)
 
 
-def test_p_of_all_is_corrected_for_every_metric_of_the_comparison_that_differs() -> None:
+def test_p_of_all_is_corrected_for_all_differing_metrics() -> None:
     found = [value for one in compare("a", "b").protocols for value in one.metrics.values()]
     differing = [value for value in found if any(value.per_scene.values())]
     assert len(differing) > 1
-    assert {value.p_of_all for value in differing} == {min(1.0, 0.25 * len(differing))}  # p is 0.25 throughout
+    assert {value.p_of_all for value in differing} == {min(1.0, 0.25 * len(differing))}  # every p is 0.25
     assert {value.p_of_all for value in found if value not in differing} <= {None}
     classes = compare("a", "b", protocols=["rooms-instance"], per_class=True).protocols[0].classes
     assert classes["chair"]["AP"].p_of_all == pytest.approx(0.75)  # three columns of one class differ
@@ -133,17 +133,17 @@ def changed_by(changes: list[float], interval: tuple[float, float] | None) -> Di
 
 
 DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] = [
-    ([0.1, 0.1, 0.12], (0.08, 0.13), "3 scenes can give no p below 0.25: no difference is shown"),
+    ([0.1, 0.1, 0.12], (0.08, 0.13), "smallest possible p with 3 scenes is 0.25: no significant difference"),
     ([0.1] * 8, (0.05, 0.15), None),
     ([0.1, -0.1] * 4, (0.01, 0.1), "the test does not find a difference (p 1)"),
     ([0.1] * 8, (-0.05, 0.15), "the test finds a difference (p 0.0078)"),
-    ([0.1] * 8, (-0.15, -0.05), "have opposite signs, and neither is chance (p 0.0078)"),
+    ([0.1] * 8, (-0.15, -0.05), "have opposite signs, both significant (p 0.0078)"),
     ([0.1] * 8, None, None),
 ]
 
 
 @pytest.mark.parametrize(("changes", "interval", "words"), DISAGREEMENTS)
-def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
+def test_interval_that_contradicts_the_test_is_explained(
     changes: list[float], interval: tuple[float, float] | None, words: str | None
 ) -> None:
     found = changed_by(changes, interval).disagreement
@@ -151,7 +151,7 @@ def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
     assert words is None or words in (found or "")
 
 
-def test_the_two_sides_exchanged_change_signs_alone() -> None:
+def test_swapping_the_sides_only_changes_signs() -> None:
     forth, back = compare("a", "b"), compare("b", "a")
     for one, other in zip(forth.protocols, back.protocols, strict=True):
         for name in one.metrics:
@@ -164,14 +164,14 @@ def test_the_two_sides_exchanged_change_signs_alone() -> None:
             assert left.p_of_all == right.p_of_all
 
 
-def test_only_common_scenes_are_compared_and_said() -> None:
+def test_only_common_scenes_are_compared_with_a_remark() -> None:
     found = compare("a", "few", protocols=["rooms-instance"]).protocols[0]
     assert found.scenes == ("painted/b",)
     assert found.metrics["AP"].interval is None
     assert found.metrics["AP"].test == SignFlipTest(1.0, 1.0, 1, True)
-    assert "only the scenes in common are compared; a:collector alone has painted/a, painted/c" in found.remarks
+    assert "only common scenes are compared; only a:collector has painted/a, painted/c" in found.remarks
     text = markdown(comparison_tables(compare("a", "few").to_json()))
-    assert "few:collector alone has painted/d" in text
+    assert "only few:collector has painted/d" in text
     assert "a single scene says nothing of other scenes" in text
 
 
@@ -183,22 +183,22 @@ REFUSED = [
     (("a", "other-rules"), "cannot be compared: digest of protocol rooms-instance is "),
     (("a", "old-rules"), "cannot be compared: version of protocol rooms-semantic is "),
     (("a", "other-encoder"), "cannot be compared: encoder is words (words-1) and words (words-2)"),
-    (("a", "a"), "a: both sides are the same; name two runs, or two methods of one as a:METHOD"),
+    (("a", "a"), "a: both sides are the same; name two runs, or two methods of one run as a:METHOD"),
     (("a:oracle", "a:oracle"), "a:oracle: both sides are the same"),
     (("a", "b:colector"), "b: holds no scores of the method 'colector'; did you mean 'collector'?"),
     (("a", "b:../../b/scenes/painted.a/collector"), "b: holds no scores of the method '../../b/scenes"),
-    (("a", "nowhere"), "nowhere: there is no such folder; name that of a run, such as runs/my-run"),
+    (("a", "nowhere"), "nowhere: no such folder; give the folder of a run, such as runs/my-run"),
 ]
 
 
 @pytest.mark.parametrize(("sides", "message"), REFUSED)
-def test_what_cannot_be_compared_is_refused_with_the_field(sides: tuple[str, str], message: str) -> None:
+def test_incomparable_runs_are_an_error_naming_the_field(sides: tuple[str, str], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         compare(*sides)
     assert message in str(caught.value)
 
 
-def test_the_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_compare_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", "a", "b", "--protocol", "rooms-instance", "--per-class"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| AP "))

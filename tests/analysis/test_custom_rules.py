@@ -1,4 +1,4 @@
-"""A run under protocols of one's own is read by all verbs after their files are gone: it keeps its rules."""
+"""Runs under user-defined protocols store their rules: all commands read them after the protocol files are deleted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from su3d_bench.runs.finished import read_run
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs under two protocols of one's own, whose files are gone."""
+    """Two runs under two user-defined protocols, whose files are deleted."""
     folder = tmp_path_factory.mktemp("own")
     rules = []
     for name in ("semantic", "instance"):
@@ -44,7 +44,7 @@ VERBS = {
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_verb_knows_the_rules_by_their_name(
+def test_commands_find_user_defined_rules_by_name(
     verb: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     see_painted(monkeypatch)
@@ -55,7 +55,7 @@ def test_a_verb_knows_the_rules_by_their_name(
     assert "those that scored the run" not in written
 
 
-def test_they_are_ranked_and_another_s_of_the_same_name_apart(made: Path, tmp_path: Path) -> None:
+def test_user_defined_protocols_with_the_same_name_are_ranked_separately(made: Path, tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     shutil.copytree(made, runs)
     found = leaderboard(runs)
@@ -63,14 +63,14 @@ def test_they_are_ranked_and_another_s_of_the_same_name_apart(made: Path, tmp_pa
     assert [len(board) for board in found.boards] == [4, 4]
     record = json.loads((runs / "second/run.json").read_text())
     for rules in record["protocols"]:
-        rules["rules"]["summary"] = "of somebody else"
+        rules["rules"]["summary"] = "of another project"
         rules["digest"] = read_rules(rules["rules"], "here").digest
     (runs / "second/run.json").write_text(json.dumps(record))
     assert [len(board) for board in leaderboard(runs).boards] == [2, 2, 2, 2]
     assert main(["report", "leaderboard", str(runs)]) == 0
 
 
-def test_what_run_json_keeps_is_what_scored_it(made: Path) -> None:
+def test_run_json_stores_the_rules_that_scored_the_run(made: Path) -> None:
     run = read_run(made / "first")
     for name, kept in run.protocols.items():
         assert run.rules(name, to_the_letter=True).digest == kept.digest
@@ -86,7 +86,7 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_rules_that_are_not_those_of_the_run_are_refused(change: str, made: Path, tmp_path: Path) -> None:
+def test_changed_rules_in_run_json_are_an_error(change: str, made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "first", tmp_path / "run")
     record = json.loads((tmp_path / "run/run.json").read_text())
     make, said = CHANGES[change]

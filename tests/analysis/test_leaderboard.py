@@ -1,4 +1,4 @@
-"""The ranking of many people's runs: what may stand in it, and what is named with the reason."""
+"""Leaderboard of runs: what is ranked, and what is excluded with a reason."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def edit(path: Path, change: Callable[[Any], None]) -> None:
     path.write_text(json.dumps(value))
 
 
-def test_runs_of_one_protocol_and_data_are_ranked_by_the_first_headline(runs: Path) -> None:
+def test_runs_with_the_same_protocol_and_data_are_ranked_by_the_first_headline(runs: Path) -> None:
     found = leaderboard(runs)
     assert [[one.run for one in board] for board in found.boards] == [["bob", "ann/first"]] * 2
     assert found.refused == ()
@@ -46,7 +46,7 @@ def test_runs_of_one_protocol_and_data_are_ranked_by_the_first_headline(runs: Pa
     assert values == sorted(values, reverse=True)
 
 
-def test_ranks_that_two_scenes_cannot_tell_apart_stay_open(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rank_intervals_overlap_with_only_two_scenes(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert {one.ranks for board in leaderboard(runs).boards for one in board} == {None}
     found = leaderboard(runs, with_ranks=True)
     assert {one.ranks for board in found.boards for one in board} == {(1, 2)}
@@ -56,7 +56,7 @@ def test_ranks_that_two_scenes_cannot_tell_apart_stay_open(runs: Path, capsys: p
     assert "Intervals from fewer than 10 scenes are unreliable (here: 2)" in text
 
 
-def test_ranks_are_those_of_the_scenes_and_a_ceiling_has_none(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranks_come_from_scene_values_and_ceilings_have_none(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     board = leaderboard(runs).boards[0]
     far = [replace(one, of_scenes=tuple((one.values[0] or 0) + k / 100 for k in range(8))) for one in board]
     told = [replace(far[0], is_ceiling=True, method="oracle")]
@@ -83,7 +83,7 @@ REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_does_not_agree_is_left_out_with_the_reason(name: str, runs: Path) -> None:
+def test_inconsistent_results_are_excluded_with_a_reason(name: str, runs: Path) -> None:
     file, change, reason = REFUSED[name]
     edit(runs / "bob" / file, change)
     found = leaderboard(runs)
@@ -92,14 +92,14 @@ def test_what_does_not_agree_is_left_out_with_the_reason(name: str, runs: Path) 
 
 
 def worse_counts(runs: Path) -> None:
-    """Counts below 0 in one scene of a run, as no scene gives."""
+    """Negative counts in one scene of a run, which are impossible."""
     file = runs / "bob/scenes/painted.a/collector/counts.npz"
     scores = unpack_scores(file.read_bytes())
     scores["rooms-semantic"].counts.confusion[0, 0] -= 10**6  # type: ignore[attr-defined]
     file.write_bytes(pack_scores(scores))
 
 
-def test_counts_that_no_scene_gives_are_refused_by_every_reader(
+def test_negative_counts_are_rejected_by_every_command(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paper = str(tmp_path / "paper.tex")
@@ -118,13 +118,13 @@ def test_counts_that_no_scene_gives_are_refused_by_every_reader(
     assert {one.run for one in refused} == {"bob"} and all(line in one.reason for one in refused)
 
 
-def test_the_command_prints_marks_the_best_and_says_what_is_left_out(
+def test_leaderboard_command_marks_the_best_and_lists_what_is_excluded(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     edit(runs / "ann/first" / "run.json", lambda r: r["protocols"][0].update(version=7))
     assert main(["report", "leaderboard", str(runs), "--intervals"]) == 0
     shown = capsys.readouterr()
-    assert "| collector " in shown.out and "**" in shown.out and "Left out: ann/first" in shown.out
+    assert "| collector " in shown.out and "**" in shown.out and "Excluded: ann/first" in shown.out
     assert "3 entries in 2 rankings, 1 excluded" in shown.err
     page = tmp_path / "board.html"
     assert main(["report", "leaderboard", str(runs), "--format", "html", "--out", str(page)]) == 0

@@ -1,4 +1,4 @@
-"""Runs of two methods under one seed and several: what shows a difference, and what it is over all seeds."""
+"""Power analysis and comparison of two methods with one or several seeds."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ N_SCENES = 3
 
 @cache
 def scores_of(name: str) -> list[SceneScore]:
-    """Of each scene, method and run, all different."""
+    """One score per scene, method and run, all different."""
     return list(noisy_scores(name, 6 * N_SCENES).values())
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``seed-0`` to ``seed-2``: the same two methods, with other counts in every scene, method and run."""
+    """``seed-0`` to ``seed-2``: the same two methods, with different counts in every scene, method and run."""
     folder = tmp_path_factory.mktemp("plans")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -59,7 +59,7 @@ def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pseudo_values_of(name: str, metric: str, seed: int) -> list[float]:
-    """Of the difference between the two methods in a run, from the numbers without each scene."""
+    """Pseudo-values of the difference between the two methods in a run, from the numbers without each scene."""
     scores = scores_of(name)
     rules = load_protocol(name)
 
@@ -73,7 +73,7 @@ def pseudo_values_of(name: str, metric: str, seed: int) -> list[float]:
 
 
 @pytest.mark.parametrize("n_seeds", [1, 3])
-def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int) -> None:
+def test_needed_scenes_follow_from_the_pseudo_values_of_the_runs(n_seeds: int) -> None:
     found = plan([Path(f"seed-{seed}") for seed in range(n_seeds)], points=[5.0, 20.0])
     assert (found.left, found.right, found.seeds) == (*METHODS, tuple(range(n_seeds)))
     for protocol, metric in (("rooms-semantic", "mAcc"), ("rooms-instance", "AP50")):
@@ -90,7 +90,7 @@ def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int)
         assert {need.n_seeds for need in one.needs} == ({1} if n_seeds == 1 else {1, 2, 3, 5, 10})
 
 
-def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_power_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["report", "power", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10"]
     words += ["--protocol", "rooms-instance"]
     assert main(words) == 0
@@ -108,7 +108,7 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
 
 
 def values_of(name: str, metric: str, seed: int, method: int) -> tuple[float, list[float]]:
-    """Over all scenes, and of each alone."""
+    """The value over all scenes, and that of each scene."""
     first = N_SCENES * (2 * seed + method)
     own = {scene: scores_of(name)[first + s] for s, scene in enumerate("abc")}
     result = combine(load_protocol(name), own)
@@ -116,9 +116,7 @@ def values_of(name: str, metric: str, seed: int, method: int) -> tuple[float, li
 
 
 @pytest.mark.parametrize(("protocol", "metric"), [("rooms-semantic", "mAcc"), ("rooms-instance", "AP50")])
-def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_alone_go(
-    protocol: str, metric: str
-) -> None:
+def test_side_of_several_seeds_is_their_mean_with_standard_deviation(protocol: str, metric: str) -> None:
     comparison = compare("seed-0,seed-1,seed-2:collector", "seed-0,seed-2:collector@drop=1")
     found = next(one for one in comparison.protocols if one.protocol == protocol).metrics[metric]
     sides = [[values_of(protocol, metric, seed, k) for seed in seeds] for k, seeds in enumerate([(0, 1, 2), (0, 2)])]

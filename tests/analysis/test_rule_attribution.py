@@ -1,4 +1,4 @@
-"""The way from one protocol to another: its ends are the run's numbers, its steps sum to the difference."""
+"""Rule attribution: its ends are the run's numbers, its steps sum to the difference."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from su3d_bench.runs.finished import read_run
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two methods of which one map is not perfect."""
+    """A run of two methods, one of which has an imperfect map."""
     return painted_run(tmp_path_factory.mktemp("walk") / "run", methods=(COLLECTOR, f"{COLLECTOR}@drop=1"))
 
 
@@ -26,9 +26,7 @@ def _words(monkeypatch: pytest.MonkeyPatch) -> None:
     see_painted(monkeypatch)
 
 
-def test_from_the_number_of_the_run_each_rule_gets_what_it_moves_and_the_way_back_is_its_reverse(
-    made: Path, tmp_path: Path
-) -> None:
+def test_each_rule_gets_its_share_and_the_reverse_direction_negates_it(made: Path, tmp_path: Path) -> None:
     lines = ['extends = "rooms-semantic"', 'name = "mine"', 'ignore = ["wall", "floor", "ceiling", "chair"]']
     (tmp_path / "mine.toml").write_text("\n".join([*lines, 'vocabulary = "all"', "[transfer]", "cap_m = 0.001"]))
     first, second = load_protocol("rooms-semantic"), load_protocol(str(tmp_path / "mine.toml"))
@@ -39,11 +37,11 @@ def test_from_the_number_of_the_run_each_rule_gets_what_it_moves_and_the_way_bac
     shares = {step.rules: step.adds["mAcc"].share for step in there.steps}
     assert shares.keys() == {("ignore",), ("vocabulary",), ("transfer.cap_m",)}
     assert abs(shares["ignore",]) > 0.01
-    assert shares["transfer.cap_m",] == 0.0  # the map is the truth's own points
+    assert shares["transfer.cap_m",] == 0.0  # the map has the points of the ground truth
     assert {step.rules: -step.adds["mAcc"].share for step in back.steps} == pytest.approx(shares, abs=1e-12)
 
 
-def test_the_command_prints_draws_and_answers_in_json(
+def test_protocols_diff_prints_a_table_draws_a_plot_and_writes_json(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["protocols", "diff", "rooms-instance", "replica-openmask3d", "--prediction", f"{made}:collector"]

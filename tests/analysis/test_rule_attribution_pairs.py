@@ -1,7 +1,7 @@
-"""Between every two protocols of one kind over one dataset there is a way, and its steps sum to the difference.
+"""Rule attribution works between every two protocols of one kind and dataset, and its steps sum to the difference.
 
-A small room is read through the adapters of Replica and ScanNet from files in their layouts, with the truths of others
-beside it, and a map with faults is put in the place of the oracle's.
+A small room is read through the adapters of Replica and ScanNet from files in their layouts, with third-party ground
+truths, and the oracle's map is replaced by a faulty one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,10 @@ RULES = [load_protocol(name) for name in protocol_names()]
 def pairs_of(dataset: str) -> Iterator[tuple[ProtocolRules, ProtocolRules]]:
     fitting = [rules for rules in RULES if rules.kind in KINDS and dataset in rules.datasets]
     for first, second in combinations(fitting, 2):
-        is_one = (first.kind, first.label_space) == (second.kind, second.label_space)  # no truth has both labels
+        is_one = (first.kind, first.label_space) == (
+            second.kind,
+            second.label_space,
+        )  # a ground truth has one label set
         if is_one and set(first.headline) & set(second.value_names):
             yield first, second
 
@@ -57,7 +60,7 @@ PAIRS = [(dataset, first, second) for dataset in ADDRESS for first, second in pa
 
 
 def pairs_to_walk() -> Iterator[Any]:
-    """All pairs; but for the first of each dataset and one of many groups they are left to proofs."""
+    """All pairs; only the first of each dataset and one with many groups run outside proofs."""
     seen = set[Any]()
     for dataset, first, second in PAIRS:
         brings: set[Any] = {dataset}
@@ -68,12 +71,12 @@ def pairs_to_walk() -> Iterator[Any]:
 
 
 class NamingEncoder:
-    """A text points where the longest class name in it does, and a little elsewhere, as each wording has it."""
+    """The feature of a text is that of the longest class name in it, plus a smaller one of the exact wording."""
 
     name, digest, dim = "naming", "naming-1", 24
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise AssertionError("a walk looks at no image")
+        raise AssertionError("rule attribution must not encode images")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         return np.stack([self._feature(text) for text in texts])
@@ -85,7 +88,7 @@ class NamingEncoder:
 
 
 def faulty_map(truth: GroundTruth) -> Instances:
-    """Masks of the truth's objects with gaps, ragged edges, some in two, some as one, some under another's name."""
+    """Masks of ground-truth objects with gaps and ragged edges, some split, merged or mislabelled."""
     generator = np.random.default_rng(3)
     points = (truth.points + generator.normal(0, 0.004, truth.points.shape)).astype(np.float32)
     points[::7] += np.float32(0.03)
@@ -104,7 +107,7 @@ def faulty_map(truth: GroundTruth) -> Instances:
 
 
 def write_others_truths(root: Path) -> None:
-    """What others than Replica's makers released: two files of labels and the clouds of ConceptGraphs."""
+    """Write third-party ground truths for Replica: two label files and the clouds of ConceptGraphs."""
     dataset_class = registry.load("dataset", "replica")
     truth = dataset_class(root, dataset_class.Options()).ground_truth(ROOM, "mesh-vertices")
     (mesh,) = root.glob("Replica/*_mesh.ply")
@@ -123,7 +126,7 @@ def write_others_truths(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """By dataset, a run of the room whose map has faults."""
+    """Dataset -> folder with a run of the room whose map has faults."""
     folder = tmp_path_factory.mktemp("pairs")
     options = Rooms.Options(width=64, height=48, n_frames=3, mesh_spacing_m=0.09)
     rooms, found = Rooms(folder / "cache", options), {}
@@ -155,12 +158,12 @@ def _places(runs: dict[str, Path], request: pytest.FixtureRequest, monkeypatch: 
     monkeypatch.setenv("SU3D_DATA", str(runs[dataset] / dataset))
     monkeypatch.setenv("SU3D_CACHE", str(runs[dataset] / "cache"))
     monkeypatch.setattr(finished, "encoder_of", lambda run, device: NamingEncoder())
-    # The map that lies in the oracle's place is a faulty one, which no truth was told
+    # The map in the oracle's place is a faulty one, which does not use ground truth
     monkeypatch.setattr(finished.FinishedRun, "visible_truth", lambda run, method: None)
 
 
 def alone(rules: ProtocolRules, run_folder: Path) -> Any:
-    """The numbers of the run's map under one protocol, worked out without a walk."""
+    """The numbers of the run's map under one protocol, computed without rule attribution."""
     run = read_run(run_folder)
     (scene,) = run.scenes
     truth = run.dataset(scene).ground_truth(scene.partition("/")[2], rules.ground_truth)
@@ -169,7 +172,7 @@ def alone(rules: ProtocolRules, run_folder: Path) -> Any:
 
 
 @pytest.mark.parametrize(("dataset", "first", "second"), [*pairs_to_walk()], ids=lambda one: getattr(one, "name", one))
-def test_the_steps_between_two_protocols_sum_to_the_difference_of_their_numbers(
+def test_steps_between_two_protocols_sum_to_the_difference_of_their_numbers(
     dataset: str, first: ProtocolRules, second: ProtocolRules, runs: dict[str, Path]
 ) -> None:
     folder = runs[dataset] / f"run-{dataset}"
@@ -188,7 +191,7 @@ def test_the_steps_between_two_protocols_sum_to_the_difference_of_their_numbers(
 
 
 @pytest.mark.parametrize("dataset", ADDRESS)
-def test_the_map_of_the_walks_is_neither_right_nor_wrong(dataset: str, runs: dict[str, Path]) -> None:
+def test_faulty_map_is_neither_perfect_nor_empty(dataset: str, runs: dict[str, Path]) -> None:
     for rules in {rules.name: rules for one, *pair in PAIRS if one == dataset for rules in pair}.values():
         value = alone(rules, runs[dataset] / f"run-{dataset}")[rules.headline[0]]
         assert 0.02 < value < 0.98, rules.name

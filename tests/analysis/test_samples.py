@@ -1,4 +1,4 @@
-"""Every instance of a run as a row: what attribute and the evaluator count, the verb, and what stands in its files."""
+"""One row per instance of a run: agreement with attribution and evaluator, and the command with its output files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from su3d_bench.runs import finished as finished_run
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Two methods over two painted scenes; one loses an object of each."""
+    """Two methods over two painted scenes; one misses an object in each."""
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
         folder, methods = tmp_path_factory.mktemp("samples") / "run", (COLLECTOR, "oracle")
@@ -40,7 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["rooms-instance", "replica-openmask3d"])
-def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: str, seed: int) -> None:
+def test_hits_and_errors_match_evaluator_and_attribution(name: str, seed: int) -> None:
     rules = load_protocol(name)
     truth, prediction = noisy(seed)
     values, masks, scoring = scored_masks(rules, truth, prediction, ENCODER)
@@ -52,7 +52,7 @@ def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: 
     for t, at in enumerate(found):
         is_true = counts.is_true & (counts.threshold_index == t)
         assert len(at.values) == is_true.sum() == (counts.n_truth - counts.n_missed[:, t]).sum()
-        if scoring.thresholds[t] >= 0.5:  # below, a mask may be that of two instances
+        if scoring.thresholds[t] >= 0.5:  # below, a mask may match two instances
             assert sorted(masks.scores[at.is_hit]) == sorted(counts.score[is_true])
     errors = errors_of(measure_overlaps(true_instances(values, scoring), masks, scoring))
     named = Counter(errors.of_mask) + Counter(errors.of_instance)
@@ -60,8 +60,8 @@ def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: 
     assert {kind: named[kind] for kind in KINDS} == dict(corrected.n)
 
 
-def test_the_rows_of_points_add_up_to_the_matrix_and_the_causes_of_the_run(run: Path) -> None:
-    """By true class its points and those that are right, by what they are called those that are called so."""
+def test_rows_of_points_add_up_to_the_confusion_matrix_and_the_causes_of_the_run(run: Path) -> None:
+    """Number of points and correct points per true class, and number of points per predicted class."""
     rows = [row for row in samples([run]).rows if row.protocol == "rooms-semantic"]
     finished = finished_run.read_run(run)
     names = [entry.name for entry in finished.rules("rooms-semantic").classes]
@@ -94,7 +94,7 @@ def test_the_rows_of_points_add_up_to_the_matrix_and_the_causes_of_the_run(run: 
 
 
 def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
-    """Ten points: a chair of six of instance 4, two lamps' points without an instance, two points of no class."""
+    """Ten points: a chair of six points (instance 4), two lamp points without an instance, two points of no class."""
     rules = load_protocol("rooms-semantic")
     chair, lamp = ([entry.name for entry in rules.classes].index(name) for name in ("chair", "lamp"))
     points = LabelledPoints(
@@ -117,14 +117,14 @@ def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
     return list(made.rows(("run", "scene", "method", "rooms-semantic")))
 
 
-def test_points_are_told_by_what_names_them_and_by_what_they_are() -> None:
+def test_points_have_rows_by_predicted_name_and_by_true_object() -> None:
     rows = scored_by_hand([0] * 4 + [0, 1, 1, -1, 0, 0])
     names = ("kind", "instance", "row", "class_name", "name", "n_points", "n_right", "matched", "is_hit_50")
     told = [tuple(getattr(row, name) for name in names) for row in rows]
     assert told == [
         ("predicted", 70, 0, "chair", "a", 4, 4, 4, True),
         ("predicted", 70, 0, "lamp", "a", 1, 0, 4, False),
-        ("predicted", 80, 1, "lamp", "b", 2, 1, None, False),  # a third with the lamps, which have no number
+        ("predicted", 80, 1, "lamp", "b", 2, 1, None, False),  # IoU 1/3 with the lamp points, which have no number
         ("true", None, None, "lamp", "", 2, 1, 80, False),
         ("true", 4, None, "chair", "", 6, 4, 70, True),
     ]
@@ -133,7 +133,9 @@ def test_points_are_told_by_what_names_them_and_by_what_they_are() -> None:
     assert (rows[0].centre_x_m, rows[0].size_x_m) == (1.5, 3.0)
 
 
-def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_samples_command_writes_one_row_per_instance(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "samples.csv"
     assert main(["report", "samples", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
     rows = samples([run]).rows
@@ -152,7 +154,7 @@ def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.
     assert {(row["method"], row["scene"]) for row in told} == {("oracle", "painted/b")}
 
 
-def test_parquet_holds_the_same_with_what_each_column_means(run: Path, tmp_path: Path) -> None:
+def test_parquet_has_the_same_rows_and_column_descriptions(run: Path, tmp_path: Path) -> None:
     from pyarrow import parquet
 
     file = tmp_path / "samples.parquet"

@@ -1,4 +1,4 @@
-"""What stands on the timeline of a run: what is logged in the order of time, and the file that rerun's viewer reads."""
+"""Timeline of a run: what is logged in order of time, and the file for rerun's viewer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _words_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Logged:
-    """What a recording was told: its kind, the place and the values, and the frame from which it holds."""
+    """A logged entry: its kind, the place and the values, and the frame at which it was logged."""
 
     kind: str
     values: tuple[Any, ...]
@@ -47,14 +47,14 @@ class Logged:
 
 
 class Kinds:
-    """Stands for the library of the viewer, whose objects are their kind and values here."""
+    """A stub of the viewer's library, whose objects are pairs of kind and values."""
 
     def __getattr__(self, kind: str) -> Any:
         return lambda *values, **named: (kind, (*values, *named.values()))
 
 
 class Notes:
-    """Stands for a recording and notes what is logged."""
+    """A stub of a recording that stores what is logged."""
 
     sdk = Kinds()
 
@@ -91,7 +91,7 @@ def timeline(run: Path, stride: int = 0) -> SceneTimeline:
 
 
 @pytest.mark.usefixtures("_words_are_known")
-def test_every_frame_that_a_method_was_given_stands_at_its_index_and_second(run: Path) -> None:
+def test_every_frame_given_to_a_method_is_logged_at_its_index_and_time(run: Path) -> None:
     one = timeline(run)
     notes = written(one)
     updates = read_updates(read_run(run).folder.job(one.scene, "collector").updates, "updates")
@@ -109,11 +109,11 @@ def test_every_frame_that_a_method_was_given_stands_at_its_index_and_second(run:
 
 @pytest.mark.usefixtures("_words_are_known")
 @pytest.mark.parametrize("kind", [places.INSTANCES, places.CLASSES])
-def test_the_map_grows_and_each_point_of_it_comes_once(run: Path, kind: str) -> None:
+def test_map_grows_and_each_point_is_logged_once(run: Path, kind: str) -> None:
     notes = written(timeline(run))
     own = (*places.MAP, "collector", kind)
     grown = [logged for logged in notes.of("Points3D") if logged.values[0][:4] == own]
-    assert len({logged.values[0] for logged in grown}) == len(grown), "what comes later hides nothing"
+    assert len({logged.values[0] for logged in grown}) == len(grown), "later entries hide nothing"
     assert all(logged.frame is not None for logged in grown)
     points = np.concatenate([logged.values[1] for logged in grown])
     assert 0 < len(points) <= MAX_POINTS
@@ -124,7 +124,7 @@ def test_the_map_grows_and_each_point_of_it_comes_once(run: Path, kind: str) -> 
 
 
 @pytest.mark.usefixtures("_words_are_known")
-def test_masks_are_of_the_size_of_their_photo_and_name_what_stands_there(run: Path) -> None:
+def test_masks_have_the_size_of_their_photo_and_are_not_empty(run: Path) -> None:
     notes = written(timeline(run))
     sizes = {logged.values[0].rgb.shape[:2] for logged in notes.of("photo")}
     assert {logged.values[0] for logged in notes.of("SegmentationImage")} == {
@@ -139,12 +139,12 @@ def frame(depth_m: float = 2.0, size: tuple[int, int] = (40, 60)) -> Frame:
     return Frame(0, 0.0, np.zeros((*size, 3), np.uint8), np.full(size, depth_m, np.float32), np.eye(4), intrinsics)
 
 
-def test_a_point_is_in_view_where_the_camera_measured_it_alone() -> None:
+def test_point_is_in_view_only_if_the_camera_measured_it() -> None:
     points = np.array([[0, 0, 2], [0, 0, 2 + 2 * SEEN_M], [0, 0, 1], [9, 0, 2], [0, 0, -2]], np.float32)
     assert in_view(points, frame()).tolist() == [True, False, False, False, False]
 
 
-def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() -> None:
+def test_logged_content_reaches_the_library_at_its_place_and_time() -> None:
     sdk, stream = MagicMock(__version__="0.41.0"), BytesIO()
     logged_at = sdk.RecordingStream.return_value
     logged_at.binary_stream.return_value.read.return_value = b"part"
@@ -160,13 +160,13 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
     logged_at.set_time.assert_any_call("frame", sequence=40)
     logged_at.set_time.assert_any_call("seconds", duration=1.5)
     assert sdk.RecordingStream.call_args.kwargs["send_properties"] is False
-    assert "0.41.0" in sdk.TextDocument.call_args.args[0], "which version reads it"
+    assert "0.41.0" in sdk.TextDocument.call_args.args[0], "the version that can read it"
     assert not sdk.init.called and not sdk.spawn.called
     assert stream.getvalue().startswith(b"part")
 
 
 @pytest.mark.usefixtures("_words_are_known")
-def test_the_file_is_read_back_and_nothing_else_is_written_or_asked(
+def test_recording_can_be_read_and_nothing_else_is_written_or_requested(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     home = tmp_path / "home"
@@ -174,14 +174,14 @@ def test_the_file_is_read_back_and_nothing_else_is_written_or_asked(
     monkeypatch.setenv("HOME", str(home))
 
     def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("asked the network")
+        raise AssertionError("accessed the network")
 
     monkeypatch.setattr(socket, "create_connection", refuse)
     file = tmp_path / "a.rrd"
     assert main(["report", "rerun", str(run), "--out", str(file), "--quiet"]) == 0
     assert "2 scenes, 2 maps, 12 frames" in capsys.readouterr().out
     assert not list(home.rglob("*"))
-    environment = {**os.environ, "HOME": str(tmp_path / "reader")}  # the reader has settings of its own
+    environment = {**os.environ, "HOME": str(tmp_path / "reader")}  # the reader writes its own settings
     read = subprocess.run([sys.executable, "-m", "rerun", "rrd", "stats", str(file)], env=environment,
                           capture_output=True, text=True, check=True).stdout  # fmt: skip
     counts = dict(line.rsplit(": ", 1) for line in read.splitlines() if line.startswith("/"))

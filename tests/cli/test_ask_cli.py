@@ -1,4 +1,4 @@
-"""``su3d-bench query ask`` and ``su3d-bench runs refine`` as whoever types them meets them."""
+"""The commands ``su3d-bench query ask`` and ``su3d-bench runs refine``."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobFolder:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No picture is made, which takes a second."""
+    """Skip drawing pictures, which takes a second."""
     monkeypatch.setattr(reasoning_picture, "draw_reasoning", lambda *words: None)
 
 
@@ -81,7 +81,7 @@ def llm(server: ChatServer, *more: str) -> list[str]:
     return ["--solver", "llm", "--model", "tiny", "--base-url", server.url, *more, "--set", *settings]
 
 
-def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "ask", SCENE, "Which sink is closer to bed?"]) == 0
     said = capsys.readouterr()
     assert said.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
@@ -90,7 +90,7 @@ def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: p
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_cannot_be_settled_is_said_and_not_drawn(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_undetermined_answer_is_reported_and_not_drawn(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "ask", SCENE, "I am cold, what should I do?", "--out", "x.png"]) == 0
     said = capsys.readouterr()
     assert said.out.startswith("I cannot settle this: ")
@@ -99,7 +99,7 @@ def test_what_cannot_be_settled_is_said_and_not_drawn(job: JobFolder, capsys: py
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_eye_decides_what_is_left(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_viewpoint_determines_what_is_left(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     answers = []
     for eye in (["-5", "1", "0"], ["5", "1", "0"]):
         assert main(["query", "ask", SCENE, "Is the bed left of the sink?", "--quiet", "--eye", *eye]) == 0
@@ -108,7 +108,7 @@ def test_the_eye_decides_what_is_left(job: JobFolder, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_model_answers_once_and_then_from_the_run(
+def test_model_reply_is_stored_in_the_run_and_reused(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["query", "ask", SCENE, "Which sink is closer to bed?", "--json", *llm(server)]
@@ -126,7 +126,7 @@ def test_a_model_answers_once_and_then_from_the_run(
     assert KEY not in stored[0].read_text()
 
 
-def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
+def test_dry_run_reports_the_cost_and_sends_no_request(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
@@ -158,14 +158,16 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
         ),
     ],
 )
-def test_wrong_input_is_one_line(job: JobFolder, capsys: pytest.CaptureFixture[str], words: str, line: str) -> None:
+def test_invalid_input_is_a_one_line_error(
+    job: JobFolder, capsys: pytest.CaptureFixture[str], words: str, line: str
+) -> None:
     assert main(shlex.split(words)) == 2
     said = capsys.readouterr().err
     assert line in said
     assert said.count("\n") == 1
 
 
-def test_a_missing_key_is_one_line(
+def test_missing_api_key_is_a_one_line_error(
     job: JobFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("OPENAI_API_KEY")
@@ -174,7 +176,7 @@ def test_a_missing_key_is_one_line(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_labels_n_prime_by_vote_are_what_ask_uses(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ask_uses_refined_labels_by_vote(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["runs", "refine", "runs/made"]) == 0
     said = capsys.readouterr().out
     assert "rooms/made: 4 instances, 2 names changed" in said
@@ -187,7 +189,7 @@ def test_labels_n_prime_by_vote_are_what_ask_uses(job: JobFolder, capsys: pytest
     assert "I cannot settle this" in capsys.readouterr().out
 
 
-def test_labels_n_prime_by_a_model_are_asked_for_once(
+def test_refined_labels_by_a_model_are_requested_once(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server.answer = lambda body: Answered("I'm sorry." if "basin" in body["messages"][1]["content"] else "furniture")
@@ -203,7 +205,7 @@ def test_labels_n_prime_by_a_model_are_asked_for_once(
     assert server.n_asked == 4
 
 
-def test_what_is_background_under_label_n_prime_is_left_out(
+def test_background_by_refined_label_is_excluded(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server.answer = lambda body: Answered("tile wall" if "basin" in body["messages"][1]["content"] else "furniture")
@@ -215,7 +217,7 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
     assert told["names"] == "labels n' by tiny, without 1 excluded instance"
     assert main([*words, "--background-names", "bed"]) == 0
-    assert "left out" not in capsys.readouterr().out
+    assert "excluded" not in capsys.readouterr().out
     assert main([*words, "--max-map-fraction", "0.05", "--json"]) == 0
     records = json.loads(capsys.readouterr().out)[SCENE]
     assert records["filter"] == {"background_names": list(FilterConfig().background_names), "max_map_fraction": 0.05}
@@ -225,7 +227,7 @@ def test_what_is_background_under_label_n_prime_is_left_out(
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_nothing_is_written_through_a_link_in_place_of_a_jobs_folder(
+def test_nothing_is_written_through_a_symlink_in_place_of_a_job_folder(
     job: JobFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     elsewhere = tmp_path / "elsewhere"

@@ -24,7 +24,7 @@ FOREIGN = ("perception/notes.txt", "perception/ab/mine.npz", "mine/0.npz", "runs
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache folder with one entry of each kind, written by what writes it, and files of others among them."""
+    """A cache folder with one real entry of each kind and foreign files."""
     root = tmp_path / "cache"
     monkeypatch.setenv("SU3D_CACHE", str(root))
     FrameCache(root).save(content_key("a frame"), {"x": np.zeros(9)})
@@ -52,9 +52,7 @@ def held(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
     return {row["kind"]: row["n_files"] for row in json.loads(capsys.readouterr().out)["kinds"]}
 
 
-def test_every_kind_that_the_program_keeps_is_known_by_its_form(
-    cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_cache_list_counts_every_kind_of_entry(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tuple(caches.KINDS) == KIND_NAMES
     assert held(capsys) == {"perception": 1, "model-digests": 1, "runs": 2, "replies": 1}
     assert main(["dev", "cache", "list"]) == 0
@@ -67,7 +65,7 @@ def test_every_kind_that_the_program_keeps_is_known_by_its_form(
     assert n_bytes == sum(path.stat().st_size for path in files) - len(FOREIGN) * len("mine")
 
 
-def test_what_is_cleared_is_of_the_cache_alone_and_replies_only_by_name(
+def test_clear_removes_only_cache_files_and_replies_only_by_name(
     cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = held(capsys)
@@ -82,7 +80,7 @@ def test_what_is_cleared_is_of_the_cache_alone_and_replies_only_by_name(
     assert sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*") if path.is_file()) == sorted(FOREIGN)
 
 
-def test_a_link_is_never_followed(cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_clear_never_follows_symlinks(cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     elsewhere = tmp_path / "elsewhere" / "ab"
     elsewhere.mkdir(parents=True)
     name = f"{'a' * 64}.npz"
@@ -99,7 +97,7 @@ def test_a_link_is_never_followed(cache: Path, tmp_path: Path, capsys: pytest.Ca
     assert (elsewhere / name).read_text() == "precious"
 
 
-def test_only_what_is_old_goes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_older_than_removes_only_old_files(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = FrameCache(cache).path(content_key("old"))
     assert old is not None
     old.parent.mkdir(parents=True, exist_ok=True)
@@ -113,7 +111,7 @@ def test_only_what_is_old_goes(cache: Path, capsys: pytest.CaptureFixture[str]) 
     assert "--older-than -1: expected a number of days" in capsys.readouterr().err
 
 
-def test_what_a_run_holds_stays(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_locked_run_is_not_cleared(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunFolder(mirror_of("s3://bucket/run", cache)).locked():
         assert main(["dev", "cache", "clear", "runs"]) == 0
     assert held(capsys)["runs"] == 2

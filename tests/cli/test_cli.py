@@ -26,7 +26,7 @@ HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
     "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
 )  # fmt: skip
-# A tenth of a second is two thirds Python's own.
+# Of the 0.1 s for --help, two thirds are Python's own start.
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")
 
 
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("painted_place")
         (["models", "list"], HEAVY),
     ],
 )
-def test_answers_that_need_nothing_load_nothing_heavy(words: list[str], unneeded: tuple[str, ...]) -> None:
+def test_simple_commands_import_no_heavy_modules(words: list[str], unneeded: tuple[str, ...]) -> None:
     code = (
         "import sys; from su3d_bench.cli.main import main\n"
         f"code = main({words!r})\n"
@@ -56,7 +56,7 @@ def test_answers_that_need_nothing_load_nothing_heavy(words: list[str], unneeded
     assert done.stdout.splitlines()[-1].split() == ["loaded:", "0"], done.stderr
 
 
-def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
+def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     from su3d_bench.metrics.protocols.loading import load_protocol
 
     assert main(["protocols", "show", "rooms-semantic"]) == 0
@@ -107,7 +107,9 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         (f"{TYPED} --extend --out none", "--extend: none holds no run.toml of a run; leave --extend out to begin"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_code_2(words: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_input_is_a_one_line_error_with_exit_code_2(
+    words: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(shlex.split(words)) == 2
     answer = capsys.readouterr()
     assert answer.out == ""
@@ -115,21 +117,21 @@ def test_wrong_input_is_one_line_and_exit_code_2(words: str, line: str, capsys: 
     assert answer.err.count("\n") == 1
 
 
-def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_misspelt_key_in_a_file_is_reported_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("run.toml").write_text('scenes = ["rooms/living0"]\nmetod = ["opensu3d"]\n')
     assert main(["run", "--config", "run.toml"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("su3d-bench: run.toml:2: unknown key 'metod'; did you mean 'method'? known: scenes, ")
 
 
-def test_debug_shows_the_traceback_above_the_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_debug_shows_the_traceback_before_the_message(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--debug", "--scenes", "nothing"]) == 2
     first, *_, last = capsys.readouterr().err.splitlines()
     assert first == "Traceback (most recent call last):"
     assert last.startswith("su3d-bench: no scene matches 'nothing'")
 
 
-def test_an_internal_error_is_one_line_and_exit_code_4(
+def test_internal_error_is_one_line_with_exit_code_4(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from su3d_bench.core import registry
@@ -149,7 +151,7 @@ def test_scenes_may_be_expanded_by_the_shell(tmp_path: Path, capsys: pytest.Capt
     assert answer.err == "not scenes, left out: cam_params.json\n"
 
 
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_shows_the_plan_and_does_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--dry-run"]) == 0
     text = capsys.readouterr().out
     assert text.count("6 updates, about") == 4
@@ -158,7 +160,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys: pytest.Captu
     assert not Path("runs").exists()
 
 
-def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_on_a_finished_run_marks_finished_jobs(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--out", "runs/x"]) == 0
     capsys.readouterr()
     assert main([*RUN, "--scenes", f"{PAINTED}/[ab]", "--extend", "--out", "runs/x", "--dry-run", "--json"]) == 0
@@ -166,7 +168,7 @@ def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.Capture
     assert [(one["is_done"], one["is_measured"]) for one in jobs] == [(True, True), (False, True)]
 
 
-def test_the_same_request_has_the_same_folder_and_another_one_another() -> None:
+def test_folder_name_depends_only_on_the_request() -> None:
     from su3d_bench.cli.run import settings_of
     from su3d_bench.runs.plan import make_plan
 
@@ -198,7 +200,7 @@ def test_pictures_of_different_texts_and_scenes_have_different_names() -> None:
     assert file_name_of_scene("replica/room0") == "replica-room0"
 
 
-def test_a_query_ranks_the_map_and_draws_it(
+def test_query_text_ranks_the_map_and_draws_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
@@ -215,7 +217,7 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert main(words) == 0
     (ranking_first,) = before
     answer = capsys.readouterr()
-    assert answer.out == ""  # the ranking stood before the picture was drawn
+    assert answer.out == ""  # the ranking was printed before the picture was drawn
     assert ranking_first.splitlines()[1].split()[0] == "1"
     assert ranking_first.splitlines()[1].endswith("  sofa")
     picture = answer.err.removeprefix("heat map: ").strip()
@@ -229,17 +231,17 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert Path("here/heat.png").is_file()
 
 
-def test_a_map_without_features_cannot_be_queried(capsys: pytest.CaptureFixture[str]) -> None:
+def test_map_without_features_cannot_be_queried(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "text", "painted/a", "sofa", "--method", "oracle"]) == 2
     assert "query: the map has no features to compare with text" in capsys.readouterr().err
 
 
-# what options of several verbs do
+# options of several commands
 
 
-def test_every_verb_has_json_quiet_debug_and_two_examples() -> None:
+def test_every_command_has_json_quiet_debug_and_two_examples() -> None:
     for words, parser in verbs():
         flags = {name for action in parser._actions for name in action.option_strings}
         assert {"--json", "--quiet", "--debug"} <= flags, words
@@ -261,12 +263,12 @@ def test_json_is_a_switch_or_names_a_file(words: list[str], is_printed: bool, fi
     assert (arguments.json, arguments.json_file) == (is_printed, None if file is None else Path(file))
 
 
-def test_json_takes_no_other_file_for_its_own() -> None:
+def test_json_rejects_files_with_another_suffix() -> None:
     with pytest.raises(ConfigError, match=r"report verify: --json paper\.tex: expected a file that ends in \.json"):
         build_parser().parse_args(["report", "verify", "--json", "paper.tex"])
 
 
-def test_json_in_a_file_stands_beside_the_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_file_is_written_in_addition_to_the_text(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "answers" / "rules.json"
     assert main(["protocols", "show", "rooms-semantic", "--json", str(file)]) == 0
     assert not capsys.readouterr().out.startswith("{")
@@ -275,7 +277,7 @@ def test_json_in_a_file_stands_beside_the_words(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("name", ["run.json", "metrics.json", "run.toml", "scenes/rooms.living0/opensu3d/done.json"])
-def test_files_of_a_run_are_never_replaced_by_an_answer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_never_overwrites_files_of_a_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     file = Path("runs/demo", name)
     file.parent.mkdir(parents=True)
     Path("runs/demo/run.toml").write_text("seed = 0\n")
@@ -291,7 +293,7 @@ def test_files_of_a_run_are_never_replaced_by_an_answer(name: str, capsys: pytes
         assert file.read_text() == "{}"
 
 
-def test_a_number_that_is_none_is_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_undefined_number_is_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = argparse.Namespace(json=True, json_file=None)
     answer_either(arguments, {"x": [float("nan"), (float("inf"), 1.5)]}, "words")
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"x": [None, [None, 1.5]]}

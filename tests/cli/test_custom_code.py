@@ -1,6 +1,6 @@
-"""What is wrong in somebody's own method or dataset is one line with their file, the line and what is expected.
+"""A mistake in a user-defined method or dataset is a one-line error with file, line and what is expected.
 
-What docs/own-code.md shows runs as it stands.
+The examples of docs/own-code.md run unchanged.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def written(what: str, as_it_is: str, wrong: str) -> str:
 
 
 def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The only line on stderr of a call that ends with exit code 2."""
+    """The only line on stderr of a call with exit code 2."""
     capsys.readouterr()
     assert main(words) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
@@ -43,7 +43,7 @@ def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return line
 
 
-# What is made of the method, and what is said of it beside the file and the line.
+# The change to the template, and the message in addition to file and line.
 METHODS = {
     "no Python": ("    def start(", "    def start", "SyntaxError"),
     "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "ends the program when it is imported"),
@@ -63,7 +63,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("mistake", METHODS)
-def test_a_mistake_in_a_method(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistake_in_a_method_is_a_one_line_error(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
     as_it_is, wrong, said = METHODS[mistake]
     written("method", as_it_is, wrong)
     line = told(["methods", "check", METHOD], capsys)
@@ -104,7 +104,7 @@ DATASETS = {
 
 
 @pytest.mark.parametrize("mistake", DATASETS)
-def test_a_mistake_in_a_dataset(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistake_in_a_dataset_is_a_one_line_error(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
     as_it_is, wrong, said = DATASETS[mistake]
     written("dataset", as_it_is, wrong)
     line = told(["datasets", "check", DATASET, "--quick"], capsys)
@@ -112,7 +112,7 @@ def test_a_mistake_in_a_dataset(mistake: str, capsys: pytest.CaptureFixture[str]
     assert re.search(r"my_dataset\.py:\d+: ", line)
 
 
-def test_a_run_names_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_reports_mistakes_in_a_dataset(capsys: pytest.CaptureFixture[str]) -> None:
     as_it_is, wrong, said = DATASETS["unknown classes"]
     written("dataset", as_it_is, wrong)
     words = ["run", "--scenes", DATASET, "--profile", "oracle", "--protocols", "rooms-instance", "--limit", "1"]
@@ -121,14 +121,14 @@ def test_a_run_names_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert said in error and re.search(r"my_dataset\.py:\d+: ", error)
 
 
-def test_what_is_merely_missing_is_found_with_the_rest(capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_file_of_a_dataset_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     written("dataset", "        return ()", '        return (Path("gone.png"),)')
     capsys.readouterr()
     assert main(["datasets", "check", DATASET, "--quick"]) == 1
     assert "gone.png is missing" in capsys.readouterr().out
 
 
-def test_a_file_may_hold_dataclasses_and_is_read_anew_when_it_changed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_file_may_contain_dataclasses_and_is_reloaded_after_a_change(capsys: pytest.CaptureFixture[str]) -> None:
     text = written("method", "class MyMethod:", "@dataclass\nclass Mine:\n    a: int = 1\n\n\nclass MyMethod:")
     mine = Path("my_method.py")
     mine.write_text(
@@ -141,7 +141,7 @@ def test_a_file_may_hold_dataclasses_and_is_read_anew_when_it_changed(capsys: py
     assert "stride = 7" in capsys.readouterr().out
 
 
-def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_of_a_changed_file_is_not_resumed(capsys: pytest.CaptureFixture[str]) -> None:
     text = written("method", "", "")
     words = ["run", "--scenes", "rooms/bathroom0", "--set", *FEW, "--profile", "oracle", "--limit", "1"]
     words += ["--methods", METHOD, "--protocols", "rooms-instance", "--jobs", "1", "--no-pictures", "--out", "out"]
@@ -153,7 +153,7 @@ def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureF
     assert "holds another run" in told(words, capsys)
 
 
-def test_a_truth_that_no_protocol_names_is_scored_by_those_that_it_fits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_custom_dataset_is_scored_under_all_fitting_protocols(capsys: pytest.CaptureFixture[str]) -> None:
     written("dataset", "", "")
     words = ["run", "--scenes", DATASET, "--methods", "oracle", "--limit", "1", "--jobs", "1", "--no-pictures"]
     assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
@@ -163,7 +163,7 @@ def test_a_truth_that_no_protocol_names_is_scored_by_those_that_it_fits(capsys: 
     assert all(one["result"]["metrics"][one["headline"][0]] == 1 for one in found)
 
 
-def test_a_truth_that_no_protocol_fits_is_said_to_be_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ground_truth_without_a_fitting_protocol_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     text = written("dataset", "", "")
     Path("my_dataset.py").write_text(text.replace('"replica"', '"mine"'))
     words = ["run", "--scenes", DATASET, "--methods", "opensu3d", "--limit", "1", "--jobs", "1", "--no-pictures"]
@@ -176,7 +176,7 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
 
 
-def test_the_method_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_method_of_the_page_runs_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     (text,) = [block for block in blocks("docs/own-code.md", "python") if "class " in block]
     Path("my_method.py").write_text(text)
     assert main(["methods", "check", METHOD]) == 0
@@ -188,7 +188,7 @@ def results(folder: str) -> dict[tuple[str, str], dict[str, float]]:
     return {(one["method"], one["protocol"]): one["result"]["metrics"] for one in found}
 
 
-def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: pytest.CaptureFixture[str]) -> None:
+def test_templates_of_method_dataset_and_protocol_run_together(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["methods", "new", "merge_all.py"]) == 0
     assert "su3d-bench methods check merge_all.py:MergeAll" in capsys.readouterr().out
     assert main(["datasets", "new", "own/my_rooms.py"]) == 0
@@ -202,7 +202,7 @@ def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: py
     assert results("run")["merge-all", "mine"]["AP25"] == 1.0
 
 
-def test_the_method_runs_on_the_built_in_rooms() -> None:
+def test_method_template_runs_on_the_built_in_rooms() -> None:
     assert main(["methods", "new", "my_method.py"]) == 0
     words = "--scenes rooms/bathroom0 --profile oracle --jobs 1 --out r --no-pictures"
     words += f" --protocols rooms-instance --set {' '.join(FEW)}"
@@ -219,7 +219,7 @@ def test_the_method_runs_on_the_built_in_rooms() -> None:
         (["datasets", "new", "3.py"], "is not a valid name"),
     ],
 )
-def test_nothing_is_overwritten_and_no_file_gets_another_form(
+def test_new_overwrites_nothing_and_checks_the_suffix(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("there.py").write_text("mine")

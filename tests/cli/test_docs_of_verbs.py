@@ -1,4 +1,4 @@
-"""Pages, tutorials and the action for GitHub say what parser and code say."""
+"""Documentation pages, tutorials and the GitHub action match the parser and the code."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
 VARIABLE = re.compile(r"SU3D_[A-Z]+(?:_[A-Z]+)*")
 CODE = ("su3d_bench", "datasets", "baselines", "reports")
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
-MADE_UP = {"SU3D_TEST_KEY"}  # by a test, for itself
+MADE_UP = {"SU3D_TEST_KEY"}  # only used in a test
 
 
 def test_every_command_has_a_page_with_every_option() -> None:
@@ -36,7 +36,7 @@ def test_every_command_has_a_page_with_every_option() -> None:
         assert shown - COMMON_OPTIONS - {"-h"} <= set(re.findall(r"(?<=[` ])--[\w-]+", page))
 
 
-def test_what_is_said_beside_the_help_is_of_verbs_that_exist() -> None:
+def test_additional_help_is_only_for_existing_commands() -> None:
     assert set(MORE) <= {" ".join(words) for words, _ in verbs()}
 
 
@@ -49,7 +49,7 @@ def parser() -> ArgumentParser:
 
 
 @pytest.mark.parametrize("file", PAGES, ids=str)
-def test_every_command_of_a_page_is_one_that_the_parser_takes(file: Path, parser: ArgumentParser) -> None:
+def test_parser_accepts_every_command_of_a_page(file: Path, parser: ArgumentParser) -> None:
     text = file.read_text().replace("\\\n", " ")
     for line in re.findall(r"^(?:! |SU3D_\w+=\S+ )?su3d-bench (.*)$", text, re.MULTILINE):
         if not re.search(r"VERB| \.\.\.|\||>", line):
@@ -62,7 +62,7 @@ def table_of_variables() -> set[str]:
     return set(rows)
 
 
-def test_one_table_has_every_variable_of_the_code_and_no_other() -> None:
+def test_table_of_variables_matches_the_code() -> None:
     read = set().union(*map(variables_in, CODE)) | {variable_of(name) for name in PLACEHOLDERS}
     of_tests = variables_in("tests") | variables_in("benchmarks")
     assert table_of_variables() == (read | of_tests) - MADE_UP
@@ -73,13 +73,13 @@ def variables_in(folder: str) -> set[str]:
     return {name for path in files for name in VARIABLE.findall(path.read_text())}
 
 
-def test_the_pages_name_no_variable_that_is_not() -> None:
+def test_pages_only_name_existing_variables() -> None:
     for file in [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "action.yml"]:
         assert set(VARIABLE.findall(file.read_text())) <= table_of_variables(), file
 
 
 @pytest.mark.parametrize("file", PAGES, ids=str)
-def test_a_page_has_one_heading_pictures_with_words_and_links_that_lead_somewhere(file: Path) -> None:
+def test_page_has_one_heading_alt_texts_and_valid_links(file: Path) -> None:
     text = re.sub(r"^```.*?^```$", "", file.read_text(), flags=re.MULTILINE | re.DOTALL)
     assert len(re.findall(r"^# ", text, re.MULTILINE)) == 1
     assert "![](" not in text
@@ -87,7 +87,7 @@ def test_a_page_has_one_heading_pictures_with_words_and_links_that_lead_somewher
         assert (file.parent / target).is_file(), target
 
 
-# the tutorials, which .ci/tutorials.py types
+# the tutorials, which .ci/tutorials.py runs
 
 PROGRAM = runpy.run_path(str(ROOT / ".ci" / "tutorials.py"))
 TUTORIALS: dict[str, Path] = PROGRAM["PAGES"]
@@ -103,27 +103,27 @@ def not_printed(shown: str, printed: str) -> Any:
 
 
 @pytest.mark.parametrize("name", TUTORIALS)
-def test_a_tutorial_has_no_block_that_is_shown_and_compared_with_nothing(name: str) -> None:
+def test_every_output_block_of_a_tutorial_is_checked(name: str) -> None:
     text = TUTORIALS[name].read_text(encoding="utf-8")
     assert text.count("```text\n") == sum(bool(shown) for _, shown in steps(name))
 
 
 @pytest.mark.parametrize("name", TUTORIALS)
-def test_what_a_tutorial_shows_passes_under_other_numbers_and_not_under_other_words(name: str) -> None:
+def test_tutorial_output_may_differ_in_numbers_but_not_in_words(name: str) -> None:
     for _, shown in steps(name):
         assert not_printed(shown, shown.replace("5", "6").replace("1", "2")) == []
         telling = [line for line in shown.splitlines() if any(letter.isalpha() for letter in line)]
         assert len(not_printed(shown, "something else\n")) >= len(telling)
 
 
-def test_a_line_with_another_word_or_column_was_not_printed() -> None:
+def test_line_with_another_word_or_column_does_not_match() -> None:
     assert not_printed("| method | AP |\n3 scenes", "| method | AP | AP50 |\n3 rooms") == [
         "| method | AP |",
         "3 scenes",
     ]
 
 
-# the action for GitHub
+# the GitHub action
 
 ACTION = ROOT / "action.yml"
 PINNED = re.compile(r"actions/(setup-python@v5|cache@v4|upload-artifact@v4)")
@@ -134,27 +134,27 @@ def action() -> Any:
     return yaml.safe_load(ACTION.read_text())
 
 
-def test_each_step_runs_in_bash_or_uses_an_action_of_a_known_version(action: Any) -> None:
+def test_each_step_runs_in_bash_or_uses_a_pinned_action(action: Any) -> None:
     for step in action["runs"]["steps"]:
         assert ("run" in step) != ("uses" in step)
         assert step.get("shell") == "bash" if "run" in step else PINNED.fullmatch(step["uses"])
 
 
-def test_scripts_are_whole_and_no_input_is_text_of_one(action: Any) -> None:
+def test_scripts_are_valid_and_contain_no_inputs(action: Any) -> None:
     scripts = [step["run"] for step in action["runs"]["steps"] if "run" in step]
     assert scripts and not [script for script in scripts if "${{" in script]
     for script in scripts:
         subprocess.run(["bash", "-n"], input=script, text=True, check=True)
 
 
-def test_every_input_is_of_use_and_documented_where_it_is_new(action: Any) -> None:
+def test_every_input_is_used_and_new_ones_are_documented(action: Any) -> None:
     steps = str(action["runs"]["steps"])
     assert all(f"inputs.{name}" in steps for name in action["inputs"])
     page = (ROOT / "docs" / "running" / "regression-check.md").read_text()
     assert all(f"`{name}" in page for name in ("cache", "artifact", "table", "artifact-url"))
 
 
-def test_every_command_is_one_that_the_parser_takes(action: Any) -> None:
+def test_parser_accepts_every_command_of_the_action(action: Any) -> None:
     text = "\n".join(step.get("run", "") for step in action["runs"]["steps"]).replace("\\\n", " ")
     commands = re.findall(r"su3d-bench (.*?)(?: \|\| .*)?$", text, re.MULTILINE)
     assert len(commands) == 4

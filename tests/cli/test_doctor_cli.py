@@ -1,4 +1,4 @@
-"""``su3d-bench dev doctor`` and ``dev completion``: what this machine lacks, and what a shell completes."""
+"""The commands ``su3d-bench dev doctor`` and ``dev completion``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from su3d_bench.cli.main import main
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[dict[str, Any], str]]:
-    """What comes of loading libraries, in place of loading them."""
+    """Stub results of loading libraries."""
     for name in ("SU3D_DATA", "SU3D_CACHE", "SU3D_MODELS", "TMPDIR"):
         (tmp_path / name).mkdir()
         monkeypatch.setenv(name, str(tmp_path / name))
@@ -28,7 +28,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[
     return found
 
 
-def test_a_whole_machine_passes_and_looking_leaves_nothing_behind(
+def test_doctor_passes_on_a_complete_machine_and_leaves_no_files(
     machine: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["dev", "doctor", "--json"]) == 0
@@ -42,7 +42,7 @@ def test_a_whole_machine_passes_and_looking_leaves_nothing_behind(
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".su3d-doctor-")]
 
 
-def test_a_library_that_cannot_be_loaded_or_a_folder_that_cannot_be_written_is_missing(
+def test_unloadable_library_or_unwritable_folder_is_missing(
     machine: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     machine["open3d"] = {}, "OSError: libGL.so.1: cannot open shared object file"
@@ -53,11 +53,11 @@ def test_a_library_that_cannot_be_loaded_or_a_folder_that_cannot_be_written_is_m
     assert missing == {"open3d", "cache"}
 
 
-def test_a_library_that_ends_its_process_ends_no_more_than_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_library_that_crashes_does_not_crash_the_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
     codes = {
         "open3d": "import os; os.kill(os.getpid(), 11)",
         "numba": "import no_such_module",
-        "torch": "print('words of its own'); found = {'gpus': []}",
+        "torch": "print('unrelated output'); found = {'gpus': []}",
     }
     monkeypatch.setattr(doctor, "LOADED", codes)
     assert doctor.loaded("open3d") == ({}, "ended by signal 11 while it was loaded")
@@ -73,7 +73,7 @@ def test_a_library_that_ends_its_process_ends_no_more_than_that(monkeypatch: pyt
         ("su3d-bench report tables runs/demo --format ", {"text", "markdown", "latex", "csv", "html"}),
     ],
 )
-def test_a_shell_completes_verbs_and_choices(line: str, words: set[str], tmp_path: Path) -> None:
+def test_shell_completes_commands_and_choices(line: str, words: set[str], tmp_path: Path) -> None:
     found = tmp_path / "found"
     environment = {
         "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(found),

@@ -1,4 +1,4 @@
-"""Every verb of the command line, carried out once on one small real run: the quick answer to "does it still work?"."""
+"""Every command, executed once on one small real run: a smoke test."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RUN = (
     f"--scenes rooms/bathroom0 --methods opensu3d oracle --protocols rooms-semantic rooms-instance --stride 200 {SMALL}"
 )
 
-# What follows each verb, the exit code, and a file that it leaves or words that it says.
+# Arguments of each command, its exit code, and a file that it writes or text that it prints.
 CASES: dict[str, tuple[str, int, str]] = {
     "run": (f"{RUN} --out out", 0, "| opensu3d"),
     "ablate": (f"--vary m=1,2 --scenes rooms/bathroom0 --limit 2 {SMALL} --out sweep", 0, "sweep/metrics.json"),
@@ -30,7 +30,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     ),
     "check": ("--build-from out --out reference.json", 0, "reference.json"),
     "compare": ("out:opensu3d out:oracle", 0, "rooms-instance"),
-    "report power": ("out", 2, "1 scene is scored"),  # one tells nothing of how differences vary
+    "report power": ("out", 2, "1 scene is scored"),  # variance needs at least two scenes
     "report attribution": ("out --method opensu3d --out errors.png", 0, "errors.png"),
     "report tables": ("out --format latex --out tables.tex", 0, "tables.tex"),
     "report timing": ("out --out timing", 0, "timing/timing.md"),
@@ -40,7 +40,11 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report leaderboard": ("out --out board.md", 0, "board.md"),
     "report bundle": ("out --out registry/bundles/mine.zip", 0, "registry/bundles/mine.zip"),
     "report verify": ("tables.tex", 0, ""),
-    "dev registry add": ("registry/bundles/mine.zip --to registry", 0, "4 scores made anew, to the last bit"),
+    "dev registry add": (
+        "registry/bundles/mine.zip --to registry",
+        0,
+        "4 scores recomputed, identical to the last bit",
+    ),
     "dev registry build": ("registry --out site", 0, "site/index.html"),
     "reproduce": ("opensu3d --table II --dry-run", 1, "su3d-bench datasets fetch replica"),
     "runs list": (".", 0, "opensu3d"),
@@ -84,17 +88,17 @@ CASES: dict[str, tuple[str, int, str]] = {
     "runs export": ("out --to openlex3d --method opensu3d --out exported", 0, "exported"),
 }
 
-# These write nothing, so that they can be asked twice.
+# These write nothing, so they can be run twice.
 READING = (
     *("compare", "report leaderboard", "runs list", "runs show", "query show", "datasets list", "models list"),
     *("methods list", "methods show", "protocols list", "protocols show", "protocols diff", "dev cache list"),
 )
-FINISHED: dict[str, str] = {}  # the files of the run, by name, as the verb run left them
+FINISHED: dict[str, str] = {}  # digests of the run's files by name, after the command run
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator[None]:
-    """A folder where each verb works on what those before it left."""
+    """A folder in which each command uses the results of those before it."""
     folder = tmp_path_factory.mktemp("verbs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -104,17 +108,17 @@ def _place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterat
         yield
 
 
-def test_every_verb_of_the_parser_has_its_case() -> None:
+def test_every_command_of_the_parser_has_a_case() -> None:
     assert sorted(CASES) == sorted(" ".join(words) for words, _ in verbs())
 
 
 @pytest.mark.parametrize("verb", CASES)
-def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_succeeds(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     words, code, left = CASES[verb]
     typed = shlex.split(f"{verb} {words}")
     assert main(typed) == code, capsys.readouterr().err
     answer = capsys.readouterr()
-    assert r"\n" not in answer.out + answer.err, "an escaped end of a line"
+    assert r"\n" not in answer.out + answer.err, "an escaped line break"
     assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err
     if verb in READING:
         assert main([*typed, "--json"]) == code
@@ -124,5 +128,5 @@ def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -
         FINISHED.update({path.as_posix(): digest_file(path) for path in files})
     for name, digest in FINISHED.items():
         assert digest_file(Path(name)) == digest, (
-            "a verb may add to a finished run what it is asked to, and changes nothing"
+            "a command may add requested files to a finished run, but must not change existing ones"
         )

@@ -1,4 +1,4 @@
-"""A finished run let loose on: whatever is typed at it, wrong or right, its files stay byte for byte as they are."""
+"""Commands on a finished run, right or wrong, never change its files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ INTO = "--out runs/demo"
 SAME = f"run {PAINTED}/[ab] {WHAT} {INTO}"
 OTHER = "su3d-bench: runs/demo: holds another run ("
 
-# What is typed, its exit code, and the line or the beginning of the line that it ends with.
+# The command, its exit code, and the start of its last line.
 SLIPS: dict[str, tuple[str, int, str]] = {
     "one scene of two": (f"run --scenes {PAINTED}/a {WHAT} {INTO}", 2, f"{OTHER}scene painted/b is not asked"),
     "more scenes": (f"run {PAINTED}/* {WHAT} {INTO}", 2, f"{OTHER}scenes painted/c, painted/d are new); --extend"),
@@ -34,7 +34,7 @@ SLIPS: dict[str, tuple[str, int, str]] = {
     "the same in another order": (f"run {PAINTED}/b {PAINTED}/a {WHAT} {INTO}", 0, "run folder: runs/demo"),
     "the same from its own file": (f"run --config runs/demo/run.toml {INTO}", 0, "run folder: runs/demo"),
     "a plan": (f"{SAME} --dry-run", 0, ""),
-    "weights that are not here": (f"{SAME} --profile paper", 2, "su3d-bench: "),
+    "missing weights": (f"{SAME} --profile paper", 2, "su3d-bench: "),
     "extended by nothing": (f"run --extend {INTO}", 0, "run folder: runs/demo"),
     "extended by another seed": (f"run --extend --seed 1 {INTO}", 2, "su3d-bench: runs/demo: cannot be extended"),
     "a plan of a replacement": (f"run {PAINTED}/c {WHAT} --replace --dry-run {INTO}", 0, ""),
@@ -58,7 +58,7 @@ SLIPS: dict[str, tuple[str, int, str]] = {
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a finished run of two scenes, pictures drawn, in ``runs/demo``."""
+    """A folder with a finished run of two scenes, with pictures, in ``runs/demo``."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
@@ -79,14 +79,14 @@ def _painted(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def files_of(run: str) -> dict[str, str]:
-    """The digest of every file of a run but those of its cache, by name."""
+    """The digest of every file of a run except its cache, by name."""
     files = [path for path in Path(run).rglob("*") if path.is_file()]
     names = {path.relative_to(run).as_posix(): path for path in files}
     return {name: digest_file(path) for name, path in names.items() if not name.startswith(".cache/")}
 
 
 @pytest.mark.parametrize("slip", SLIPS)
-def test_a_finished_run_stays_as_it_is(slip: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_finished_run_is_unchanged(slip: str, capsys: pytest.CaptureFixture[str]) -> None:
     words, code, line = SLIPS[slip]
     before = files_of("runs/demo")
     assert len(before) > 10
@@ -97,7 +97,7 @@ def test_a_finished_run_stays_as_it_is(slip: str, capsys: pytest.CaptureFixture[
     assert code != 2 or len(said) == 1, said
 
 
-def test_an_extension_that_is_stopped_leaves_the_run_finished_and_is_taken_up_again(
+def test_interrupted_extension_leaves_the_run_finished_and_can_be_resumed(
     kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copytree("runs/demo", "stopped")
@@ -135,6 +135,6 @@ def test_an_extension_that_is_stopped_leaves_the_run_finished_and_is_taken_up_ag
         f"ablate {PAINTED}/a --method {COLLECTOR} --vary dorp=1",
     ],
 )
-def test_a_request_that_fails_before_any_work_leaves_no_folder(words: str) -> None:
+def test_request_that_fails_early_creates_no_folder(words: str) -> None:
     assert main([*words.split(), "--out", "new/one"]) == 2
     assert not Path("new").exists()

@@ -1,4 +1,4 @@
-"""The verb ``export``: runs and other programs' predictions to files, whole or not at all."""
+"""The command ``runs export``: atomic export of runs and of other programs' predictions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return answer.err
 
 
-def test_a_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     words = ["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector"]
     assert main([*words, "--out", "x/collector"]) == 0
@@ -57,7 +57,7 @@ def test_a_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.Capture
         np.testing.assert_array_equal(found.features, own.content.features)
 
 
-def test_a_run_is_exported_for_scannet(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_is_exported_for_scannet(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["runs", "export", run_folder, "--to", "scannet", "--protocol", "rooms-instance"]
     capsys.readouterr()
     assert main([*words, "--method", "collector", "--out", "collector", "--json"]) == 0
@@ -81,9 +81,7 @@ def test_maps_of_an_interrupted_run_are_exported_too(run_folder: str, capsys: py
     assert sorted(file.name for file in Path("oracle").glob("*.txt")) == ["a.txt", "b.txt"]
 
 
-def test_a_map_is_not_labelled_by_data_from_which_it_was_not_made(
-    run_folder: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_map_is_not_labelled_with_changed_data(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     mark_complete = Path("r/scenes/painted.b/oracle/done.json")
     record = json.loads(mark_complete.read_text())
     record["steps"]["predict"]["key"]["data"] = "another"
@@ -92,7 +90,7 @@ def test_a_map_is_not_labelled_by_data_from_which_it_was_not_made(
     assert "painted/b: its data are not those of the run; run it again" in error_of(capsys, run_folder, *words)
 
 
-def test_the_only_method_of_a_limited_run_is_meant_and_called_partial(
+def test_only_method_of_a_limited_run_is_exported_with_a_partial_warning(
     run_folder: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["run", "--scenes", f"{PAINTED}/a", "--methods", COLLECTOR, "--jobs", "1", "--limit", "2", "--out", "part"]
@@ -120,7 +118,7 @@ def test_predictions_of_other_programs_are_exported(
     assert "no scene matches" in message
 
 
-def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
+def test_invalid_request_is_a_one_line_error_and_writes_nothing(
     run_folder: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     r = run_folder
@@ -139,14 +137,14 @@ def test_each_fault_of_a_request_is_one_line_and_leaves_nothing(
     assert "r/none: no such file or folder" in error_of(capsys, "r/none", "--to", "scannet")
     assert "only valid for a run folder" in error_of(capsys, "data", "--to", "scannet", "--method", "oracle")
     assert "unknown --to 'openlex'; did you mean 'openlex3d'?" in error_of(capsys, r, "--to", "openlex")
-    # the second scene cannot be read: the first is not left behind
+    # the second scene cannot be read: the first is not exported either
     Path("r/scenes/painted.b/collector/prediction.npz").write_bytes(b"PK")
     message = error_of(capsys, r, "--to", "openlex3d", "--method", "collector")
     assert "painted.b/collector/prediction.npz" in message
     assert not [file for file in tmp_path.iterdir() if file.name.startswith(".never")]
 
 
-def test_features_outside_of_a_run_are_not_named(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_features_outside_of_a_run_need_text_features(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("a.npz").write_bytes(Path("r/scenes/painted.a/collector/prediction.npz").read_bytes())
     words = ["a.npz", "--to", "scannet", "--protocol", "rooms-instance", "--scenes", f"{PAINTED}/*"]
     assert "--text-features FILE.npz (names, features)" in error_of(capsys, *words)

@@ -1,5 +1,5 @@
-"""Names that would act on a terminal, a log, a page or a spreadsheet, through the verbs: all that is printed is plain,
-and so is every file of text that is written.
+"""Hostile names (terminal escapes, CI commands, markup, formulas) are escaped in everything that commands print and in
+every text file that they write.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ SCENE, METHOD = "rooms/bathroom0", "opensu3d"
 FEW = ["--set", "rooms.n_frames=8", "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.05"]
 TEXTS = (".md", ".csv", ".html", ".tex", ".xml", ".txt", ".json", ".toml", ".svg")
 
-# What follows verbs that write texts, and verbs that print what each kind of file of others holds: a run of hostile
-# names, a data root of hostile scenes, files of hostile texts. What any other verb prints goes through the same door.
+# Arguments of commands that write text files, and of commands that print contents of untrusted files: a run with
+# hostile names, a data root with hostile scenes, files with hostile texts. Other commands escape output the same way.
 CASES: dict[str, list[list[str]]] = {
     "run": [["--scenes", "replica/*", "--stride", "1", "--limit", "1", "--jobs", "1", "--out", f"made{IN_A_PATH}"],
             ["--config", "hostile.toml"], ["--scenes", HOSTILE], ["--set", f"{HOSTILE}=1"]],
@@ -75,7 +75,7 @@ CASES: dict[str, list[list[str]]] = {
     "protocols texts": [["--protocol", "rules.toml", "--encoder", "embedded", "--out", f"out/{IN_A_PATH}.npz"]],
     "runs export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"]],
 }  # fmt: skip
-# Verbs that draw or ask models, and what needs their files: in the proofs alone.
+# Commands that draw or call models, and those that need their files: only in the proofs.
 SLOW = {
     "report attribution", "report timing", "report html", "report samples", "sheets make", "sheets score",
     "sheets pictures", "query text", "query ask", "datasets show",
@@ -92,7 +92,7 @@ class Loud:
 
 
 def poisoned_texts(run: Path) -> tuple[str, str]:
-    """What a record says of itself, and the names in a map."""
+    """Poison the texts of records and the names in maps."""
 
     def poison(value: Any, key: str = "") -> Any:
         if isinstance(value, dict):
@@ -114,7 +114,7 @@ def poisoned_texts(run: Path) -> tuple[str, str]:
 
 
 def poisoned_keys(run: Path) -> tuple[str, str]:
-    """The names of scene, method, protocols and metrics themselves, in records and folders."""
+    """Poison the names of scene, method, protocols and metrics, in records and folders."""
     scene, method = SCENE + IN_A_PATH, METHOD + IN_A_PATH
     new = {SCENE: scene, METHOD: method, "rooms-semantic": f"rooms-semantic{HOSTILE}", "F-mIoU": f"F-mIoU{HOSTILE}"}
 
@@ -138,7 +138,7 @@ POISONS: dict[str, Callable[[Path], tuple[str, str]]] = {"texts": poisoned_texts
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
-    """A run as it is, and a data root with a scene of a hostile name."""
+    """An unmodified run, and a data root with a scene of a hostile name."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(rooms_data))
@@ -156,7 +156,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
 
 @pytest.fixture
 def place(request: pytest.FixtureRequest, whole: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
-    """A folder with a poisoned run and hostile files; what stands for RUN, SCENE and METHOD."""
+    """A folder with a poisoned run and hostile files; the values of RUN, SCENE and METHOD."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         patch.setenv("SU3D_DATA", str(whole / "data"))
@@ -169,7 +169,7 @@ def place(request: pytest.FixtureRequest, whole: Path, tmp_path: Path) -> Iterat
 
 
 def write_files(whole: Path) -> None:
-    """Files of hostile texts, as others might send them."""
+    """Write files with hostile texts, as an attacker might send them."""
     quoted = json.dumps(HOSTILE)
     reference = json.loads((whole / "reference.json").read_text())
     for result in reference["results"]:
@@ -182,7 +182,7 @@ def write_files(whole: Path) -> None:
         f'extends = "rooms-semantic"\nname = {quoted}\nsummary = {quoted}\n# {HOSTILE[:12]}\n'
     )
     Path("questions.toml").write_text(f"[[query]]\nscene = {quoted}\ntext = {quoted}\nobjects = [1]\n")
-    Path("lines.txt").write_text("a chair\n" + " ".join(HOSTILE.splitlines()) + "\n")  # a text a line
+    Path("lines.txt").write_text("a chair\n" + " ".join(HOSTILE.splitlines()) + "\n")  # one text per line
     Path("audit.csv").write_text(f'number,scene,kind,text,answer,verdict,remark\n1,a,b,"{HOSTILE}",c,right,d\n')
     Path("answers.csv").write_text(f'sheet_id,item_id,annotator,ask,answer\n"{HOSTILE}",1,a,b,c\n')
     for folder in ("predictions", "truth"):
@@ -192,7 +192,7 @@ def write_files(whole: Path) -> None:
 
 
 def faults_of(text: str, *, is_commanding: bool = False) -> list[str]:
-    """What in ``text`` would act on a terminal or on what runs a job."""
+    """The parts of ``text`` that a terminal or a CI runner would interpret."""
     faults = [f"{c!r}" for c in sorted(set(text)) if not c.isprintable() and c != "\n"]
     lines = [line for line in text.split("\n") if not (is_commanding and re.match(r"::(error|notice) title=", line))]
     faults += [line for line in lines if line.lstrip().startswith("::") or re.search(r"##\w*\[", line)]
@@ -222,7 +222,7 @@ def faults_of_file(path: Path) -> list[str]:
     indirect=["place"],
     ids=["texts in quick verbs", "texts", "keys"],
 )
-def test_nothing_that_is_printed_or_written_acts(
+def test_control_characters_and_markup_are_escaped(
     place: dict[str, str], verbs: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     faults = []

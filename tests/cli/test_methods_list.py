@@ -1,4 +1,4 @@
-"""What the list of methods says of each, and which ones stand for all."""
+"""The list of methods with their facts, and the methods that ``all`` selects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
+def test_every_method_has_source_licence_needs_and_status(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     rows = {row["name"]: row for row in json.loads(told(capsys, "list", "--json"))}
@@ -35,7 +35,7 @@ def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
         assert "reproduces the paper" not in row["status"], name
 
 
-def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.CaptureFixture[str]) -> None:
+def test_methods_show_lists_settings_and_published_results(capsys: pytest.CaptureFixture[str]) -> None:
     text = told(capsys, "show", "conceptgraphs-detector")
     assert "[method.conceptgraphs-detector]" in text
     assert "# mAcc 38.72, F-mIoU 35.82: ConceptGraphs (Gu et al.), Table II" in text
@@ -45,16 +45,14 @@ def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.Captu
     assert value["settings"]
 
 
-def test_the_settings_that_are_shown_can_be_used_as_they_stand(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_shown_settings_are_a_valid_configuration_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from su3d_bench.core.config import read_file
 
     (tmp_path / "mine.toml").write_text(told(capsys, "show", "opensu3d"))
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
 
 
-def test_all_means_the_eight_systems_not_the_truth_nor_programs_of_others(
+def test_all_selects_the_eight_methods_without_oracle_and_external_programs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))

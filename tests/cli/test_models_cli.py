@@ -1,4 +1,4 @@
-"""``su3d-bench models``: what each verb answers with models here, with none, and with wrong ones."""
+"""The commands ``su3d-bench models`` with available, missing and invalid models."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ HEAVY = ("torch", "transformers", "onnxruntime", "open3d", "sklearn", "pandas", 
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """No model is here, and a connection to anywhere is an error."""
+    """No models are available, and every network connection is an error."""
     monkeypatch.setenv("SU3D_MODELS", str(tmp_path / "models"))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
 
     def refuse(*_: object) -> None:
-        raise AssertionError("a command about models reached out to the network")
+        raise AssertionError("a models command accessed the network")
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     return tmp_path
@@ -46,11 +46,11 @@ def tiny_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def found(home: Path, tiny_clip: Path) -> Path:
-    """The tiny encoder where ``clip-vit-b-32`` is looked for."""
+    """The tiny encoder in the folder of ``clip-vit-b-32``."""
     return Path(shutil.copytree(tiny_clip, home / "models" / "clip-vit-b-32"))
 
 
-def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
+def test_list_shows_every_model_with_size_licence_and_state(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["models", "list"]) == 0
@@ -61,7 +61,7 @@ def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
     assert f"{len(MODELS)} missing; su3d-bench models check clip-vit-h-14 shows what to download" in err
 
 
-def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_prints_the_digests_of_a_complete_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check"]) == 0
     out = capsys.readouterr().out
     assert out.splitlines()[0] == f"clip-vit-b-32 (transformers): {found}: OK"
@@ -72,7 +72,7 @@ def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.Ca
     assert all(f"{digest}  {name}" in out for name, digest in row["sha256"].items())
 
 
-def test_check_names_what_is_wrong_and_answers_1(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_faults_with_exit_code_1(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (found / "config.json").write_text('{"model_type": "bert"}')
     assert main(["models", "check", "clip-vit-b-32"]) == 1
     assert "config.json: model_type is 'bert'" in capsys.readouterr().out
@@ -89,7 +89,7 @@ def test_check_names_what_is_wrong_and_answers_1(found: Path, capsys: pytest.Cap
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_request_is_a_one_line_error(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -97,16 +97,14 @@ def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: py
     assert len(err.splitlines()) == 1
 
 
-def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
-    found: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_warm_prints_time_memory_and_the_digest_of_run_records(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "warm", "clip-vit-b-32"]) == 0
     out = capsys.readouterr().out
     assert "ViT-B-32/openai: loaded and first run" in out
     assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
 
 
-def test_a_device_that_is_none_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_device_is_an_early_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--scenes", "rooms/living0", "--device", "gpu", "--dry-run"]) == 2
     assert "--device: models.device = 'gpu': expected cpu, cuda or cuda:N" in capsys.readouterr().err
 
@@ -118,15 +116,15 @@ def _finished_run(folder: Path, made_by: str | None, made_with: str) -> RunFolde
     return RunFolder(folder)
 
 
-def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home: Path) -> None:
+def test_query_uses_the_encoder_of_the_run(found: Path, home: Path) -> None:
     made = load_encoder(ModelsConfig(encoder="clip-vit-b-32", precision="bfloat16"))
     encoder = encoder_of(_finished_run(home / "run", made.name, made.digest))
-    # the text runs in float32, whatever the images ran in
+    # texts are encoded in float32, whatever precision the images used
     assert encoder.digest == load_encoder(ModelsConfig(encoder="clip-vit-b-32")).digest != made.digest
     assert encoder.encode_texts(["chair"]).shape == (1, CLIP_DIM)
 
 
-def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
+def test_query_on_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
     with pytest.raises(PredictionError, match=r"made by encoder ViT-B-32/openai \(000000000000\), here is ViT-B-32/op"):
         encoder_of(_finished_run(home / "run", "ViT-B-32/openai", "0" * 64))
     with pytest.raises(PredictionError, match="here is su3d-embedded"):
@@ -135,7 +133,7 @@ def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: P
         encoder_of(_finished_run(home / "run", "ViT-L-14/openai", "0" * 64))
 
 
-def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
+def test_evaluation_names_features_with_the_protocol_encoder_if_available(tiny_clip: Path, home: Path) -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     assert "which is not available" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))
     shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")

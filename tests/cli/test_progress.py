@@ -1,4 +1,4 @@
-"""The bars of a run: what is done is said, also where no frame is fed, and a narrow terminal keeps a bar."""
+"""Progress bars of a run: activities are shown even without frames, and narrow terminals keep a bar."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def plain_lines(bars: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("scene", ["rooms/living0", LONG])
-def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bar_and_activity_are_visible_on_80_columns(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with bars_on(80, monkeypatch) as bars:
         board = _Board(bars, 4, "")
         assert "starting" in plain_lines(bars)[0]
@@ -57,7 +57,7 @@ def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkey
         assert "scoring 2 of 4 protocols" in plain_lines(bars)[1] and "160/160" in plain_lines(bars)[1]
 
 
-def test_a_scene_has_one_bar_which_is_its_current_method_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_has_one_bar_for_its_current_method(monkeypatch: pytest.MonkeyPatch) -> None:
     with bars_on(120, monkeypatch) as bars:
         board = _Board(bars, 2, "drawing")
         board.report(Event("rooms/a", "one", 3, 3, 1))

@@ -1,4 +1,4 @@
-"""``su3d-bench datasets``: what is listed, what is made, and each fault of a request in one line."""
+"""The commands ``su3d-bench datasets``: lists, generated scenes, and one-line errors."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def fault(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a wrong request gets."""
+    """The one-line error of an invalid request."""
     assert main(words) == 2
     said = capsys.readouterr()
     assert said.out == "" and said.err.count("\n") == 1
     return said.err
 
 
-def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
+def test_list_shows_datasets_folders_scenes_and_how_to_get_missing_ones(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert main(["datasets", "list"]) == 0
@@ -44,7 +44,7 @@ def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
     )
 
 
-def test_list_tells_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_list_shows_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for scene, traj in (("room0", "1 0\n2 0\n"), ("room1", None)):
         (tmp_path / "data" / "Replica" / scene / "results").mkdir(parents=True)
         if traj is not None:
@@ -59,7 +59,7 @@ def test_list_tells_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], 
     assert rows["rooms"]["error"] is None
 
 
-def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothing(
+def test_generated_room_is_a_replica_scene_and_repeating_the_command_does_nothing(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = [*MAKE, "--layout", "replica", "--out", "made"]
@@ -74,14 +74,14 @@ def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothi
     ]
 
 
-def test_native_layout_puts_the_scan_into_the_data_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_native_layout_writes_the_scan_to_the_data_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main([*MAKE, "--out", "native"]) == 0
     assert capsys.readouterr().out.split() == ["bathroom0", "generated", "rooms/bathroom0"]
     assert len(list((tmp_path / "native").rglob("bathroom0.npz"))) == 1
 
 
 @pytest.mark.proof
-def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
+def test_one_and_two_workers_generate_identical_files(tmp_path: Path) -> None:
     words = [*MAKE[:-1], "2", "--layout", "replica", "--out", "made2", "--quiet"]
     done = subprocess.run([sys.executable, "-m", "su3d_bench", *words], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
@@ -108,7 +108,7 @@ def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
         ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file stands where a folder should be"),
     ],
 )  # fmt: skip
-def test_each_wrong_request_is_one_line(
+def test_invalid_request_is_a_one_line_error(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")

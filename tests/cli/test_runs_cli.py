@@ -1,4 +1,4 @@
-"""The verb runs: what is listed, what is shown, and what is removed."""
+"""The commands ``runs list``, ``runs show`` and ``runs remove``."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_runs_are_listed_with_their_state_and_first_numbers(capsys: pytest.Captu
     assert "| running now " in table and "rooms-semantic mAcc 100.0" in table
 
 
-def test_a_run_shows_what_was_asked_for_and_the_command_that_it_shows_takes_it_up_again(
+def test_runs_show_prints_the_request_and_a_command_that_resumes_the_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["runs", "show", "runs/two"]) == 0
@@ -84,7 +84,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(("reply", "is_there"), [("n\n", True), ("\n", True), ("", True), ("y\n", False)])
-def test_whoever_sits_at_a_terminal_is_asked(
+def test_remove_asks_for_confirmation_on_a_terminal(
     reply: str, is_there: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", Terminal(reply))
@@ -97,7 +97,7 @@ def test_whoever_sits_at_a_terminal_is_asked(
     assert sorted(os.listdir("runs")) == (["one", "two"] if is_there else ["two"])
 
 
-def test_what_is_more_than_a_run_or_less_is_not_removed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_that_are_not_exactly_a_run_are_not_removed(capsys: pytest.CaptureFixture[str]) -> None:
     os.symlink("runs/one", "link")
     shutil.copytree("runs/one", "notes")
     Path("notes/thesis.tex").write_text("years of work")
@@ -106,18 +106,18 @@ def test_what_is_more_than_a_run_or_less_is_not_removed(capsys: pytest.CaptureFi
     shutil.copytree("runs/one", "linked")
     os.symlink("/etc", "linked/scenes/painted.a/collector/pictures")
     cases = {
-        "link": "link: is a link; name the folder that it leads to, or remove the link yourself",
-        "runs": "runs: is no folder of a run, so nothing there is removed",
-        "notes": "notes: holds 'thesis.tex', which no run wrote; move it elsewhere first",
-        "deep": "deep: holds 'scenes/painted.a/collector/photo.png', which no run wrote; move it elsewhere first",
-        "linked": "linked: holds 'scenes/painted.a/collector/pictures', which no run wrote; move it elsewhere first",
+        "link": "link: is a link; name the folder that it points to, or remove the link yourself",
+        "runs": "runs: is not a run folder; nothing was removed",
+        "notes": "notes: contains 'thesis.tex', which no run wrote; move it elsewhere first",
+        "deep": "deep: contains 'scenes/painted.a/collector/photo.png', which no run wrote; move it elsewhere first",
+        "linked": "linked: contains 'scenes/painted.a/collector/pictures', which no run wrote; move it elsewhere first",
     }
     for place, line in cases.items():
         assert main(["runs", "remove", "runs/two", place, "--yes"]) == 2
         assert capsys.readouterr().err == f"su3d-bench: {line}\n"
     with RunFolder(Path("runs/one")).locked():
         assert main(["runs", "remove", "runs/two", "runs/one", "--yes"]) == 2
-    assert capsys.readouterr().err == "su3d-bench: runs/one: a run is writing here; end it or wait for it\n"
+    assert capsys.readouterr().err == "su3d-bench: runs/one: a run is writing here; stop it or wait until it finishes\n"
     assert Path("runs/two").is_dir()
     Path("runs/two/.cache").mkdir()
     Path("runs/two/.cache/page").write_text("")

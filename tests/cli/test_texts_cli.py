@@ -1,4 +1,4 @@
-"""``texts make`` and ``protocols show --names``: what is encoded here names features as the run does, bit for bit."""
+"""``protocols texts`` and ``protocols show --names``: encoded texts name features exactly as the run does."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def make(protocol: str, out: str, *more: str) -> int:
     return main(["protocols", "texts", "--protocol", protocol, "--encoder", "embedded", "--out", out, *more])
 
 
-def test_texts_made_here_give_the_numbers_of_the_run_itself(
+def test_encoded_texts_reproduce_the_numbers_of_the_run(
     rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
@@ -51,7 +51,7 @@ def test_texts_made_here_give_the_numbers_of_the_run_itself(
         ]
 
 
-def test_the_mean_over_several_prompts_is_formed_as_with_the_encoder_itself() -> None:
+def test_mean_over_several_prompts_equals_that_of_the_encoder() -> None:
     assert make(TWO_PROMPTS, "texts.npz") == 0
     rules, encoder, given = load_protocol(TWO_PROMPTS), EmbeddedEncoder(), read_text_features(Path("texts.npz"))
     assert given is not None
@@ -63,7 +63,7 @@ def test_the_mean_over_several_prompts_is_formed_as_with_the_encoder_itself() ->
     assert given.encoder == encoder.name
 
 
-def test_the_texts_of_a_protocol_are_listed_one_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_texts_of_a_protocol_are_listed_one_per_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["protocols", "show", TWO_PROMPTS, "--names"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == ["background", "There is the background in the scene."]
@@ -87,7 +87,7 @@ def test_the_texts_of_a_protocol_are_listed_one_a_line(capsys: pytest.CaptureFix
         ("q.json", '{"synonyms": {"a place to sit": [1], "something to eat at": ["2"]}}'),
     ],
 )  # fmt: skip
-def test_queries_are_encoded_from_every_form_in_which_they_come(
+def test_queries_are_encoded_from_every_file_format(
     name: str, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path(name).write_text(content)
@@ -112,7 +112,9 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("words", "message"), REFUSED)
-def test_what_cannot_be_encoded_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_texts_request_is_a_one_line_error(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["protocols", "texts", "--out", "texts.npz", *words]) == 2
     error = capsys.readouterr().err
     assert message in error

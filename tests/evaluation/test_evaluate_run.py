@@ -225,7 +225,7 @@ def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: 
     told = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
     assert "made by encoder theirs/v1" in told and "only texts of that one can be held against them" in told
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
-    assert "texts.npz: is not the file that runs/mine was scored with" in answered(
+    assert "texts.npz: is not the text features file used to score runs/mine" in answered(
         capsys, "report", "attribution", "runs/mine", code=2
     )
 
@@ -237,9 +237,9 @@ PREDICTIONS = (
 NO_RUNS = {
     "compare numbers.json runs/mine": f"numbers.json: {NUMBERS_ALONE}",
     "compare runs/mine both.json:mine": f"both.json: {NUMBERS_ALONE}",
-    "compare nowhere runs/mine": "nowhere: there is no such folder",
+    "compare nowhere runs/mine": "nowhere: no such folder",
     "report attribution pred": PREDICTIONS,
-    "report leaderboard pred": "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
+    "report leaderboard pred": "pred: contains no runs; create one with su3d-bench run, or with evaluate --out",
 }
 
 

@@ -84,11 +84,11 @@ def test_a_ranking_has_numbers_of_as_many_labels_and_names_the_others(
     assert {one.labels for one in found.boards[0]} == {"one label"}
     (refused,) = found.refused
     assert (refused.run, refused.what) == ("b", "b / scannet-instance")
-    assert refused.reason == "is of the top labels of a mask, 2 of 3 entries are of one label"
+    assert refused.reason == "uses the top labels of a mask; 2 of 3 entries use one label"
     capsys.readouterr()
     assert main(["report", "leaderboard", str(tmp_path / "runs")]) == 0
     shown = capsys.readouterr().out
-    assert "Labels: one label." in shown and "Left out: b, b / scannet-instance: is of the top labels" in shown
+    assert "Labels: one label." in shown and "Excluded: b, b / scannet-instance: uses the top labels" in shown
 
 
 def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,11 +99,11 @@ def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsy
     assert main(["compare", *runs, "--protocols", "scannet-instance"]) == 2
     line = capsys.readouterr().err
     assert line.count("\n") == 1
-    assert "scannet-instance is of one label and of the top labels of a mask; give both" in line
+    assert "scannet-instance uses one label and the top labels of a mask; give both predictions the same number" in line
     assert main(["compare", *runs, "--protocols", "class-agnostic-open3dis"]) == 0
     capsys.readouterr()
     assert main(["report", "tables", str(tmp_path / "runs/a"), str(tmp_path / "runs/b")]) == 2
-    assert "is of one label and of the top labels of a mask" in capsys.readouterr().err
+    assert "uses one label and the top labels of a mask" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("labels", "fits", "fails"), [("one", ONE, PAIRS), ("top-k", PAIRS, ONE)])

@@ -72,7 +72,7 @@ def test_table_iv_is_made_of_what_people_judged(folders: tuple[Path, Path], caps
     assert {cell["beside"] for row in table["rows"][:4] for cell in row["cells"]} == {"n=10"}
     assert not any(cell["is_best"] for row in table["rows"] for cell in row["cells"])  # 9 of 10 against 7 of 10
     assert sum("with so few items no difference" in note for note in table["notes"]) == 1
-    assert any("judged by 1 person, 40 items" in note for note in table["notes"])
+    assert any("judged by 1 annotator, 40 items" in note for note in table["notes"])
     assert sum(row["is_reported"] for row in table["rows"]) == 8
     assert table["caption"] == "Retrieval by text on rooms; not the paper's set-up: other scenes."
 

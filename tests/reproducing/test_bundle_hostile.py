@@ -1,4 +1,4 @@
-"""Archives of others: no name leads out of the folder, no size is believed, what is no bundle is one line."""
+"""Untrusted archives: names cannot leave the folder, sizes are checked, invalid bundles are one-line errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from su3d_bench.reproducing.bundle import unpack
 
 
 def written(place: Path, members: dict[str, bytes], **changed: object) -> Path:
-    """An archive whose manifest is right, but for what is ``changed``."""
+    """An archive whose manifest is correct except for what is ``changed``."""
     entries = {name: {"n_bytes": len(content), "sha256": digest_bytes(content)} for name, content in members.items()}
     manifest = {"schema": 1, "program": "su3d-bench", "recipe": "mine", "runs": [], "files": entries, **changed}
     with zipfile.ZipFile(place, "w") as archive:
@@ -27,24 +27,24 @@ def written(place: Path, members: dict[str, bytes], **changed: object) -> Path:
 
 
 @pytest.mark.parametrize("name", ["../evil", "/evil", "a//b", "C:evil", "a\\..\\b"])
-def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
+def test_names_that_lead_out_of_the_folder_are_rejected(tmp_path: Path, name: str) -> None:
     into = tmp_path / "into"
-    with pytest.raises(StoreError, match="is no plain file below its folder; not unpacked"):
+    with pytest.raises(StoreError, match="is not a plain file below its folder; not unpacked"):
         unpack(written(tmp_path / "b.zip", {name: b"x"}), into)
     assert not into.exists() and not (tmp_path / "evil").exists()
 
 
-def test_a_link_is_not_unpacked(tmp_path: Path) -> None:
+def test_links_are_not_unpacked(tmp_path: Path) -> None:
     link = zipfile.ZipInfo("link")
     link.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
         archive.writestr("manifest.json", "{}")
         archive.writestr(link, "/etc/passwd")
-    with pytest.raises(StoreError, match="'link' is no plain file"):
+    with pytest.raises(StoreError, match="'link' is not a plain file"):
         unpack(tmp_path / "b.zip", tmp_path / "into")
 
 
-def test_what_would_unpack_to_far_more_than_it_is_is_refused(tmp_path: Path) -> None:
+def test_decompression_bombs_are_rejected(tmp_path: Path) -> None:
     zeros = bytes(200 << 20)
     entries = {"a": {"n_bytes": len(zeros), "sha256": digest_bytes(zeros)}}
     manifest = {"schema": 1, "program": "", "recipe": "", "runs": [], "files": entries}
@@ -56,7 +56,9 @@ def test_what_would_unpack_to_far_more_than_it_is_is_refused(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04" + bytes(100)])
-def test_what_is_no_archive_is_one_line(tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_archive_is_a_one_line_error(
+    tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "b.zip").write_bytes(content)
     assert main(["report", "verify", str(tmp_path / "b.zip")]) == 2
-    assert "b.zip: is no bundle, or damaged" in capsys.readouterr().err
+    assert "b.zip: is not a bundle, or damaged" in capsys.readouterr().err

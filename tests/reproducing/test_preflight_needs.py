@@ -1,4 +1,4 @@
-"""What the preflight names as missing of data that are here in part."""
+"""What the preflight reports as missing if data are only partly available."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def missing_meshes(methods: tuple[str, ...]) -> list[Need]:
     return [need for need in preflight([replace(run, methods=methods)]).needs if need.kind == "mesh"]
 
 
-def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
+def test_missing_scan_mesh_is_reported_for_methods_that_require_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
@@ -34,5 +34,5 @@ def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
     assert need.is_required and not need.is_available and need.how == "su3d-bench datasets fetch replica"
     assert need.name == "replica/bedroom0: the scan's mesh"
     assert "bedroom0_mesh.ply is missing" in need.remark
-    assert need.remark.endswith("openmask3d, sam3d@ensemble cannot do without")
+    assert need.remark.endswith("required by openmask3d, sam3d@ensemble")
     assert missing_meshes(("sam3d", "conceptgraphs")) == []

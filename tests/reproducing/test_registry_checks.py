@@ -1,4 +1,4 @@
-"""What comes into a registry was scored anew; what was tampered with is refused though all of its digests are right."""
+"""Bundles are scored again before they are added; tampered ones are rejected even if all digests are correct."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield made
 
 
-def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
+def test_valid_bundle_is_added_once_and_unchanged(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["dev", "registry", "add", str(bundle), "--to", str(tmp_path)]
@@ -35,7 +35,7 @@ def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
     assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (5, 5)
     assert (tmp_path / "bundles" / "opensu3d.zip").read_bytes() == bundle.read_bytes()
     assert main(words) == 1
-    assert "is there already as opensu3d.zip" in capsys.readouterr().out
+    assert "is already in the registry as opensu3d.zip" in capsys.readouterr().out
 
 
 def other_rules(files: Files) -> None:
@@ -53,19 +53,19 @@ def other_data(files: Files) -> None:
 @pytest.mark.parametrize(
     ("tamper", "says"),
     [
-        (lambda files: flip_labels(files, JOB), "by opensu3d: its counts are not those of its map"),
+        (lambda files: flip_labels(files, JOB), "by opensu3d: its counts do not match its map"),
         (other_rules, "are not those that scored it"),
         (other_data, "its data are not those of the run"),
     ],
 )
-def test_a_tampered_bundle_is_refused_with_its_reason(
+def test_tampered_bundle_is_rejected_with_a_reason(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tamper: Callable[[Files], None], says: str
 ) -> None:
     files, manifest = read_bundle(bundle)
     tamper(files)
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
     assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
-    assert "t.zip: refused: " in (said := capsys.readouterr().out) and says in said
+    assert "t.zip: rejected: " in (said := capsys.readouterr().out) and says in said
     assert not (tmp_path / "bundles").exists()
 
 
@@ -76,16 +76,16 @@ def repository(tmp_path: Path) -> Path:
     return folder
 
 
-def test_the_workflow_has_least_permissions_pinned_actions_and_no_secret(repository: Path) -> None:
+def test_workflow_has_minimal_permissions_pinned_actions_and_no_secrets(repository: Path) -> None:
     text = (repository / ".github/workflows/registry.yml").read_text()
     workflow = yaml.safe_load(text)
-    assert set(workflow[True]) == {"pull_request", "push"}, "YAML takes 'on' for true"
+    assert set(workflow[True]) == {"pull_request", "push"}, "YAML reads 'on' as true"
     assert workflow["permissions"] == {} and workflow["jobs"]["check"]["permissions"] == {"contents": "read"}
     assert workflow["jobs"]["publish"]["if"] == "github.event_name == 'push'"
     assert "secrets." not in text and "pull_request_target" not in text
     steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
     assert all(len(step["uses"].partition("@")[2].split()[0]) == 40 for step in steps if "uses" in step)
-    assert not any("${{" in step["run"] for step in steps if "run" in step), "no value is text of a script"
+    assert not any("${{" in step["run"] for step in steps if "run" in step), "no values are inserted into scripts"
     (checkout,) = (step for step in steps if "checkout" in step.get("uses", ""))
     assert checkout["with"]["persist-credentials"] is False
     assert not any("uses" in step and "checkout" in step["uses"] for step in workflow["jobs"]["publish"]["steps"])

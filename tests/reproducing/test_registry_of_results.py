@@ -1,4 +1,4 @@
-"""A registry: what goes together stands in one ranking, what does not is refused with what, where and what to do."""
+"""A registry: comparable rows share one ranking, others are rejected with what, where and what to do."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</s
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two bundles of people who ran other variants on the same scenes."""
+    """Two bundles with different variants on the same scenes."""
     folder = tmp_path_factory.mktemp("registry")
     painted_bundle(folder, "ann", ["@drop=1", "@noise_m=0.3"], said=f"my own photos {STRUCK}")
     painted_bundle(folder, "bob", [""])
@@ -34,7 +34,7 @@ def registry(made: Path, tmp_path: Path) -> Path:
     return tmp_path / "registry"
 
 
-def test_rows_of_several_bundles_stand_in_one_ranking_a_protocol_the_best_first(registry: Path) -> None:
+def test_rows_of_several_bundles_share_one_ranking_per_protocol_best_first(registry: Path) -> None:
     found = read_registry(registry)
     assert found.refused == () and found.n_bundles == 2
     assert [board[0].protocol for board in found.boards] == ["rooms-instance", "rooms-semantic"]
@@ -52,9 +52,7 @@ def test_rows_of_several_bundles_stand_in_one_ranking_a_protocol_the_best_first(
         ('"is_partial": false', '"is_partial": true', "is partial"),
     ],
 )
-def test_a_run_that_may_stand_in_no_ranking_is_left_out_with_its_reason(
-    registry: Path, old: str, new: str, says: str
-) -> None:
+def test_run_that_cannot_be_ranked_is_excluded_with_a_reason(registry: Path, old: str, new: str, says: str) -> None:
     files, manifest = read_bundle(registry / "bundles" / "bob.zip")
     edit_record(files, "runs/bob/run.json", old, new)
     rewrite_bundle(registry / "bundles" / "bob.zip", files, manifest)
@@ -75,40 +73,40 @@ def other_data(files: Files) -> None:
         (other_data, "its data of painted/a have the digest 000000000000, those of collector@drop=1 in ann.zip "),
         (
             lambda files: None,
-            "that name is taken by collector@drop=1 in ann.zip over the same scenes; give the variant",
+            "the name is taken by collector@drop=1 in ann.zip on the same scenes; give the variant",
         ),
     ],
 )
-def test_rows_that_mix_data_or_name_a_method_twice_are_refused(
+def test_rows_with_other_data_or_duplicate_methods_are_rejected(
     registry: Path, tmp_path: Path, change: Callable[[Files], None], says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files, manifest = read_bundle(registry / "bundles" / "ann.zip")
     change(files)
     bundle = rewrite_bundle(tmp_path / "dan.zip", files, {**manifest, "program": "another"})
     assert main(["dev", "registry", "add", str(bundle), "--to", str(registry)]) == 1
-    assert "dan.zip: refused: " in (said := capsys.readouterr().out) and says in said
+    assert "dan.zip: rejected: " in (said := capsys.readouterr().out) and says in said
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]
 
 
-def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(registry: Path) -> None:
+def test_features_of_two_encoders_conflict_if_the_protocol_requires_one(registry: Path) -> None:
     rows, _ = rows_of_bundle(registry / "bundles" / "ann.zip")
     one = replace(rows[0], protocol="replica-openmask3d", method="other", encoder="ViT-L-14-336/openai")
     other = replace(one, method="mine", encoder="su3d-embedded")
-    assert "its features are of the encoder su3d-embedded, those of other in ann.zip of" in (
+    assert "its features are from the encoder su3d-embedded, those of other in ann.zip from" in (
         conflict_with(other, [one]) or ""
     )
-    assert conflict_with(replace(other, encoder=None), [one]) is None, "it names its instances itself"
+    assert conflict_with(replace(other, encoder=None), [one]) is None, "the method names its instances itself"
     free = [replace(row, protocol="rooms-instance") for row in (other, one)]
-    assert conflict_with(free[0], free[1:]) is None, "a protocol that names none leaves it open"
+    assert conflict_with(free[0], free[1:]) is None, "the protocol does not require an encoder"
     weights = [(ModelWeights("clip-vit-l-14-336", "", (("model.safetensors", sha * 64),)),) for sha in "ab"]
     same = replace(other, encoder=one.encoder, weights=weights[0])
-    assert "its weights of clip-vit-l-14-336 are not those of" in (
+    assert "its weights of clip-vit-l-14-336 differ from those of" in (
         conflict_with(same, [replace(one, weights=weights[1])]) or ""
     )
     assert conflict_with(same, [replace(one, weights=weights[0])]) is None
 
 
-def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_markup(
+def test_site_has_one_page_per_method_and_scene_and_escapes_texts_of_bundles(
     registry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["dev", "registry", "build", str(registry), "--out", str(tmp_path / "site"), "--title", STRUCK]
@@ -126,4 +124,4 @@ def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_mar
     assert {page: (tmp_path / "site" / page).read_bytes() for page in pages} == before, "the same bytes again"
     (registry / "bundles" / "ann.zip").unlink()
     assert main(words) == 0
-    assert len([*(tmp_path / "site" / "methods").iterdir()]) == 1, "pages of what is gone are gone"
+    assert len([*(tmp_path / "site" / "methods").iterdir()]) == 1, "pages of removed methods are deleted"

@@ -1,4 +1,4 @@
-"""Whose perception is rehearsed, on which device: said in the first line, and before anything is made."""
+"""Profile and device of a rehearsal are used in every run and checked before anything is written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.proof
-def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
+def test_profile_paper_runs_end_to_end_with_tiny_networks(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_MODELS", str(write_fetched(tmp_path / "models")))
@@ -36,7 +36,7 @@ def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
     assert {one["encoder"] for one in runs} >= {"ViT-L-14-336/openai"}
 
 
-def test_the_device_reaches_every_run_and_the_preflight(out: Path) -> None:
+def test_device_is_passed_to_every_run(out: Path) -> None:
     recipe = load_recipe("opensu3d")
     asked = RecipeRequest("embedded", "embedded", device="cuda:99", values={})
     runs = asked_runs(recipe, recipe.experiments, asked)

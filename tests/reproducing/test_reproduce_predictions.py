@@ -1,4 +1,4 @@
-"""Predictions of a method that is none here, in the files that its program writes, put into its row of the table."""
+"""Predictions of a method that is not implemented here, in its original file format, fill its row of the table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "h
 WORDS = ["reproduce", "hovsg", "--rehearse", *ROOM, "--jobs", "1", "--limit", "1", "--quiet"]
 
 
-def test_maps_of_hovsg_fill_its_row_and_a_scene_of_another_name_is_refused(
+def test_maps_of_hovsg_fill_its_row_and_an_unknown_scene_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
@@ -26,7 +26,7 @@ def test_maps_of_hovsg_fill_its_row_and_a_scene_of_another_name_is_refused(
     maps.mkdir()
     named = ["--predictions", f"HOV-SG={maps}", "--text-features", f"HOV-SG={tmp_path / 'texts.npz'}"]
     np.savez(tmp_path / "texts.npz", names=np.array(["chair"]), features=np.eye(1, 3))
-    assert main([*WORDS, "--out", str(out), *named]) == 2  # the rooms are there now
+    assert main([*WORDS, "--out", str(out), *named]) == 2  # this generates the rooms
     assert "maps: " in capsys.readouterr().err and not (out / "runs/replica").exists(), "before any run"
 
     rules = load_protocol("replica-hovsg")
@@ -49,5 +49,7 @@ def test_maps_of_hovsg_fill_its_row_and_a_scene_of_another_name_is_refused(
     assert main([*WORDS, "--out", str(out), *named]) == 0
     cells = json.loads((out / "compared.json").read_text())["cells"]
     own = [cell for cell in cells if cell["method"] == "HOV-SG"]
-    assert own and all(cell["measured"] is not None and cell["measured"] > 90 for cell in own), "the truth itself"
+    assert own and all(cell["measured"] is not None and cell["measured"] > 90 for cell in own), (
+        "the ground truth itself"
+    )
     assert (out / "bundle.zip").is_file()

@@ -1,4 +1,4 @@
-"""Recipes: each finds its printed figures and methods here; a wrong one is one line that says where and what."""
+"""Recipes: all printed figures and methods exist here; an invalid recipe is a one-line error with its place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ figures = [{ table = "III" }]
 
 
 @pytest.mark.parametrize("name", recipe_names())
-def test_each_recipe_of_the_program_asks_for_runs_of_methods_scenes_and_protocols_that_there_are(name: str) -> None:
+def test_built_in_recipes_use_existing_methods_scenes_and_protocols(name: str) -> None:
     recipe = load_recipe(name)
     runs = asked_runs(recipe, recipe.experiments, RecipeRequest())
     assert {one for run in runs for one in run.experiments} == {one.name for one in recipe.experiments}
@@ -33,7 +33,7 @@ def test_each_recipe_of_the_program_asks_for_runs_of_methods_scenes_and_protocol
 
 
 @pytest.mark.parametrize("name", recipe_names())
-def test_each_printed_row_is_of_a_method_that_is_run_or_of_predictions_that_are_taken(name: str) -> None:
+def test_each_printed_row_has_a_method_that_is_run_or_accepts_predictions(name: str) -> None:
     recipe = load_recipe(name)
     for experiment in recipe.experiments:
         (*_, methods) = (run.methods for run in asked_runs(recipe, [experiment], RecipeRequest()))
@@ -42,7 +42,7 @@ def test_each_printed_row_is_of_a_method_that_is_run_or_of_predictions_that_are_
             assert method in methods or figure.method in experiment.predictions, figure
 
 
-def test_opensu3ds_recipe_has_every_figure_that_is_printed_in_its_paper() -> None:
+def test_opensu3d_recipe_has_every_figure_of_its_paper() -> None:
     printed = [figure for one in load_recipe("opensu3d").experiments for figure in one.printed()]
     assert [figure for figure in published() if figure.table is not None and figure not in printed] == []
     assert figures_of(table="I") == printed[:9]
@@ -53,13 +53,13 @@ def test_opensu3ds_recipe_has_every_figure_that_is_printed_in_its_paper() -> Non
     [
         (("methods =", "method ="), "experiment 1 method: unknown key; did you mean 'methods'?"),
         (("schema = 1", "schema = 2"), "schema"),
-        (('table = "III"', 'table = "IX"'), "experiment a: published.toml holds no figure of table = IX"),
+        (('table = "III"', 'table = "IX"'), "experiment a: published.toml has no figure with table = IX"),
         (('table = "III"', 'tabel = "III"'), "experiment a: figures have no 'tabel'; did you mean 'table'?"),
-        (('methods = ["opensu3d"]', ""), "names no methods, no vary and no predictions"),
-        (("[[experiment]]", "[experiment"), "is no TOML"),
+        (('methods = ["opensu3d"]', ""), "has no methods, vary or predictions, so there is nothing to do"),
+        (("[[experiment]]", "[experiment"), "is not valid TOML"),
     ],
 )
-def test_a_wrong_recipe_is_one_line(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+def test_invalid_recipe_is_a_one_line_error(tmp_path: Path, change: tuple[str, str], says: str) -> None:
     file = tmp_path / "mine.toml"
     file.write_text(OWN)
     assert load_recipe(str(file)).experiments[0].printed() == figures_of(table="III")

@@ -1,4 +1,4 @@
-"""A rehearsal, whole: rooms in the datasets' layouts, the runs, printed beside measured, the archive and its check."""
+"""A complete rehearsal: rooms in the datasets' layouts, runs, reported and measured values, bundle and verification."""
 
 from __future__ import annotations
 
@@ -29,18 +29,22 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield out
 
 
-def test_every_printed_cell_stands_beside_a_measured_one_with_what_differs(rehearsed: Path) -> None:
+def test_every_printed_cell_has_a_measured_value_and_causes_of_the_difference(rehearsed: Path) -> None:
     cells = json.loads((rehearsed / "compared.json").read_text())["cells"]
     assert len(cells) == 8 + 2
     assert all(cell["measured"] is not None and cell["protocol"].startswith(cell["dataset"]) for cell in cells)
     assert all(cell["difference"] == cell["measured"] - float(cell["reported"]) for cell in cells)
-    for said in ("judges: ", "scenes: 1 room made by the program", "proposals: masks of the profile 'embedded'"):
+    for said in (
+        "judges: ",
+        "scenes: 1 procedurally generated room, not ",
+        "proposals: masks of the profile 'embedded' instead of ",
+    ):
         assert all(any(cause.startswith(said) for cause in cell["causes"]) for cell in cells)
     text = (rehearsed / "tables.md").read_text()
     assert all(f"**{name}**" in text for name in TABLES)
 
 
-def test_the_same_command_takes_the_run_up_and_packs_the_same_bytes(rehearsed: Path) -> None:
+def test_repeated_command_resumes_the_run_and_writes_an_identical_bundle(rehearsed: Path) -> None:
     before = (rehearsed / "bundle.zip").read_bytes()
     metrics = (rehearsed / "runs/replica/metrics.json").stat().st_mtime_ns
     assert main([*WORDS, "--out", str(rehearsed)]) == 0
@@ -48,7 +52,7 @@ def test_the_same_command_takes_the_run_up_and_packs_the_same_bytes(rehearsed: P
     assert (rehearsed / "runs/replica/metrics.json").stat().st_mtime_ns == metrics
 
 
-def test_in_another_folder_the_bundle_is_scored_to_the_same_bits(
+def test_bundle_verifies_to_the_last_bit_in_another_folder(
     rehearsed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shutil.copy(rehearsed / "bundle.zip", tmp_path / "b.zip")
@@ -65,18 +69,18 @@ def raise_a_cell(files: Files) -> None:
     files["compared.json"] = json.dumps(record).encode()
 
 
-# A flipped label is refused in the tests of the registry: in a random network's map it moves no count.
+# Flipped labels are tested with the registry: in a random network's map they change no count.
 @pytest.mark.parametrize(
     ("tamper", "says"),
     [
         (raise_a_cell, "measured is 98.7, the runs give"),
         (
             lambda files: edit_record(files, "runs/replica/run.toml", "scenes = [", 'scenes = ["evil.py:Data/a", '),
-            "names somebody's own 'evil.py:Data/a', which a bundle does not bring",
+            "uses the user-defined 'evil.py:Data/a', which a bundle cannot contain",
         ),
     ],
 )
-def test_a_tampered_bundle_is_refused_with_its_reason_though_all_its_digests_are_right(
+def test_tampered_bundle_with_correct_digests_is_rejected_with_a_reason(
     rehearsed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tamper: Callable[[Files], None], says: str
 ) -> None:
     files, manifest = read_bundle(rehearsed / "bundle.zip")

@@ -1,1 +1,1 @@
-"""What the page of some runs holds: their numbers, and their maps scene after scene, made once and kept."""
+"""The contents of the HTML report of runs: their numbers, and their maps per scene, computed once and cached."""

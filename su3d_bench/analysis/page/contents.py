@@ -1,4 +1,4 @@
-"""All that a page of some runs holds: their numbers, and their scenes, made side by side or taken as they were kept."""
+"""All contents of the HTML report of runs: their numbers and their scenes, computed in parallel or from the cache."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
-MAX_BINS = 160  # points of a line: more than a plot has room for
-DIGITS = 4  # of a time
+MAX_BINS = 160  # points of a line: more than a plot can show
+DIGITS = 4  # significant digits of a time
 
 
 def confusion_cells(confusion: Int64Array) -> list[list[int]]:
-    """Rows (true class, predicted class, points) of what is not 0; a predicted class -1 is none of the classes.
+    """Rows (true class, predicted class, points) of the non-zero cells; a predicted class of -1 means no class.
 
     >>> confusion_cells(np.array([[3, 0, 1], [0, 2, 0]]))
     [[0, 0, 3], [0, -1, 1], [1, 1, 2]]
@@ -52,7 +52,7 @@ def confusion_cells(confusion: Int64Array) -> list[list[int]]:
 
 
 def series_of(times: UpdateTimes) -> dict[str, Any]:
-    """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
+    """A scene's update times as means of ``per`` updates each, in ms, and the map's number of points if known."""
     per = max(1, -(-len(times) // MAX_BINS))
     starts = np.arange(0, len(times), per)
 
@@ -68,7 +68,7 @@ def series_of(times: UpdateTimes) -> dict[str, Any]:
 
 
 def short(value: float) -> float:
-    """``value`` with ``DIGITS`` digits, which is more than a plot or a table shows.
+    """``value`` with ``DIGITS`` significant digits, more than a plot or a table shows.
 
     >>> short(12.34567)
     12.35
@@ -77,7 +77,7 @@ def short(value: float) -> float:
 
 
 def summary_data(summary: MethodSummary) -> dict[str, Any]:
-    """A method's costs; times in ms, null where nothing was measured."""
+    """A method's costs; times in ms, None if nothing was measured."""
     shown = {name: value for name, value in vars(summary).items() if name not in ("run", "frames_per_s")}
     numbers = {name: _number(value) if isinstance(value, float) else value for name, value in shown.items()}
     stages = []
@@ -93,24 +93,24 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else short(value)
 
 
-MAX_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
-# Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
-# are no more to be looked at one by one.
+MAX_PAIRS = 40  # pairs of methods that are compared: all pairs of nine methods, in a few seconds
+# Maximum number of jobs (scene and method) of which each is read. For more, time series and comparisons take minutes to
+# compute, and no one looks at them one by one.
 MAX_JOBS = 500
-MAX_MAPS = 16  # of a page of more jobs: two scenes under eight methods
+MAX_MAPS = 16  # on a page of more jobs: two scenes under eight methods
 LEFT_OUT = (
-    "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
-    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MAX_MAPS}"
+    "details of single jobs are omitted: errors (su3d-bench report attribution), confusions, times (report timing), "
+    f"comparisons (compare) and all maps except those of the first scenes, at most {MAX_MAPS}"
 )
-# Of a record of results: what the page says elsewhere, or not at all.
+# Fields of a result record that the page shows elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")
 NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean")
 
 
 def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Plain values for the page of ``runs``, every text in them on one line and printable.
+    """JSON values for the page of ``runs``, every text in them on one line and printable.
 
-    Of more than ``MAX_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
+    For more than ``MAX_JOBS`` jobs the page only shows the runs' own records, and ``left_out`` names what is omitted.
     """
     reads_all = are_all_read(runs)
     results: list[dict[str, Any]] = []
@@ -141,7 +141,7 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
 
 
 def are_all_read(runs: Sequence[FinishedRun]) -> bool:
-    """Whether the files of each job are read, or there are too many."""
+    """Whether the files of each job are read; False if there are too many."""
     return _n_jobs(runs) <= MAX_JOBS
 
 
@@ -177,7 +177,7 @@ def _about(run: FinishedRun) -> dict[str, Any]:
 
 
 def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
-    """The confusion of every semantic protocol, its scenes added up; none where the rules here are not the run's."""
+    """The confusion of every semantic protocol, summed over scenes; a reason if the installed rules differ."""
     confusions = []
     for name, of_scene in run.scores(method).items():
         rules: ProtocolRules | None = None
@@ -188,7 +188,7 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
         with suppress(ConfigError):
             rules = run.rules(name, to_the_letter=True)
         if rules is None or any(len(c.is_present) != len(rules.classes) for c in counts):
-            confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
+            confusions.append(confusion | {"reason": f"installed rules of {name} are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]
         confusions.append(
@@ -205,7 +205,7 @@ def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
 
 
 def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
-    """The first ``MAX_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
+    """The first ``MAX_PAIRS`` pairs: methods of the same name in two runs, then methods within a run."""
     pairs: list[tuple[Side, Side]] = []
     for first, second in itertools.combinations(runs, 2):
         pairs += [(Side(first, method), Side(second, method)) for method in first.methods if method in second.methods]
@@ -229,9 +229,9 @@ def _n_jobs(runs: Sequence[FinishedRun]) -> int:
 
 
 def scored_maps(runs: Sequence[FinishedRun]) -> list[tuple[int, FinishedRun, str, str]]:
-    """Index of the run, run, scene and method of every map there is, all methods of a scene together.
+    """Index of the run, run, scene and method of every existing map, all methods of a scene together.
 
-    Of more than ``MAX_JOBS`` jobs only the maps of the first scenes, at most ``MAX_MAPS``.
+    For more than ``MAX_JOBS`` jobs only the maps of the first scenes, at most ``MAX_MAPS``.
     """
     maps = (
         (index, run, scene, method)
@@ -257,10 +257,10 @@ QUERIES = (
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What a page shall hold: ``queries`` are texts that instances are compared with; ``max_bytes`` is about its size.
+    """Options of a page: ``queries``: texts that instances are compared with; ``max_bytes``: its approximate size.
 
-    There is a gallery of single errors only where errors are explained at all.
-    ``jobs`` scenes are made side by side, 0: as many as there are cores.
+    The gallery of individual errors requires error attribution.
+    ``jobs``: number of scenes computed in parallel; 0: one per core.
     """
 
     queries: tuple[str, ...] = QUERIES
@@ -273,7 +273,7 @@ class PageOptions:
 
 @dataclass(frozen=True)
 class Contents:
-    """Plain ``numbers``, the ``scenes`` with their maps, none of more than ``max_points``, and their ``galleries``."""
+    """JSON-like ``numbers``, the ``scenes`` with maps of at most ``max_points`` points, and their ``galleries``."""
 
     numbers: Mapping[str, Any]
     scenes: tuple[PageScene, ...]
@@ -287,7 +287,7 @@ class Contents:
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """What is needed of one scene: the maps of some jobs, the errors of some, and where all of it is kept."""
+    """What is needed for one scene: maps of some jobs, errors of some jobs, and the cache entry."""
 
     scene: str
     maps: tuple[Job, ...]
@@ -301,7 +301,7 @@ class SceneRequest:
 
 @dataclass(frozen=True)
 class Batch:
-    """The scenes that one process makes."""
+    """The scenes that one process computes."""
 
     folders: tuple[Path, ...]
     options: PageOptions
@@ -319,8 +319,8 @@ def page_contents(
 ) -> Contents:
     """The contents of the page of the runs in ``folders``.
 
-    ``begin`` is told once how many steps there are, ``report`` of each. Raises a ``StoreError`` where a folder holds
-    no finished run; what cannot be had of one is a reason on the page.
+    ``begin`` is called once with the number of steps, ``report`` for each step. Raises ``StoreError`` if a folder has
+    no finished run; parts that cannot be computed have a reason on the page.
     """
     folders = tuple(dict.fromkeys(folders))
     runs = [read_run(folder) for folder in folders]
@@ -340,14 +340,14 @@ def page_contents(
     for (index, method), one in explained.items():
         job = index, method
         of_scenes = {scene: made[scene].errors[job] for scene in made if job in made[scene].errors}
-        errors.append({**page_cache.errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
+        errors.append({**page_cache.errors_of(one, method, of_scenes), "run": index})  # replaces the name of the run
     shown = tuple(one.page for one in made.values() if one.page is not None)
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
     return Contents(page_numbers(runs, errors), shown, galleries, max_points)
 
 
 def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
-    """What can be explained of each method, or the reason why nothing can."""
+    """The attribution of each method, or the reason why there is none."""
     explained: dict[Job, Explained | str] = {}
     for index, run in enumerate(runs):
         for method in run.methods if is_scored(run) else ():
@@ -361,7 +361,7 @@ def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
 def _wanted(
     runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], options: Sequence[Any]
 ) -> list[SceneRequest]:
-    """What is needed of each scene; those with maps first."""
+    """What is needed for each scene; scenes with maps first."""
     shown: dict[str, list[Job]] = {}
     for index, _, scene, method in maps:
         shown.setdefault(scene, []).append((index, method))
@@ -374,7 +374,7 @@ def _wanted(
     for scene in dict.fromkeys([*shown, *counted_jobs]):
         of_maps, of_errors = shown.get(scene, []), counted_jobs.get(scene, [])
         jobs = dict.fromkeys([*of_maps, *of_errors])
-        # what an error costs depends on the counts of every scene
+        # the cost of an error depends on the counts of every scene
         counts = [page_cache.state_of_counts(runs[index], method) for index, method in of_errors]
         states = [[index, *page_cache.state_of_scene(runs[index], scene, method)] for index, method in jobs]
         place = page_cache.piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *options])
@@ -383,7 +383,7 @@ def _wanted(
 
 
 def _all_made(batch: Batch, report: Report) -> list[SceneContent]:
-    """The scenes of ``batch``, dealt out to processes where there is more than one."""
+    """The scenes of ``batch``, distributed over processes if there are several."""
     n_workers = min(batch.options.jobs or os.cpu_count() or 1, len(batch.scenes))
     dealt = [replace(batch, scenes=batch.scenes[k::n_workers]) for k in range(n_workers)]
     if n_workers > 1:
@@ -395,11 +395,11 @@ def _all_made(batch: Batch, report: Report) -> list[SceneContent]:
 
 def _lost(batch: Batch, cause: str) -> list[SceneContent]:
     scenes = printable(", ".join(asked.scene for asked in batch.scenes), 200)
-    raise DataError(f"{scenes}: {cause}; scenes that were made are kept")
+    raise DataError(f"{scenes}: {cause}; finished scenes are cached")
 
 
 def _make(batch: Batch, report: Report) -> list[SceneContent]:
-    """The scenes of ``batch``, each kept as soon as it is made."""
+    """The scenes of ``batch``, each cached as soon as it is finished."""
     runs = [read_run(folder) for folder in batch.folders]
     spaces = Spaces(batch.options.queries)
     explained = cache(lambda index, method: explained_of(runs[index], method))

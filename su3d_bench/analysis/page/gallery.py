@@ -1,4 +1,4 @@
-"""The gallery of a page: of each scene the errors that cost most, with photos of the worst ones."""
+"""The error gallery of a page: the most costly errors of each scene, with photos of the worst ones."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from su3d_bench.reports.page.maps import frame_cover, jpeg_text
 from su3d_bench.reports.pictures.items import PIXEL_STEP, best_view, draw_outline, fitted, seen_in, window_around
 
 PHOTO = (256, 192)  # width and height
-PREDICTED, TRUTH = (255, 64, 200), (0, 96, 255)  # an area and a line: told apart without colours, too
-SHADE = 0.45  # of the area over the photo
-MIN_ROWS = 48.0  # of a mask, which has a row for every second one of the frame
-MAX_POINTS = 20_000  # of a mask that are looked for in a frame
-PROBES = 16  # points of a mask by which its spacing is told
+PREDICTED, TRUTH = (255, 64, 200), (0, 96, 255)  # an area and an outline: distinguishable without colours, too
+SHADE = 0.45  # opacity of the area over the photo
+MIN_ROWS = 48.0  # of a mask, which has one row for every second row of the frame
+MAX_POINTS = 20_000  # points of a mask that are projected into a frame
+PROBES = 16  # points of a mask from which its spacing is estimated
 JPEG_QUALITY = 60
 
 
 @dataclass(frozen=True)
 class ErrorView:
-    """The points (N, 3) m of each mask that is ``predicted`` and of each object of the ``truth``."""
+    """The points (N, 3) m of each ``predicted`` mask and of each object of the ground ``truth``."""
 
     predicted: tuple[Float32Array, ...]
     truth: tuple[Float32Array, ...]
@@ -40,9 +40,9 @@ class ErrorView:
 
 
 def error_photo(frame: Frame, error: ErrorView) -> UInt8Array | None:
-    """A photo (192, 256, 3): what is predicted as an area, each object of the truth with a line around it.
+    """A photo (192, 256, 3) with predictions as an area and an outline around each ground-truth object.
 
-    None where the frame shows nothing of either. Of several masks each has a thin line of its own.
+    None if the frame shows neither. With several masks, each also has a thin outline.
     """
     areas = [seen_mask(frame, points) for points in error.predicted]
     objects = [seen_mask(frame, points) for points in error.truth]
@@ -63,7 +63,7 @@ def error_photo(frame: Frame, error: ErrorView) -> UInt8Array | None:
 
 
 def seen_mask(frame: Frame, points: Float32Array) -> BoolArray:
-    """Where the frame shows ``points`` (N, 3) m, hidden by nothing: every ``PIXEL_STEP``-th pixel, gaps closed."""
+    """Mask of every ``PIXEL_STEP``-th pixel in which the frame shows ``points`` (N, 3) m unoccluded, gaps closed."""
     import cv2
 
     height, width = frame.depth_m.shape
@@ -77,13 +77,13 @@ def seen_mask(frame: Frame, points: Float32Array) -> BoolArray:
     pixels = _spacing(looked_for) * frame.intrinsics[0, 0] / max(float(np.median(depth_m)), 1e-6) / PIXEL_STEP
     reach = int(np.clip(np.ceil(pixels), 1, width // 16 or 1))
     kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    padded = np.pad(mask, reach)  # at the border the image would end the area
+    padded = np.pad(mask, reach)  # so that the image border does not affect the closing
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[reach:-reach, reach:-reach]
     return closed.astype(bool)
 
 
 def _spacing(points: np.ndarray) -> float:
-    """How far apart neighbouring points are, in metres."""
+    """The distance between neighbouring points, in metres."""
     if len(points) < 2:
         return 0.0
     probes = points[np.linspace(0, len(points) - 1, min(PROBES, len(points))).astype(np.int64)]
@@ -91,24 +91,24 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(np.sqrt(np.partition(squared, 1, axis=1)[:, 1])))
 
 
-MAX_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
-MAX_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
-CANDIDATES = 24  # frames of a scene in which objects are looked for
-MAX_FRAMES = 6  # of a scene from which photos are taken
-PHOTO_WIDTH = 320  # of a frame for photos, where that saves time
-AS_GOOD = 0.7  # of the best view of an object: a frame that several share is taken for it
+MAX_ERRORS = 40  # listed errors of a scene under a method and a protocol
+MAX_PHOTOS = 64  # on a page, distributed over its scenes, each of which has at least one per method
+CANDIDATES = 24  # frames of a scene in which objects are searched for
+MAX_FRAMES = 6  # frames of a scene from which photos are taken
+PHOTO_WIDTH = 320  # of a frame for photos, if reading it smaller saves time
+AS_GOOD = 0.7  # fraction of an object's best view score that is good enough to share a frame with other objects
 MAX_NAMES, MAX_TEXT = 6, 60  # classes that a card names, characters of a name
-ONLY_WORST_NOTE = "only the worst errors of a scene have one"
+ONLY_WORST_NOTE = "only the worst errors of a scene have a photo"
 
 
 @dataclass(frozen=True)
 class Card:
-    """One error. ``gains``: by how much each metric rises when it alone is put right, as fractions, None for no number.
+    """One error. ``gains``: increase of each metric if only this error is corrected, as fractions, None if undefined.
 
-    ``true`` and ``called`` are names of classes, ``ids`` the instances as the method numbers them, ``rows`` where they
-    stand in its map, ``objects`` the truth's instances by their numbers, ``n_points`` and ``n_true`` points of the
-    masks, or wrong ones, and of the true object. ``photo`` is a place in the scene's photos and ``frame`` what it was
-    taken from; ``why`` says why there is none.
+    ``true`` and ``called`` are names of classes, ``ids`` the method's instance ids, ``rows`` their rows in its map,
+    ``objects`` ground-truth instance numbers, ``n_points`` the number of points of the masks, or of wrong points,
+    ``n_true`` that of the true object. ``photo`` is an index into the scene's photos, ``frame`` the frame it was taken
+    from; ``why``: the reason if there is none.
     """
 
     kind: str
@@ -129,9 +129,9 @@ class Card:
 
 @dataclass(frozen=True)
 class Cards:
-    """The ``n`` errors of a scene under a method and a protocol; ``cards`` are the dearest, those that are told.
+    """The ``n`` errors of a scene under a method and a protocol; ``cards`` lists the most costly ones.
 
-    ``truth``: which of the scene's truths numbers the objects.
+    ``truth``: the ground-truth variant whose numbers the objects have.
     """
 
     run: int
@@ -154,12 +154,12 @@ class SceneGallery:
     is_whole: bool
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values for a page."""
+        """JSON values for a page."""
         return {name: value for name, value in asdict(self).items() if name != "is_whole"}
 
 
 def summary_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
-    """What the galleries hold by method and protocol: how many errors of each scene, which classes, kinds and pairs."""
+    """A summary of galleries by method and protocol: number of errors per scene, and their classes, kinds and pairs."""
     summary: dict[tuple[int, str, str], dict[str, Any]] = {}
     for gallery in galleries:
         for one in gallery.of_methods:
@@ -179,7 +179,7 @@ def summary_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
 
 
 def photos_of_each(n_scenes: int, n_methods: int) -> int:
-    """How many photos each of some scenes has on a page of so many methods.
+    """The number of photos of each scene on a page of ``n_scenes`` scenes and ``n_methods`` methods.
 
     >>> photos_of_each(4, 2), photos_of_each(20, 8)
     (16, 8)
@@ -188,16 +188,16 @@ def photos_of_each(n_scenes: int, n_methods: int) -> int:
 
 
 class GalleryOfScene:
-    """Gathers the errors of a scene, method after method, and takes the photos when all are there."""
+    """Collects the errors of a scene, method by method, and then takes the photos."""
 
     def __init__(self, scene: str, max_photos: int) -> None:
         self._scene, self._max_photos = scene, max_photos
         self._cards: list[tuple[Cards, list[ErrorView]]] = []
         self._fed: list[int] = []
-        self.lacks = False  # whether a method's errors, or frames, could not be had
+        self.lacks = False  # whether a method's errors or frames are missing
 
     def add(self, index: int, explained: Explained, evaluated: Mapping[str, EvaluatedScene]) -> None:
-        """The errors of the method of ``explained``, which is one of run ``index``, under each protocol."""
+        """Add the errors of the method of ``explained``, from run ``index``, under each protocol."""
         self._fed += fed_frames(explained.run, self._scene, explained.method)
         ids, method = explained.instance_ids(self._scene), printable(explained.method, 200)
         for protocol, scene in evaluated.items():
@@ -213,7 +213,7 @@ class GalleryOfScene:
             self._cards.append((summary, seen))
 
     def finish(self, dataset: Any, data: SceneData) -> SceneGallery:
-        """The gallery with photos of the worst errors; ``dataset`` is a text where there is none, the reason."""
+        """The gallery with photos of the worst errors; ``dataset`` is the reason as text if there is no dataset."""
         # the first error of every method, then the second of each, and so on
         places = sorted((k, of) for of, (_, seen) in enumerate(self._cards) for k in range(len(seen)))
         places = places[: self._max_photos]
@@ -265,7 +265,7 @@ def _places(points: Points, sets: Sequence[NDArray[np.integer[Any]]]) -> tuple[F
 def _photos(
     things: Sequence[ErrorView], dataset: Any, data: SceneData, fed: Sequence[int]
 ) -> list[tuple[int, str] | str]:
-    """Of each thing the index of the frame that shows it best and its photo, or why there is none."""
+    """For each error the index of the frame that shows it best and its photo, or why there is none."""
     places = sorted(data.in_turn(dataset, fed)[:CANDIDATES])
     looks = np.zeros((len(things), len(places)))
     for column, place in enumerate(places):
@@ -286,4 +286,4 @@ def _photo(
             frame = frames[places[column]]
             if (photo := error_photo(frame, thing)) is not None:
                 return frame.index, jpeg_text(photo, JPEG_QUALITY)
-    return "no frame that was looked at shows it"
+    return "none of the searched frames shows it"

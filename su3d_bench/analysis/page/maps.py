@@ -1,4 +1,4 @@
-"""The maps of some runs for their page: what frames saw, what the truth is, what each map says, scene after scene."""
+"""The maps of runs for their page: per scene, frames, ground truth and the contents of each map."""
 
 from __future__ import annotations
 
@@ -64,22 +64,22 @@ from su3d_bench.reports.pictures.scene import SEEN_POINTS, seen_points
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 
-MAX_POINTS, MIN_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
-BYTES_PER_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
+MAX_POINTS, MIN_POINTS = 60_000, 3_000  # of one map: what a phone can draw, what still shows a room
+BYTES_PER_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and true class, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
 THUMBNAILS = 14  # frames of a scene that are shown
-FRAMES_AT_ONCE = 6  # that are read for the colours of the map before it is looked again
-GREY_SHARE = 0.01  # of the points may stay without a colour when there are frames left
-EVERY = 8  # of the points is asked whether it was seen
+FRAMES_AT_ONCE = 6  # frames read for the map's colours between two checks of coverage
+GREY_SHARE = 0.01  # fraction of points that may stay without a colour while there are frames left
+EVERY = 8  # step of the points that are checked for being seen
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
 MapOfRun = tuple[int, FinishedRun, str, str]
 
 
 @dataclass(frozen=True)
 class PageMap:
-    """A map as the page holds it; ``content`` is empty and ``reason`` says why where it cannot be shown.
+    """A map in the page's format; if it cannot be shown, ``content`` is empty and ``reason`` is set.
 
-    ``truth``: which of the scene's truths stands beside it, None where none does.
+    ``truth``: the ground-truth variant shown with it, None if there is none.
     """
 
     run: int
@@ -90,15 +90,15 @@ class PageMap:
     truth: str | None = None
 
     def listed(self) -> dict[str, Any]:
-        """What the page's list of maps says of it."""
+        """The entry of the page's list of maps."""
         return {name: value for name, value in vars(self).items() if name != "content"}
 
 
 @dataclass(frozen=True)
 class PageScene:
-    """Thumbnails of a scene: pairs of a frame's index and its JPEG in base64; ``remarks``: what is not known of it.
+    """A scene of the page; ``thumbnails``: pairs of frame index and JPEG in base64; ``remarks``: what is missing.
 
-    ``truths`` are as maps are; each map names the one that it stands beside by its place here.
+    ``truths`` have the format of maps; each map refers to the one shown with it by its index here.
     """
 
     scene: str
@@ -109,17 +109,17 @@ class PageScene:
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing is missing, so that it would come out the same another time."""
+        """Whether nothing is missing, so that the result can be cached."""
         return not self.remarks and all(page_map.reason is None for page_map in self.maps)
 
     def listed(self) -> dict[str, Any]:
-        """The scene as the page holds it, its maps aside."""
+        """The scene in the page's format, without its maps."""
         about = {"scene": self.scene, "thumbnails": dict(self.thumbnails)}
         return about | {"remarks": list(self.remarks), "truths": list(self.truths)}
 
 
 def points_of_each(n_maps: int, max_bytes: int) -> int:
-    """How many points a map may have for a page of ``max_bytes``.
+    """The number of points per map for a page of ``max_bytes``.
 
     >>> points_of_each(2, 30_000_000), points_of_each(160, 30_000_000)
     (60000, 18750)
@@ -130,7 +130,7 @@ def points_of_each(n_maps: int, max_bytes: int) -> int:
 
 @dataclass
 class Spaces:
-    """The encoders of runs and the features of the queries under each, made once."""
+    """The encoders of runs and the features of the queries with each, computed once."""
 
     queries: tuple[str, ...]
     _encoders: dict[Path, Encoder] = field(default_factory=dict)
@@ -143,7 +143,7 @@ class Spaces:
         return self._encoders[path]
 
     def naming(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
-        """What names the instances of a map; None where all of them have names."""
+        """The encoder that names the instances of a map; None if all of them have labels."""
         labels = getattr(prediction, "labels", None)
         return None if labels is not None and all(labels) else self.encoder(run)
 
@@ -164,9 +164,9 @@ def page_scene(
     tell: Callable[[str], None] = lambda doing: None,
     evaluated: Mapping[tuple[int, str], Mapping[str, EvaluatedScene]] = MappingProxyType({}),
 ) -> PageScene:
-    """A scene with its ``maps``. What fails of a map is a reason on the page, never a page without it.
+    """A scene with its ``maps``. A map that fails has a reason on the page instead.
 
-    ``tell`` hears of each map before it is made; ``evaluated`` holds what evaluators saw of it already, by protocol.
+    ``tell`` is called before each map is computed; ``evaluated``: existing evaluations of it, by protocol.
     """
     return _Scene(scene, maps, spaces, data, evaluated).page(max_points, tell)
 
@@ -218,7 +218,7 @@ class _Scene:
             return printable(str(error))
 
     def _frame(self, index: int, width: int) -> Frame | None:
-        """Frame ``index`` of the full sequence, read once; None where it is not there. ``width`` pixels are enough."""
+        """Frame ``index`` of the full sequence, read once; None if missing. ``width``: sufficient width in pixels."""
         if index not in self.frame_of:
             frame = None
             if 0 <= index < len(self.reader.sequence):
@@ -227,7 +227,7 @@ class _Scene:
         return self.frame_of[index]
 
     def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
-        """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
+        """The points seen in the shown frames, and in as many more as are needed to see nearly all of ``clouds``."""
         fed = [index for _, run, scene, method in self.maps for index in fed_frames(run, scene, method)]
         places = self.data.in_turn(self.reader.dataset, fed) if len(self.reader.sequence) else []
         unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
@@ -245,13 +245,13 @@ class _Scene:
         return Candidates(points), colours
 
     def _chosen_frames(self, maps: Sequence[Instances]) -> Sequence[int]:
-        """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
+        """The frames to show: as few as possible that show every instance, from those that the maps list."""
         return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
     def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> TruthOverlay | None:
-        """The truth that stands beside a map, and which of it the map misses.
+        """The ground truth shown with a map, and which of its objects the map misses.
 
-        It is that of the first protocol of instances, else that in whose classes the map is shown.
+        It is that of the first usable instance protocol, otherwise that of the protocol whose classes the map shows.
         """
         fitting = (run.rules(name) for name in run.protocols if not not_shown_reason(run, name, prediction))
         judging = next(fitting, None)
@@ -327,7 +327,7 @@ class _Scene:
         return pack_map(cloud, planes, printable_json(about))
 
     def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
-        """The cosine (K, Q) of each instance with each query; None where the map has no features."""
+        """The cosine (K, Q) of each instance with each query; None if the map has no features."""
         features = prediction.features
         if features is None or not len(features) or not self.spaces.queries:
             return None
@@ -336,10 +336,10 @@ class _Scene:
 
 
 def shown_rules(run: FinishedRun) -> ProtocolRules | None:
-    """The rules whose classes the maps of a run are shown in: of points before those of instances."""
+    """The rules whose classes are used to show the maps of a run: point protocols before instance protocols."""
     fitting: list[ProtocolRules] = []
     for name in run.protocols:
-        with suppress(ConfigError):  # those of another version are passed over
+        with suppress(ConfigError):  # rules of another version are skipped
             fitting += [rules for rules in (run.rules(name),) if rules.vocabulary is not None]
     return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
 
@@ -352,7 +352,7 @@ def shown_classes(
     cloud: Cloud,
     spaces: Spaces,
 ) -> Int64Array:
-    """The class of each instance, or of each drawn point of dense features; ``truth``: that of each point of it."""
+    """The class of each instance, or of each drawn point of dense features; ``truth``: the true class of each point."""
     if isinstance(prediction, DenseFeatures):
         prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
     is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
@@ -361,7 +361,7 @@ def shown_classes(
 
 
 def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
-    """Those of ``points`` that none of ``frames`` gives a colour."""
+    """The ``points`` that get no colour from any of ``frames``."""
     seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MAX_INSPECTED)
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 

@@ -1,8 +1,8 @@
-"""Scenes of a page that were made before, kept in the folder of their run under a key of all that they were made from.
+"""Cache of a page's scenes in the folder of their run, under a key of all inputs.
 
-The piece of a scene lies in ``RUN/.cache/page`` as a SHA-256 of its key and its content, a line end and the content.
-One that is damaged, or was made from anything else, counts as absent; a folder that takes no files only means that the
-next page makes its pieces again.
+The entry of a scene is a file in ``RUN/.cache/page``: a SHA-256 of its key and content, a line break and the content.
+An entry that is damaged or has other inputs counts as absent; if the folder is not writable, the next page computes its
+scenes again.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.run_folder import check_no_links
 
 FOLDER = Path(".cache", "page")
-MAX_BYTES = 1 << 28  # of a piece; one of a scene under fifty methods has a tenth of it
-FORMAT = 5  # moves every key: raise it when the form of a piece changes
+MAX_BYTES = 1 << 28  # of an entry; that of a scene under fifty methods has a tenth of it
+FORMAT = 5  # changes every key: increase it when the format of an entry changes
 
 Job = tuple[int, str]  # index of the run, method
 RulesOf = Callable[[str], ProtocolRules]
-AS_IS, ALL, LABELLED = "as it is", "all corrected", "true labels"  # beside the kinds of errors, each corrected alone
+AS_IS, ALL, LABELLED = "as it is", "all corrected", "true labels"  # besides the kinds of errors, each corrected alone
 _FORM: TypeAdapter[tuple[list[tuple[int, str, bytes]], PageScene | None, SceneGallery | None]] = TypeAdapter(
     tuple[list[tuple[int, str, bytes]], PageScene | None, SceneGallery | None],
     config=ConfigDict(ser_json_bytes="base64", val_json_bytes="base64"),
@@ -50,7 +50,7 @@ _FORM: TypeAdapter[tuple[list[tuple[int, str, bytes]], PageScene | None, SceneGa
 
 @dataclass
 class SceneContent:
-    """What was made of one scene; the errors of a job are a text where they cannot be had."""
+    """The results of one scene; the errors of a job are a text if they could not be computed."""
 
     scene: str
     errors: dict[Job, MendedJob | str] = field(default_factory=dict)
@@ -59,14 +59,14 @@ class SceneContent:
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing is missing, so that it would come out the same another time."""
+        """Whether nothing is missing, so that the result can be cached."""
         has_errors = not any(isinstance(one, str) for one in self.errors.values())
         return has_errors and all(part is None or part.is_whole for part in (self.page, self.gallery))
 
 
 @dataclass(frozen=True)
 class CacheFile:
-    """The place of the piece of ``scene`` below the folder of a run, ``top``, and the key of what it is made from."""
+    """The cache entry of ``scene`` below the run folder ``top``, and the key of its inputs."""
 
     top: Path
     scene: str
@@ -80,7 +80,7 @@ class CacheFile:
         return digests.digest_bytes(self.key.encode() + content).encode()
 
     def save(self, made: SceneContent, runs: Sequence[FinishedRun]) -> None:
-        """Keep a whole scene, where the folder takes files."""
+        """Cache a complete scene, if the folder is writable."""
         errors = [
             (index, method, packed(corrected, runs[index].rules))
             for (index, method), corrected in made.errors.items()
@@ -93,8 +93,8 @@ class CacheFile:
                 stream.write(self._signed(content) + b"\n" + content)
 
     def load(self, runs: Sequence[FinishedRun]) -> SceneContent | None:
-        """The scene that was kept; None where there is no whole piece of this key."""
-        # a run folder comes from anywhere: what another program left under the right key counts as absent, too
+        """The cached scene; None if there is no valid entry with this key."""
+        # run folders are untrusted: content that another program left under the right key counts as absent, too
         with suppress(OSError, Su3dError, ValueError, KeyError, TypeError, RecursionError):
             check_no_links(self.top, self._place)
             if self._place.stat().st_size <= MAX_BYTES:
@@ -107,14 +107,14 @@ class CacheFile:
 
 
 def piece(run: FinishedRun, scene: str, made_from: Any) -> CacheFile:
-    """The piece of ``scene`` in the folder of ``run``; ``made_from`` is a JSON-like value of all that moves it."""
+    """The cache entry of ``scene`` in the folder of ``run``; ``made_from``: a JSON-like value of all inputs."""
     versions = digests.package_versions(digests.NUMERIC_PACKAGES)
     code = [FORMAT, digests.code_digest(), digests.package_digest("analysis", "reports"), versions]
     return CacheFile(run.folder.path, scene, digests.digest_json([scene, made_from, code]))
 
 
 def state_of_scene(run: FinishedRun, scene: str, method: str) -> list[Any]:
-    """What a page is made from of a scene under a method: records, rules, state of the data, digests of files."""
+    """The inputs of a page for a scene and method: records, rules, state of the data, digests of files."""
     job = run.folder.job(scene, method)
     files = (job.prediction, features_beside(job.prediction), job.counts, job.updates, job.done)
     return [
@@ -127,7 +127,7 @@ def state_of_scene(run: FinishedRun, scene: str, method: str) -> list[Any]:
 
 
 def state_of_counts(run: FinishedRun, method: str) -> list[str | None]:
-    """The digests of what a method counted in every scene."""
+    """The digests of a method's counts in every scene."""
     return [_digest(run.folder.job(scene, method).counts) for scene in run.scenes]
 
 
@@ -146,7 +146,7 @@ def _fault(ask: Callable[[], Any]) -> str | None:
 
 
 def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, MendedJob | str]) -> dict[str, Any]:
-    """The errors of a method as a page holds them; a text in the place of what cannot be had is their reason."""
+    """The errors of a method in the page's form; a text in place of errors becomes their ``reason``."""
     reasons = [explained] if isinstance(explained, str) else [one for one in of_scenes.values() if isinstance(one, str)]
     try:
         if not isinstance(explained, str) and not reasons:
@@ -158,7 +158,7 @@ def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, M
 
 
 def packed(corrected: MendedJob, rules_of: RulesOf) -> bytes:
-    """The counts of a scene under a method as the bytes of an npz file; ``rules_of`` finds a protocol by its name."""
+    """The counts of a scene under a method as the bytes of an npz file; ``rules_of`` returns a protocol's rules."""
     scores: dict[str, SceneScore] = {}
     nowhere = np.zeros(len(COVERAGE_RADII_M), np.int64)
     for protocol, of_scene in corrected.items():
@@ -172,7 +172,7 @@ def packed(corrected: MendedJob, rules_of: RulesOf) -> bytes:
 
 
 def unpacked(content: bytes, rules_of: RulesOf) -> MendedJob:
-    """What ``packed`` packed."""
+    """The inverse of ``packed``."""
     corrected: dict[str, CorrectedScene] = {}
     scores: dict[str, dict[str, SceneScore]] = {}
     for name, score in unpack_scores(content).items():

@@ -1,4 +1,4 @@
-"""What a page says of the instances of a map: names, scores, sizes, views, and when each of them was first seen."""
+"""Data of a map's instances for a page: names, scores, sizes, views, and when each was first seen."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import read_updates
 
 Had = TypeVar("Had")
-MAX_VIEWS = 12  # frames of an instance that are named
+MAX_VIEWS = 12  # listed frames of an instance
 MAX_CAPTION = 240  # characters
-MAX_STEPS = 500  # of a growth: more than a slider has pixels
+MAX_STEPS = 500  # of a timeline: more than a slider has pixels
 
 
 def fed_frames(run: FinishedRun, scene: str, method: str) -> list[int]:
-    """The frames that a method was given, as its table of updates says; none where it says nothing that can be read."""
+    """The frames that a method was given, from its table of updates; empty if that cannot be read."""
     return [int(index) for index in _updates(run, scene, method).get("frame", ())]
 
 
@@ -54,14 +54,14 @@ def _updates(run: FinishedRun, scene: str, method: str) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class Growth:
-    """The updates of a map: ``steps`` as the page has them, some of ``frames`` where there are very many."""
+    """The updates of a map: ``steps`` in the page's form, a subset of ``frames`` if there are very many."""
 
     frames: Sequence[int]
     places: Int64Array
     steps: Mapping[str, Any]
 
     def step_of(self, views: Sequence[int]) -> int | None:
-        """The step by which an instance with these views was first seen; None where no view is of a known frame."""
+        """The step by which an instance with these views was first seen; None if no view is from a known frame."""
         known = [self._place_of[frame] for frame in views if frame in self._place_of]
         return int(np.searchsorted(self.places, min(known))) if known else None
 
@@ -71,7 +71,7 @@ class Growth:
 
 
 def growth_of(run: FinishedRun, scene: str, method: str) -> Growth | None:
-    """How the map of a method grew; None where its table of updates names no frames.
+    """The growth of a method's map; None if its table of updates has fewer than two frames.
 
     >>> growth = Growth([0, 40, 80], np.array([0, 2]), {})
     >>> growth.step_of([0]), growth.step_of([80, 40]), growth.step_of([7])
@@ -89,7 +89,7 @@ def growth_of(run: FinishedRun, scene: str, method: str) -> Growth | None:
 
 
 def frames_of(instances: Instances, k: int) -> list[int]:
-    """The frames in which an instance was seen, each once; none where the method keeps no views."""
+    """The frames in which an instance was seen, each once; empty if the method stores no views."""
     if not len(instances.views):
         return []
     rows = instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]]
@@ -99,7 +99,7 @@ def frames_of(instances: Instances, k: int) -> list[int]:
 def instance_data(
     prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
 ) -> dict[str, Any]:
-    """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
+    """An instance: points, class, similarities in thousandths, and for ``Instances`` also name, score and views."""
     data: dict[str, Any] = {}
     if classes is not None:
         data["class"] = int(classes[k])
@@ -135,18 +135,18 @@ def _box(points: Any, frame: Frame) -> list[float] | None:
     return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
 
 
-MAX_INSPECTED = 48  # frames of a scene
-SKETCH_WIDTH = 160  # of a frame to look at, where that saves time
+MAX_INSPECTED = 48  # frames read per scene
+SKETCH_WIDTH = 160  # of a frame for these searches, if reading it smaller saves time
 
 
 class SceneData:
-    """The data of one scene, of each dataset that is asked for: a run keeps its datasets."""
+    """The data of one scene, cached per dataset object: a run keeps its datasets."""
 
     def __init__(self, scene: str) -> None:
         self._name = scene.partition("/")[2]
         self._scene = scene
         self._truths: dict[tuple[int, str], GroundTruth] = {}
-        self._candidates: dict[int, Candidates] = {}  # of truths that are kept above
+        self._candidates: dict[int, Candidates] = {}  # of ground truths that are cached above
         self._sequences: dict[int, Sequence[Frame]] = {}
         self._frames: dict[tuple[int, int, int], Frame] = {}
 
@@ -157,13 +157,13 @@ class SceneData:
         return self._truths[key]
 
     def candidates(self, truth: GroundTruth) -> Candidates:
-        """The points of a truth, to be asked for what is nearest."""
+        """The points of a ground truth, for nearest-neighbour queries."""
         if id(truth) not in self._candidates:
             self._candidates[id(truth)] = Candidates(truth.points)
         return self._candidates[id(truth)]
 
     def truth_of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
-        """The truth in the data of ``run``, which must be those that it was made from."""
+        """The ground truth in the data of ``run``, which must be unchanged since the run."""
         return self.truth(run.dataset(self._scene), variant)
 
     def sequence(self, dataset: Any) -> Sequence[Frame]:
@@ -173,7 +173,7 @@ class SceneData:
         return self._sequences[id(dataset)]
 
     def frame(self, dataset: Any, index: int, width: int) -> Frame:
-        """Frame ``index`` of the sequence, of ``width`` pixels where a smaller one is had sooner, else as it is."""
+        """Frame ``index`` of the sequence, ``width`` pixels wide if the dataset reads smaller ones faster."""
         has_sketches = isinstance(dataset, HasPreviews)
         key = id(dataset), index, width if has_sketches else 0
         if key not in self._frames:
@@ -182,21 +182,21 @@ class SceneData:
         return self._frames[key]
 
     def in_turn(self, dataset: Any, fed: Iterable[int]) -> list[int]:
-        """The frames to look at, far ones first: of those that methods were ``fed``, of all where none is known."""
+        """The frames to read, distant ones first: from those that methods were ``fed``, or from all if unknown."""
         n_frames = len(self.sequence(dataset))
         known = sorted({index for index in fed if 0 <= index < n_frames}) or range(n_frames)
         return [known[place] for place in spread(len(known), MAX_INSPECTED)]
 
 
 class SceneReader:
-    """The data of one scene of a run, as far as they are here; ``remarks``: what could not be had, each once."""
+    """The available data of one scene of a run; ``remarks``: what is not available, each once."""
 
     def __init__(self, run: FinishedRun, scene: str, data: SceneData) -> None:
         self._run, self._scene, self.data = run, scene, data
         self.remarks: list[str] = []
 
     def had(self, what: str, make: Callable[[], Had]) -> Had | None:
-        """What ``make`` gives; None and a remark where it cannot be had."""
+        """The result of ``make``; None and a remark if it fails."""
         try:
             return make()
         except Su3dError as error:
@@ -207,12 +207,12 @@ class SceneReader:
 
     @cached_property
     def dataset(self) -> Any:
-        """The dataset where its data are those of the run, else None."""
-        return self.had("no frames, colours and truth", lambda: self._run.dataset(self._scene))
+        """The dataset; None if its data are not those of the run."""
+        return self.had("no frames, colours and ground truth", lambda: self._run.dataset(self._scene))
 
     @cached_property
     def sequence(self) -> Sequence[Frame]:
-        """Every frame, in order; none where they cannot be had."""
+        """Every frame, in order; empty if they are not available."""
         if self.dataset is None:
             return ()
         return self.had("no frames", lambda: self.data.sequence(self.dataset)) or ()
@@ -223,14 +223,14 @@ class SceneReader:
         return self.had("no ground truth", lambda: self.data.truth(self.dataset, rules.ground_truth))
 
 
-Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
+Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m seen in frames and their colours (n, 3)
 
 
 @dataclass(frozen=True)
 class TruthOverlay:
-    """The truth beside a map: which ``variant`` of it, and what the page's map says ``about`` it.
+    """The ground truth shown with a map: its ``variant``, and the page's data ``about`` it.
 
-    ``same``: by the place of each instance that is an object of this truth, which object.
+    ``same``: index of each instance that is an object of this ground truth -> the object.
     """
 
     variant: str
@@ -239,13 +239,13 @@ class TruthOverlay:
 
 
 class ShownTruths:
-    """The truths of a scene that maps stand beside, each once, in the order in which they were asked for."""
+    """The ground truths of a scene shown with maps, each once, in the order of first use."""
 
     def __init__(self) -> None:
         self._truths: list[GroundTruth] = []
 
     def place(self, truth: GroundTruth) -> int:
-        """Where ``truth`` stands among those that are drawn."""
+        """The index of ``truth`` among those that are shown."""
         for place, known in enumerate(self._truths):
             if known is truth:
                 return place
@@ -253,22 +253,22 @@ class ShownTruths:
         return len(self._truths) - 1
 
     def packed(self, max_points: int, seen: Seen | None) -> list[str]:
-        """The truths in the form of maps, in base64."""
+        """The ground truths in the format of maps, in base64."""
         return [_packed(truth, max_points, seen) for truth in self._truths]
 
 
 def not_shown_reason(run: FinishedRun, protocol: str, prediction: Prediction) -> str | None:
-    """Why ``protocol`` does not say what a map misses; None where it does."""
-    with suppress(ConfigError):  # another version of it
+    """Why ``protocol`` cannot show what a map misses; None if it can."""
+    with suppress(ConfigError):  # another version of the protocol
         rules = run.rules(protocol)
         return kind_incompatibility(rules, prediction) if rules.kind == "instance" else "counts no objects"
-    return "its rules here are others"
+    return "its installed rules differ"
 
 
 def judged_objects(truth: GroundTruth, overlaps: Overlaps) -> dict[str, list[int]]:
-    """The places of objects among ``instances_of``: those ``counted``, and of these those ``missed``.
+    """Indices of objects into ``instances_of``: the ``counted`` ones, and the ``missed`` ones among them.
 
-    They are missed as the kind of error of that name has it.
+    Missed as defined by the kind of error of that name.
     """
     place_of = {int(number): place for place, number in enumerate(instances_of(truth))}
     counted = [place_of.get(int(truth.instance[members[0]])) for members in overlaps.members]
@@ -280,9 +280,9 @@ def judged_objects(truth: GroundTruth, overlaps: Overlaps) -> dict[str, list[int
 
 
 def same_objects(truth: GroundTruth, masks: Masks) -> dict[int, dict[str, Any]]:
-    """Of each of ``masks`` on the points of the truth that is one of its objects, above IoU 0.5: its place and name.
+    """For each of ``masks`` on the ground-truth points that matches an object with IoU > 0.5: its index and name.
 
-    The place is that among ``instances_of``; parts and lumps are no object of the truth.
+    The index is that in ``instances_of``; fragments and merged masks match no object.
     """
     numbers = instances_of(truth)
     column = np.where(truth.instance > 0, np.searchsorted(numbers, truth.instance), len(numbers))
@@ -290,20 +290,20 @@ def same_objects(truth: GroundTruth, masks: Masks) -> dict[int, dict[str, Any]]:
     union = masks.sizes[:, None] + np.bincount(column, minlength=len(numbers) + 1)[:-1] - shared
     row_of_class = truth_owner(truth)
     found: dict[int, dict[str, Any]] = {}
-    for row, place in np.argwhere(2 * shared > union).tolist():  # objects share no point: of a mask at most one
+    for row, place in np.argwhere(2 * shared > union).tolist():  # objects are disjoint: at most one per mask
         called = _most(row_of_class[truth.instance == numbers[place]])
         found[row] = {"place": place, "name": printable(truth.labels.names[called], 80) if called >= 0 else ""}
     return found
 
 
 def _most(classes: Int32Array) -> int:
-    """The row of the labels that most points have, -1 where none has any."""
+    """The row of the most frequent label, -1 if no point has one."""
     known = classes[classes >= 0]
     return int(np.bincount(known).argmax()) if len(known) else -1
 
 
 def instances_of(truth: GroundTruth) -> Int64Array:
-    """The numbers of the instances of a truth, ascending."""
+    """The numbers of the instances of a ground truth, ascending."""
     return np.unique(truth.instance[truth.instance > 0]).astype(np.int64)
 
 

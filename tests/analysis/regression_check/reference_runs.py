@@ -1,4 +1,4 @@
-"""A small run for the gate, with times of one's own and whatever is to be wrong in it."""
+"""A small run for the regression check, with chosen times and planted faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COSTS = {"calibration_ms": 5.0, "start_ms": 10.0, "close_ms": 0.0}
 
 
 def timed(run: Path, method_ms: Sequence[float] = (40.0,) * 6, finish_ms: float = 60.0, **costs: float) -> Path:
-    """Put such times in place of the measured ones, so that the tests do not depend on the machine's mood."""
+    """Replace the measured times by these, so that the tests do not depend on the machine."""
     for updates in run.rglob("collector/updates.csv"):
         rows = list(csv.DictReader(updates.open()))
         for row, ms in zip(rows, method_ms, strict=True):
@@ -39,7 +39,7 @@ def of_costs(done: Any) -> Any:
 
 
 def sealed(run: Path) -> Path:
-    """The run with seals that fit its files, as one has that was written so."""
+    """The run with completion records that match its files, as if it had been written so."""
     for done in run.rglob("done.json"):
 
         def mark_complete(value: Any, folder: Path = done.parent) -> None:
@@ -51,7 +51,7 @@ def sealed(run: Path) -> Path:
 
 
 def counted_otherwise(run: Path, n_points: int = 5) -> Path:
-    """The run with ``n_points`` of the chairs called sofas, in counts and metrics alike."""
+    """The run with ``n_points`` chair points called sofa, in both counts and metrics."""
     scores: dict[str, dict[str, Any]] = {}
     for file in run.rglob("collector/counts.npz"):
         of_scene = unpack_scores(file.read_bytes())

@@ -1,4 +1,4 @@
-"""The gate: planted regressions are caught, unchanged repeats pass."""
+"""Regression check: planted regressions are caught, unchanged repeats pass."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def reference(gated: Path) -> Reference:
 
 @pytest.fixture(scope="module")
 def reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The reference as the command writes it."""
+    """The reference as written by the command."""
     path = tmp_path_factory.mktemp("gate") / "reference.json"
     assert main(["check", "--build-from", str(gated), "--out", str(path)]) == 0
     return path
@@ -50,12 +50,12 @@ def reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture
 def run(gated: Path, tmp_path: Path) -> Path:
-    """A copy that may be spoiled."""
+    """A copy that may be damaged."""
     return Path(shutil.copytree(gated, tmp_path / "run"))
 
 
 def counts_alone(run: Path) -> None:
-    """Other counts than those from which the metrics were formed."""
+    """Change the counts, but not the metrics computed from them."""
     text = (run / "metrics.json").read_text()
     counted_otherwise(run)
     (run / "metrics.json").write_text(text)
@@ -76,14 +76,17 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "other data": (in_record(lambda r: r["data_digests"].update({"painted/a": "x"})), "painted/a: data digest was"),
     "another option of the dataset": (other_option, "dataset.painted.n_frames was 6, now 5"),
-    "an update slower by half": (slower(1.5), "cost of the updates after 3: costs 1.50 times"),
-    "an update that nobody timed": (without_calibration, "collector / cost: the run did not measure it"),
-    "a map that is gone": (
+    "an update slower by half": (
+        slower(1.5),
+        "cost of updates after the first 3: takes 1.50 times as long as the reference; at most 1.3 times",
+    ),
+    "an untimed update": (without_calibration, "collector / cost: the run did not measure it"),
+    "a missing map": (
         lambda run: (run / "scenes/painted.a/collector/prediction.npz").unlink(),
         "collector / scene painted/a: prediction.npz is missing",
     ),
     "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
-    "a scene more": (
+    "an additional scene": (
         in_record(lambda r: r["scenes"].append("painted/c")),
         "run / scene painted/c: the reference does not have this scene",
     ),
@@ -100,7 +103,7 @@ def test_a_planted_regression_is_caught(
     assert said in capsys.readouterr().out
 
 
-def test_what_no_run_can_have_written_is_refused(
+def test_duplicate_protocols_or_results_are_an_error(
     run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record = (run / "run.json").read_text()
@@ -118,23 +121,23 @@ def test_what_no_run_can_have_written_is_refused(
 def test_unchanged_repeats_pass(run: Path, reference_file: Path) -> None:
     generator = np.random.default_rng(0)
     for _ in range(10):
-        # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
+        # Unchanged repeats only differ in time: usually by 5 %, sometimes by 10 %.
         noise = np.exp(generator.normal(0, 0.05, 8))
         timed(run, (40 * noise[:6]).tolist(), 60 * noise[6], start_ms=10 * noise[7])
         assert main(["check", str(run), "--against", str(reference_file)]) == 0
 
 
-def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(
+def test_busy_machine_allows_up_to_twice_the_cost_with_a_remark(
     run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     timed(run, [100.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(run), "--against", str(reference_file)]) == 0
-    assert "the calibrating work took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
+    assert "the calibration workload took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
     timed(run, [106.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(run), "--against", str(reference_file)]) == 1
 
 
-def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
+def test_command_exits_with_1_and_writes_reports_for_pull_requests(
     run: Path, reference_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["check", str(run), "--against", str(reference_file)]) == 0
@@ -154,7 +157,7 @@ def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
 HOSTILE = "<script>|`$(x)`\n::error::\x00" + "é" * 400
 
 
-def test_a_hostile_name_does_no_harm() -> None:
+def test_hostile_names_are_escaped_in_reports() -> None:
     verdict = Verdict("run", (Finding("changed", HOSTILE, HOSTILE),), 1, (HOSTILE,))
     assert "<script>" not in markdown(verdict).replace("\\<script\\>", "")
     ElementTree.fromstring(junit_xml(verdict))
@@ -162,7 +165,7 @@ def test_a_hostile_name_does_no_harm() -> None:
     assert len(lines) == 2 and all(line.startswith("::") and " title=su3d-bench::" in line for line in lines)
 
 
-def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_not_compared(
+def test_missing_scenes_are_listed_first_and_values_over_all_scenes_are_not_compared(
     run: Path, reference: Reference
 ) -> None:
     (gone,) = list(reference.data_digests)[:1]
@@ -182,11 +185,11 @@ def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_not_co
     edit(run / "metrics.json", without)
     lines = plain_lines(check(read_run(run), reference))
     assert lines[1] == f"FAIL {gone}: the run does not have this scene"
-    assert len(lines) < 12 and not any(" / mAcc:" in line for line in lines), "what is formed over other scenes"
+    assert len(lines) < 12 and not any(" / mAcc:" in line for line in lines), "values over other scenes"
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[" * 100_000])
-def test_a_damaged_reference_is_one_line(
+def test_damaged_reference_is_a_one_line_error(
     text: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bad.json").write_text(text)
@@ -195,28 +198,28 @@ def test_a_damaged_reference_is_one_line(
     assert "check --build-from" in error and error.count("\n") == 1
 
 
-def test_what_is_better_is_said_and_passes(run: Path, gated: Path) -> None:
+def test_improvements_are_reported_and_pass(run: Path, gated: Path) -> None:
     verdict = check(read_run(gated), learn([read_run(counted_otherwise(run))]))
     assert verdict.is_passed
     assert {one.kind for one in verdict.findings} == {"better"}
     assert f"{len(verdict.findings)} better" in plain_lines(verdict)[0]
 
 
-def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, gated: Path, tmp_path: Path) -> None:
+def test_tolerance_is_twice_the_spread_of_the_learned_runs(run: Path, gated: Path, tmp_path: Path) -> None:
     first, second = (read_run(path) for path in (gated, counted_otherwise(run, 4)))
     values = [results_in(one).metrics["mAcc"] for one in (first, second)]
     taught = learn([first, second])
     expected = taught.results[0].metrics["mAcc"]
     assert expected.value == pytest.approx(np.mean(values))
     assert expected.tolerance == pytest.approx(2 * (values[0] - values[1]))
-    for n_points, is_passed in ((9, True), (11, False)):  # 2 less than the mean of the two, and 8 more at most
+    for n_points, is_passed in ((9, True), (11, False)):  # the mean of the two runs is 2, the tolerance 8
         shutil.copytree(gated, tmp_path / str(n_points))
         verdict = check(read_run(counted_otherwise(tmp_path / str(n_points), n_points)), taught)
         assert verdict.is_passed == is_passed, verdict.findings
 
 
 def findings_of(run: Path, name: str, measured: float, value: Value, across: float | None = None) -> list[Finding]:
-    """What is said where a run measured this of a headline value of which no scene and class is known."""
+    """The findings for this measured headline value, without values of scenes and classes."""
     numbers = replace(results_in(read_run(run)), metrics={name: measured}, per_scene={}, per_class={})
     first = learn([read_run(run)]).results[0]
     expected = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
@@ -224,7 +227,7 @@ def findings_of(run: Path, name: str, measured: float, value: Value, across: flo
 
 
 @pytest.mark.parametrize("value", [0.25, 0.75])
-def test_a_value_without_a_better_direction_may_move_in_neither(value: float, gated: Path) -> None:
+def test_value_without_a_direction_fails_both_ways(value: float, gated: Path) -> None:
     assert "over-merged" not in HIGHER_IS_BETTER
     found = findings_of(gated, "over-merged", value, Value(value=0.5))
     assert [(one.kind, one.text, one.is_failure) for one in found] == [
@@ -234,12 +237,12 @@ def test_a_value_without_a_better_direction_may_move_in_neither(value: float, ga
     assert [one.kind for one in found] == ["better" if value > 0.5 else "regression"]
 
 
-def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
+def test_headline_values_have_a_tolerance_on_another_processor(run: Path, reference: Reference) -> None:
     slower(3.0)(counted_otherwise(run, 4))
     assert not check(read_run(run), reference).is_passed
     edit(run / "run.json", lambda r: r.update(processor="other"))
     verdict = check(read_run(run), reference)
     assert verdict.is_passed, verdict.findings
-    assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
+    assert "the processor has the same name" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
     counted_otherwise(run, 40)
     assert not check(read_run(run), reference).is_passed

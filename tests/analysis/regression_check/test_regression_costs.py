@@ -1,4 +1,4 @@
-"""What the gate sees of a method's cost, wherever the method puts it; what a reference without it says."""
+"""Regression check of costs: all time of a method is measured, wherever it is spent."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ DELAY_S = 0.15
 
 
 class Delayed(Collector):
-    """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same.
+    """A collector that takes ``DELAY_S`` longer at the place given in the environment, with the same name and numbers.
 
-    What it says of its own costs is not true.
+    The costs that it reports itself are wrong.
     """
 
     name = "delayed"
@@ -93,21 +93,21 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def reference(made: Path) -> Reference:
-    """What is learnt from the run but for its costs, which are those of a machine that nothing else keeps busy."""
+    """The reference learned from the run, but with costs of an idle machine."""
     learnt = learn([read_run(made)], cost_limit=10.0)
     costs = {method: Cost(start=0.1, updates=0.1, finish=0.1, whole=0.3) for method in learnt.costs}
     return learnt.model_copy(update={"costs": costs})
 
 
 PLACES = {
-    "outside": "the updates after 3",
-    "start": "start and the first 3 updates",
+    "outside": "updates after the first 3",
+    "start": "start and first 3 updates",
     "finish": "finish",
 }
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_a_cost_is_seen_wherever_the_method_puts_it(where: str, tmp_path: Path, reference: Reference) -> None:
+def test_cost_is_found_wherever_the_method_spends_it(where: str, tmp_path: Path, reference: Reference) -> None:
     run = read_run(made_in(tmp_path / "run", delay=where))
     found = [one for one in check(run, reference).findings if one.kind == "cost"]
     assert f"delayed / cost of {PLACES[where]}" in {one.where for one in found}
@@ -117,7 +117,7 @@ def test_a_cost_is_seen_wherever_the_method_puts_it(where: str, tmp_path: Path, 
     assert whole_ms > 1e3 * DELAY_S
 
 
-def test_perception_that_a_method_asks_for_is_not_its_own_unless_another_thread_asks() -> None:
+def test_requested_perception_time_is_excluded_except_in_other_threads() -> None:
     ready = threading.Event()
     clock = MethodClock()
     with clock.running("update"):
@@ -144,7 +144,7 @@ COST = Cost(start=10, updates=100, finish=40, whole=150)
 
 
 def dearer(limit: float = 1.5, **parts: float) -> list[str]:
-    """Which parts of a cost fail."""
+    """The parts of a cost that fail."""
 
     class Run:
         methods = ("m",)
@@ -156,18 +156,18 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
     return [one.where.partition("cost of ")[2] for one in found]
 
 
-def test_every_part_is_held_against_the_limit_by_itself() -> None:
+def test_every_part_is_compared_with_the_limit_separately() -> None:
     assert dearer() == []
-    assert dearer(updates=150, whole=200) == []  # just the limit
-    assert dearer(updates=151, whole=201) == ["the updates after 3"]
+    assert dearer(updates=150, whole=200) == []  # exactly the limit
+    assert dearer(updates=151, whole=201) == ["updates after the first 3"]
     assert dearer(finish=61, whole=171) == ["finish"]
-    assert dearer(whole=226) == ["all together"]
-    assert dearer(updates=1000, whole=1050) == ["the updates after 3", "all together"]
+    assert dearer(whole=226) == ["all stages"]
+    assert dearer(updates=1000, whole=1050) == ["updates after the first 3", "all stages"]
 
 
-def test_a_part_that_hardly_shows_in_the_whole_is_none() -> None:
+def test_growth_of_a_part_below_5_percent_of_the_total_is_ignored() -> None:
     least = MIN_SHARE * COST.whole
     assert dearer(start=10 + least, whole=157.5) == []
-    assert dearer(start=10 + least + 0.1, whole=157.6) == ["start and the first 3 updates"]
+    assert dearer(start=10 + least + 0.1, whole=157.6) == ["start and first 3 updates"]
     assert dearer(1.001, whole=151) == []
-    assert dearer(1.001, whole=151.1) == ["all together"]
+    assert dearer(1.001, whole=151.1) == ["all stages"]
