@@ -168,9 +168,7 @@ class SAM3D:
                 raise DataError(
                     f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set ensemble=false"
                 ) from error
-            logger.warning(
-                "%s: sam3d's groups stay on its own points, because there is no mesh (%s)", self._scene, error
-            )
+            logger.warning("%s: sam3d's groups stay on its own points; no mesh (%s)", self._scene, error)
             return None
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:

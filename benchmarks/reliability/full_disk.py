@@ -125,9 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.json is not None:
         command = f"python benchmarks full_disk --disks {given.disks}"
         notes = ["The others ended before the disk was full or read-only."]
-        write_measured(
-            given.json, "Full and read-only disks", command, ["kind", "runs", "affected", "faults"], rows, notes
-        )
+        write_measured(given.json, "Disk errors", command, ["kind", "runs", "affected", "faults"], rows, notes)
     return 1 if any(row[-1] != "0" for row in rows) else 0
 
 

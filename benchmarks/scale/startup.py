@@ -67,12 +67,7 @@ def main() -> None:
             "for the package, 400 ms for lists.",
         )
         write_measured(
-            arguments.json,
-            "Response time of the command line",
-            command,
-            ("command", "wall ms", "processor ms"),
-            rows,
-            notes,
+            arguments.json, "Command-line latency", command, ("command", "wall ms", "processor ms"), rows, notes
         )
 
 

@@ -244,9 +244,7 @@ def guess_up(poses: Float64Array, frames: Sequence[Frame]) -> WorldUp:
         best, *others = np.sort(level)[::-1]
         if best < MIN_LEVEL or any(best < MORE_LEVEL * other for other in others):
             return WorldUp(None, False, "the cameras were tilted and no axis has clearly more level surfaces")
-        return WorldUp(
-            AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of the surfaces are perpendicular to it"
-        )
+        return WorldUp(AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of the surfaces are normal to it")
     return WorldUp(AXES[candidates[0]], False, "by camera orientation")
 
 

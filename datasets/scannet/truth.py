@@ -281,9 +281,7 @@ def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64A
     file = read_ply(path, where)
     labelled = meshes.vertex_positions(file, where)
     if len(labelled) != len(vertices):
-        raise DataError(
-            f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; they are of different meshes"
-        )
+        raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; the meshes differ")
     is_elsewhere = np.abs(labelled.astype(np.float64) - vertices).max(axis=1) > SAME_PLACE_M
     if is_elsewhere.any():
         row = int(np.argmax(is_elsewhere))

@@ -10,9 +10,7 @@ from typing import TypeVar
 Value = TypeVar("Value")
 
 
-def wait_until(
-    is_so: Callable[[], Value], what: str = "the condition did not become true", seconds: float = 60.0
-) -> Value:
+def wait_until(is_so: Callable[[], Value], what: str = "it stayed false", seconds: float = 60.0) -> Value:
     """The first true value of ``is_so``; fails with ``what`` after ``seconds``."""
     end = time.monotonic() + seconds
     while not (value := is_so()):
