@@ -354,6 +354,6 @@ def load_run(path: Place) -> Run:
     ('rooms-semantic', 'rooms-instance')
     >>> su3d.load_run("runs/none")
     Traceback (most recent call last):
-    su3d_bench.core.errors.StoreError: runs/none: holds no run.json; name the folder of a run, such as runs/my-run
+    su3d_bench.core.errors.StoreError: runs/none: contains no run.json; name the folder of a run, such as runs/my-run
     """
     return Run(path)

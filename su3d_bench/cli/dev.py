@@ -85,7 +85,7 @@ def _ago(written: float) -> str:
 
 
 def call_cache_clear(arguments: argparse.Namespace) -> None:
-    """Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.
+    """Remove cached files of some kinds or all; only cache files are removed, and links are not followed.
 
     su3d-bench dev cache clear all --dry-run
     su3d-bench dev cache clear perception --older-than 30

@@ -20,9 +20,9 @@ from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, counted, printable, shown
 
 PROGRAM = "su3d-bench"
-PATIENCE_S = 180.0  # for one import, from a cold disk
+PATIENCE_S = 180.0  # per import, from a cold disk
 MIN_FREE_BYTES = 10**9  # bytes: a room, its cache, its run
-MIN_MEMORY = 4 * 10**9  # bytes: a room under opensu3d takes one; docs/running/performance.md
+MIN_MEMORY = 4 * 10**9  # bytes: a room under opensu3d needs 10**9; docs/running/performance.md
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Imported in a child process: a compiled library with a missing dependency can crash it.
 LOADED = {
@@ -214,7 +214,7 @@ def _datasets() -> Iterator[Check]:
             n_scenes = len(dataset_class(data_root(), dataset_class.Options()).scenes())
         except Su3dError:  # datasets list shows the reason
             n_scenes = 0
-        hint = "" if n_scenes else "to see where it is looked for: su3d-bench datasets list"
+        hint = "" if n_scenes else "to see where it is searched: su3d-bench datasets list"
         yield Check(f"dataset {name}", "note" if hint else "ok", counted(n_scenes, "scene"), hint)
 
 

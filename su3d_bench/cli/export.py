@@ -130,7 +130,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 
 
 def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
-    """The only method of a run, the added ground-truth ceiling aside."""
+    """The only method of a run, ignoring the added ground-truth ceiling."""
     from su3d_bench.core.registry import CEILING_METHOD
 
     run = _run_of(next(iter(maps.values()))[0])

@@ -28,7 +28,7 @@ GROUPS = {
     "maintain": ("dev",),
 }
 MODULE_OF = {"ablate": "run", "check": "compare"}
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
   su3d-bench run --scenes rooms/living0 --methods opensu3d oracle
@@ -89,7 +89,7 @@ def complete(parser: Parser) -> None:
 
 
 def _check_not_run_files(arguments: argparse.Namespace) -> None:
-    """Refuse an ``--out`` that is a file of a finished run."""
+    """Reject an ``--out`` that is a file of a finished run."""
     out = getattr(arguments, "out", None)
     if isinstance(out, Path) and os.path.isfile(out):
         from su3d_bench.store.run_folder import check_not_run_file

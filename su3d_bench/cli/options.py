@@ -142,7 +142,7 @@ def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
 
 
 def count(text: str) -> int:
-    """Option type: an integer of 1 or more."""
+    """Option type: an integer of at least 1."""
     try:
         value = int(text)
     except ValueError:
@@ -153,7 +153,7 @@ def count(text: str) -> int:
 
 
 def index(text: str) -> int:
-    """Option type: an integer of 0 or more."""
+    """Option type: an integer of at least 0."""
     if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")

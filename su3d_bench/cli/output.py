@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Prose, Table
     from su3d_bench.runs.executors import Event, Report
 
-MAX_UNSEEN = 8  # words that are listed
+MAX_UNSEEN = 8  # listed words
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
 MAX_BAR_LABEL = 80  # characters of the label
 
@@ -65,13 +65,13 @@ def _defined(value: Any) -> Any:
 
 
 def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:
-    """Print ``value`` with ``--json``, else ``lines``."""
+    """Print ``value`` with ``--json``, otherwise ``lines``."""
     if not answer_json(arguments, value):
         answer(*lines)
 
 
 def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
-    """Print ``value`` with ``--json``, else the tables."""
+    """Print ``value`` with ``--json``, otherwise the tables."""
     if not answer_json(arguments, value):
         answer_document(formatted(parts, arguments))
 
@@ -146,7 +146,7 @@ def remark(*lines: str, quiet: bool = False) -> None:
 
 
 def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
-    """Warn about words of ``text`` that the encoder was not trained on, if it knows."""
+    """Warn about words of ``text`` that the encoder was not trained on, if it can tell."""
     from su3d_bench.core.interfaces import HasTrainingVocabulary
 
     if isinstance(encoder, HasTrainingVocabulary) and (words := encoder.unseen_words(text)):

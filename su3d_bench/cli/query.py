@@ -179,7 +179,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
         unnamed[noun] = None
         return nearest_by(encoder)(noun, names)
 
-    encoder = EmbeddedEncoder()  # its files are read only if a name is looked up
+    encoder = EmbeddedEncoder()  # its files are only read if a name is looked up
     reply = Solver(scene, eye, nearest_name).answer(arguments.question)
     asked = arguments.question.split()
     for noun in unnamed or asked[: len(asked) == 1]:  # a single word is a noun, not a question

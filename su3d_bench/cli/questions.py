@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SOURCES = ("auto", "generated")
 FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
-FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question, as --json shows them
+FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question with --json
 N_SHOWN = 20
 MAX_CHARACTERS = 80
 

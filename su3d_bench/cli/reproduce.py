@@ -70,7 +70,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise early if the GPU does not exist; machines of a cluster have their own."""
+    """Raise early if the GPU does not exist, except on clusters, whose machines have their own."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
     from su3d_bench.runs.executors import ELSEWHERE
 

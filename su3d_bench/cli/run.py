@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def _add_run_options(parser: Parser) -> None:
-    """Add the options of both commands; values come from the flag, else ``--config``, else the default."""
+    """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'rooms/*')")
     parser.option("--protocols PROTOCOL...", "protocols to score (default: those of the dataset)")
@@ -97,7 +97,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 
 def execute(plan: Plan, arguments: argparse.Namespace) -> int:
-    """Run the plan, or with ``--dry-run`` print what it takes."""
+    """Run the plan, or with ``--dry-run`` print its estimated cost."""
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.store.caches import cache_warning
 

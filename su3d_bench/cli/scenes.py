@@ -121,7 +121,7 @@ def _frames_text(inspection: Inspection) -> str:
 
 
 def up_text(up: WorldUp) -> str:
-    """The up axis, how it is known, and whether the scene is rotated."""
+    """The up axis, its source, and whether the scene is rotated."""
     if up.axis is None:
         return f"assumed z; {up.reason}"
     if up.is_turned or up.axis == "z":

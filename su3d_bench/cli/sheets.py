@@ -148,7 +148,7 @@ def _looks_line(scores: Scores) -> str:
 
 SUBJECTS = ("similarity", "labels", "reasoning")
 MAX_ROWS = 40  # of one figure
-FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
+FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.py
 
 
 def _add_pictures(verbs: Verbs) -> None:

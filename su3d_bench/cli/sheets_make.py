@@ -1,4 +1,4 @@
-"""``su3d-bench sheets make``: a run or scenes -> sheets for people, as page, workbook and table; the key apart."""
+"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page, workbook and table, and their key."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
 
-QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
+QUESTIONS: Final = "questions"  # the kind that needs no method and therefore no run
 KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
 # An annotator rates about a hundred items without a break: questions per kind and scene, instances per scene, or
 # questions per template and scene.
@@ -134,7 +134,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
-    """The run without the methods whose maps have nothing to rate in sheets of a kind, with a warning.
+    """The run without the methods whose maps have nothing to rate in a kind of sheet, with a warning.
 
     Retrieval needs features of instances or points; the other kinds need instances.
     """
@@ -158,7 +158,7 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
 def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Key]:
-    """The questions to rate and their origin; kinds take the place of methods."""
+    """The questions to rate and their origin, with kinds instead of methods."""
     from su3d_bench.human_eval.drafts import question_drafts
     from su3d_bench.human_eval.items import Key
     from su3d_bench.human_eval.scores import ANY_KIND
@@ -291,7 +291,7 @@ def _write(
     drawn: Mapping[SheetKind, Sequence[bytes]],
     arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
-    """Write one set per kind, several into a folder each; returns what was written."""
+    """Write one set per kind, several sets into separate folders; returns what was written."""
     from su3d_bench.human_eval.sets import make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")

@@ -1,1 +1,1 @@
-"""Annotation sheets: what people judge, how their answers come back, and what they add up to."""
+"""Annotation sheets: items for annotators, reading their answers, and scores."""

@@ -22,11 +22,11 @@ from su3d_bench.human_eval.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
 from su3d_bench.numerics.statistics import DIFFERENCE, MIN_ITEMS, jackknife_interval, leave_one_out
 from su3d_bench.questions.query_files import csv_rows
 
-MAX_BYTES = 256 << 20  # of one file: a workbook holds its pictures
-MAX_TEXT_BYTES = 32 << 20  # of a CSV file: some hundred thousand answers
+MAX_BYTES = 256 << 20  # per file: a workbook contains its pictures
+MAX_TEXT_BYTES = 32 << 20  # per CSV file: some hundred thousand answers
 ADVICE = "pass the files returned by the annotators, tables saved as 'CSV UTF-8'"
-MAX_CHARACTERS = 1000  # of one cell that is read
-HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
+MAX_CHARACTERS = 1000  # per cell
+HEADER_WITHIN = 30  # first rows of a worksheet among which the header is searched, after possible instructions
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ def _text(value: str | None, name: str, at: str) -> str:
     """Text of a cell without the leading mark that prevents evaluation as a formula."""
     text = meant((value or "").strip())
     if len(text) > MAX_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
-        raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
+        raise DataError(f"{at}: '{name}' is too long or has control characters: '{printable(text, 40)}'")
     return text
 
 
-LABELS = ("n", "n'")  # as the paper calls them: the name of the best view, and that out of the names of several
-SHOWN_ITEMS = 5  # of many that are missing
+LABELS = ("n", "n'")  # as in the paper: the name of the best view, and the one chosen from the names of several views
+SHOWN_ITEMS = 5  # maximum number of missing items in a message
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def check_key(sheet: Sheet, key: Key) -> None:
     }:
         raise DataError(
             f"key: belongs to the set '{printable(key.sheet_id, 60)}', not '{printable(sheet.id, 60)}'; pass the "
-            f"key created with the sheet"
+            "key created with the sheet"
         )
 
 

@@ -69,7 +69,7 @@ def audit_table(verdicts: Sequence[Verdict]) -> Table:
     n_open = len(verdicts) - len(judged)
     return Table(
         "audit",
-        "Questions judged by people: plainly right, and with the arguable ones.",
+        "Questions judged by annotators: right ones, and right or arguable ones.",
         "kind",
         ("judged", "right", "right or arguable", "wrong"),
         tuple(TableRow(kind, _cells(of_kind[kind])) for kind in kinds),

@@ -35,7 +35,7 @@ from su3d_bench.questions.model import REASONING, Answer, Question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.solver import AskMap, LanguageSolver, given_answer
 
-UNKNOWN = "something unknown"  # what stands in place of an id that the map does not have
+UNKNOWN = "something unknown"  # replaces an id that the map does not have
 
 
 def without_ids(text: str, scene: SceneMap, spoken_of: Sequence[int]) -> tuple[str, dict[int, str]]:
@@ -61,7 +61,7 @@ def without_ids(text: str, scene: SceneMap, spoken_of: Sequence[int]) -> tuple[s
 
 
 def _called(number: str) -> str:
-    """The forms of an id: ``#12`` as the built-in solver writes it, ``ID 12`` or ``(ID: 12)`` as language models do."""
+    """A pattern for an id: ``#12`` as in the built-in solver, ``ID 12`` or ``(ID: 12)`` as in language models."""
     return rf"\(\s*IDs?\b\s*[:=#]?\s*{number}\s*\)|(?:#|\bIDs?\b\s*[:=#]?\s*){number}(?!\d)"
 
 
@@ -88,7 +88,7 @@ def _letter(k: int) -> str:
 MAX_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"
 NO_ANSWER = "(no answer)"
-HINT = re.compile(r"; did you mean '[^']*'\?")  # for who can ask again
+HINT = re.compile(r"; did you mean '[^']*'\?")  # only useful to users who can ask again
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def questions_of(
     per_kind: int | None,
     left_out: Collection[str] = (),
 ) -> list[Question]:
-    """The questions of four kinds for a scene: those ``given``, else questions generated from its ground truth.
+    """The questions of four kinds for a scene: those ``given``, otherwise generated from its ground truth.
 
     Questions whose ids are ``left_out`` are replaced by others.
     """
@@ -342,7 +342,7 @@ def reasoning_drafts(
 ) -> list[Draft]:
     """The answers about each map; maps with the same answer share one draft.
 
-    Uses the ``given`` questions of kind ``reasoning``, else ``per_kind`` generated from the ground truth for each
+    Uses the ``given`` questions of kind ``reasoning``, otherwise ``per_kind`` generated from the ground truth for each
     template; without those whose ids are ``left_out``.
     """
 
@@ -454,7 +454,7 @@ def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Co
         draft = Draft(
             kind="questions",
             scene=scene,
-            methods=(kind, ANY_KIND),  # no method answers: what is counted together is a kind
+            methods=(kind, ANY_KIND),  # no method answers: results are grouped by kind
             instance_ids=(answers[0] if len(answers) == 1 else -1,) * 2,
             text="\n".join(printable(line, MAX_TEXT) for line in (asked, f"Answer: {told}")),
             asks=tuple(ask.name for ask in ASKS["questions"]),

@@ -32,12 +32,12 @@ from su3d_bench.reports.pictures.scene import evenly, seen_points
 from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
-SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
-ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
-# A map's points may lie 5 cm from what the frames saw, and 5 cm apart. What that reach takes of the neighbours is given
-# back, but for the width of a drawn point, which noise needs.
+SEEN_POINTS = 1_500_000  # of all frames together, before thinning: floors are seen at a low angle
+ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that the judged objects are highlighted
+# A map's points may be 5 cm from the surfaces in the frames, and 5 cm apart. Points of neighbours within that reach are
+# removed again, except within the width of a drawn point, as a tolerance for noise.
 REACH_M, BACK_M = items.CAP_M, 0.035
-PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chosen
+PALETTE_FRAMES = 8  # frames from which the colours of all pictures of a scene are chosen
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
     return full
 
 
-ROOM_PHOTOS = 6  # of the room, for answers that name nothing
+ROOM_PHOTOS = 6  # photos of the room, for answers that name no object
 
 
 PictureSource = RunSource | TruthSource
@@ -328,7 +328,7 @@ def _lost(unit: SceneDrafts, how: str) -> NoReturn:
 
 
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
-SMALLER = 4  # times, of the views in which the corner is chosen
+SMALLER = 4  # downscaling factor of the views used to choose the corner
 UNSEEN = 225
 Labels = Sequence[str]
 
@@ -375,7 +375,7 @@ class Figures:
                 refined = self._source.refined(scene, method)
                 both = [own, own if refined is None else np.where(refined.is_kept, refined.names, "").tolist()]
                 palette = class_colours(list(dict.fromkeys(name for names in both for name in names if name)))
-                palette[""] = (UNSEEN, UNSEEN, UNSEEN)  # without a name, or left out under label n'
+                palette[""] = (UNSEEN, UNSEEN, UNSEEN)  # without a name, or excluded under label n'
                 for names in both:
                     colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
                     cells.append(Cell(shown.paint(view, colours), _name_tags(shown, view, names, colours)))
@@ -406,7 +406,7 @@ class Figures:
         return [drawn_map(self._source.instances(scene, method)) for method in self._source.methods]
 
     def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
-        """One camera for all ``maps``, chosen in the first: from above, or the corner that shows most of ``wanted``."""
+        """One camera for all ``maps``, chosen for the first: from above, or the corner showing most of ``wanted``."""
         first = maps[0]
         place = 0
         if self._view == "corner":

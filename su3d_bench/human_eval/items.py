@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
-PICTURES = "pictures"  # folder of the pictures, beside sheet.json
+PICTURES = "pictures"  # folder of the pictures, next to sheet.json
 MAX_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
 SheetKind = Literal["retrieval", "annotation", "reasoning", "questions"]
-# Columns of a file of answers; others may follow and are for the reader alone.
+# Columns of an answers file; others may follow and are only for readers.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
 ARGUABLE = "arguable"
-VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: what nobody can tell from pictures is at best arguable
-# The names that metrics/score_questions.py has for the merging of a mask.
+VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: one that cannot be decided from pictures is at best arguable
+# The names in metrics/questions for the merging of a mask.
 MERGES = ("well-merged", "under-merged", "over-merged", CANNOT_TELL)
 _DIGITS = 12
 
@@ -78,7 +78,7 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {name: kind.asks for name, kind in S
 
 @dataclass(frozen=True)
 class SheetItem(_Strict):
-    """One thing to judge: ``text`` is the query, the labels, or question and answer; ``asks`` names what is asked.
+    """One item to judge: ``text`` is the query, the labels, or question and answer; ``asks`` names its questions.
 
     ``pictures`` are file names below ``PICTURES``, ``picture_digests`` their SHA-256; ``check`` is a digest of all.
     """
@@ -123,11 +123,11 @@ class Sheet(_Strict):
 class KeyItem(_Strict):
     """The source of an item: instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
 
-    ``methods``: all whose answer this is, a variant such as ``opensu3d@scheme4`` a name; ``instance_ids`` its id in the
-    map of each of them (-1 where an answer names several or none). No method answers in sheets of questions: the kind
-    of question and ``all`` stand there instead. ``question_id`` and ``question_kind`` are those of
-    the question that was asked ('' in annotation sheets). ``represents``: what an ask judges where that is hidden:
-    ``{"label 1": ("n", "n'")}``. ``automatic``: ask -> the choice that the ground truth makes, where it is known.
+    ``methods``: all methods with this answer, including variants such as ``opensu3d@scheme4``; ``instance_ids`` its id
+    in the map of each of them (-1 if an answer names several or none). In sheets of questions no method answers, so
+    that ``methods`` are the kind of question and ``all``. ``question_id`` and ``question_kind`` are those of the
+    question ('' in annotation sheets). ``represents``: the hidden meaning of an ask: ``{"label 1": ("n", "n'")}``.
+    ``automatic``: ask -> the correct choice according to the ground truth, if known.
     """
 
     id: str
@@ -144,9 +144,9 @@ class KeyItem(_Strict):
 class JudgedRun:
     """Configuration of the judged run.
 
-    ``answered_by``: who gave the answers of reasoning sheets, or labels n'; ``profile``, ``encoder``, ``limit`` and
-    ``changed`` (method -> settings other than its own) are those of the run; ``remarks``: what must stand beside its
-    numbers.
+    ``answered_by``: the source of the answers of reasoning sheets, or of labels n'; ``profile``, ``encoder``, ``limit``
+    and ``changed`` (method -> settings that are not defaults) are those of the run; ``remarks``: notes to be shown with
+    its numbers.
     """
 
     answered_by: str = ""
@@ -163,7 +163,7 @@ class JudgedRun:
 
 @dataclass(frozen=True)
 class Key(JudgedRun, _Strict):
-    """The key of the maintainer: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
+    """The key, kept by the maintainer: ``sheet_id`` identifies its sheet, ``run`` is the run folder, ``run_digest`` its
     code."""
 
     sheet_id: str
@@ -232,13 +232,13 @@ def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> R
 
 GUIDE = "how to judge"
 _ALONE = (
-    "Two seconds are usually enough; the first impression is what counts.",
-    "Judge alone, and do not talk about single items before all are done: how far people agree is itself a result.",
+    "Two seconds are usually enough; your first impression counts.",
+    "Judge on your own, and do not discuss items before all are done: agreement between annotators is also a result.",
 )
 
 
 def guide_of(sheet: Sheet) -> tuple[str, ...]:
     """The instructions at the start of a sheet."""
     is_open = any(CANNOT_TELL in ask.choices for ask in sheet.asks)
-    unsure = (f"'{CANNOT_TELL}' is for what the picture does not show; it is counted apart, and no fault of yours.",)
+    unsure = (f"'{CANNOT_TELL}' is for what the picture does not show; it is counted separately, not as an error.",)
     return (*SHEET_KINDS[sheet.kind].guide, *(unsure if is_open else ()), *_ALONE)

@@ -44,25 +44,25 @@ def whole_verdicts(judgements: Iterable[Judgement]) -> Iterator[Judgement]:
 
 Judge = Literal["people", "automatic"]
 Reason = Literal["annotators disagree", "against the truth", "not right"]
-STEPS = (1, 2, 6, 12, 60)  # of which shares of up to 1, 2, 3, 4, 6 judges, and their differences, are whole numbers
-MAX_STEPS = 50_000  # a distribution of 100,001 sums, some seconds for as many items
+STEPS = (1, 2, 6, 12, 60)  # denominators for shares of up to 1, 2, 3, 4, 6 judges, and their differences
+MAX_STEPS = 50_000  # a distribution of 100,001 sums takes a few seconds for as many items
 ANY_KIND = "all"
 LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
-# As the protocols that let the ground truth judge call the same numbers.
+# The same names as in the protocols that compute these numbers from ground truth.
 METRICS = (
     *(*ALL_KINDS, ANY_KIND, *LABEL_METRICS, *MERGES[:3], *(f"{name} {LABELS[1]}" for name in MERGES[:3])),
     *("sense", "wording", "answer", "objects", WHOLE, ARGUABLE),
 )
-_PLACE = ["method", "dataset", "metric"]  # of a cell
+_PLACE = ["method", "dataset", "metric"]  # identifies a cell
 
 
 @dataclass(frozen=True)
 class ScoreCell:
-    """One number: the mean over ``n_items`` items of the share of an item's judgements that speak for it.
+    """One number: the mean over ``n_items`` items of the share of an item's judgements that support the metric.
 
-    "Cannot tell" is left out and counted. ``value`` is None where nothing remains, and so is its ``interval``, which is
-    over items. ``per_scene``: the same mean of each scene. ``judge``: ``automatic`` is the ground truth's answer to the
-    very same items.
+    "Cannot tell" is excluded and counted separately. ``value`` and its ``interval`` over items are None if no judgement
+    remains. ``per_scene``: the same mean for each scene. ``judge``: ``automatic`` is the ground truth's judgement of
+    the same items.
     """
 
     judge: Judge
@@ -79,10 +79,10 @@ class ScoreCell:
 
 @dataclass(frozen=True)
 class PairTest:
-    """``right`` less ``left`` over the ``n_items`` questions or instances that both have, as people judged them.
+    """``right`` minus ``left`` over the ``n_items`` questions or instances that both have, as judged by annotators.
 
-    ``p``: two-sided sign-flip test over the ``n_differ`` that differ, McNemar's exact test where each is judged once;
-    1 where none differs. ``smallest_p`` is the least that so many can give.
+    ``p``: two-sided sign-flip test over the ``n_differ`` that differ, McNemar's exact test if each is judged once; 1 if
+    none differs. ``smallest_p`` is the smallest possible p for that many.
     """
 
     left: str
@@ -108,9 +108,9 @@ class AskAgreement:
 
 @dataclass(frozen=True)
 class Confusion:
-    """People's judgements (rows, in the order of ``choices``) by what the ground truth says (columns).
+    """Annotators' judgements (rows, in the order of ``choices``) by those of the ground truth (columns).
 
-    ``n_equal`` of ``n`` judgements other than "cannot tell" are the truth's; ``kappa`` is Cohen's of the two.
+    ``n_equal`` of ``n`` judgements other than "cannot tell" agree with it; ``kappa`` is Cohen's of the two.
     """
 
     ask: str
@@ -123,9 +123,9 @@ class Confusion:
 
 @dataclass(frozen=True)
 class ReviewItem:
-    """An item on which annotators differ, or most of them from the truth, or a question that none of them calls right.
+    """An item on which annotators disagree or contradict the ground truth, or a question that none of them calls right.
 
-    ``automatic`` is '' where nobody knows.
+    ``automatic`` is '' if unknown.
     """
 
     item_id: str
@@ -141,7 +141,7 @@ class ReviewItem:
 
 @dataclass(frozen=True)
 class Scores(items.JudgedRun):
-    """All that is known of a set; ``annotators``: name -> number of judgements, ``silent`` those without any."""
+    """All results of a set; ``annotators``: name -> number of judgements, ``silent`` those without any."""
 
     sheet_id: str
     kind: str
@@ -160,7 +160,7 @@ class Scores(items.JudgedRun):
 
 
 def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
-    """The scores of judgements that ``check_answers`` found without fault; without any, what the truth says of all."""
+    """The scores of judgements validated by ``check_answers``; without any, the ground truth's judgements of all."""
     keys = {item.id: item for item in key.items}
     counted = [*judgements, *(whole_verdicts(judgements) if sheet.kind == "questions" else ())]
     given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in counted]
@@ -197,7 +197,7 @@ _Given = tuple[KeyItem, str, str]  # an item, one of its asks, the answer
 
 
 def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
-    """What is asked -> item and ask -> annotator -> answer."""
+    """Kind of ask -> item and ask -> annotator -> answer."""
     ratings: dict[str, dict[str, dict[str, str]]] = {}
     for (key, ask, answer), judgement in zip(given, judgements, strict=True):
         ratings.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[judgement.annotator] = answer
@@ -205,14 +205,14 @@ def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[s
 
 
 def _asked(key: KeyItem, ask: str) -> str:
-    """The name of what is asked: labels 1 and 2 change places from item to item and ask the same."""
+    """The kind of an ask: labels 1 and 2 are in random order, so that both are of the kind "label"."""
     return "label" if ask in key.represents else ask
 
 
 def _shares(given: Iterable[_Given]) -> pandas.DataFrame:
-    """A row a method, metric and ask of an item, in the order of the sheet: how many answers, and how many are clear.
+    """One row per method, metric and ask of an item, in the order of the sheet: numbers of answers and of clear ones.
 
-    ``share`` of the clear ones speaks for the metric, NaN where none is; ``unit`` is what methods are compared over.
+    ``share`` of the clear ones supports the metric, NaN if there is none; methods are compared over ``unit``.
     """
     import pandas
 
@@ -232,11 +232,11 @@ def _shares(given: Iterable[_Given]) -> pandas.DataFrame:
 
 
 def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
-    """The metrics that an ask of an item speaks to, and the choice that speaks for each."""
+    """The metrics of an ask of an item, and the choice that supports each."""
     if ask == "retrieval":
         return [(key.question_kind, RIGHT), (ANY_KIND, RIGHT)]
     if ask == "merging":
-        # what labels n' leave out has no label n', and does not count in the merging under them
+        # instances excluded by labels n' have no label n', and do not count in the merging under them
         is_kept = any(LABELS[1] in named for named in key.represents.values())
         ends = ("", f" {LABELS[1]}") if is_kept else ("",)
         return [(f"{name}{end}", name) for end in ends for name in MERGES[:3]]
@@ -275,8 +275,8 @@ def _cell(judge: Judge, place: tuple[str, str, str], group: pandas.DataFrame) ->
 
 
 def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest]:
-    """Each pair of methods under each metric over the questions that were asked of both; of labels, n' against n of
-    each method over its instances, for other methods have other instances; of questions none."""
+    """Each pair of methods under each metric over the questions asked for both; for labels, n' compared with n of each
+    method over its instances, because instances differ between methods; none for questions."""
     if sheet.kind == "questions":
         return
     if sheet.kind == "annotation":
@@ -320,11 +320,11 @@ def _test(
 
 
 def paired_p(changes: Float64Array) -> tuple[float, float, bool]:
-    """The two-sided p of the sign-flip test of ``changes``, the least that so many can give, and whether it is exact.
+    """The two-sided p of the sign-flip test of ``changes``, the smallest possible one, and whether it is exact.
 
-    What does not change no sign can move. Shares of a few judges are multiples of one small step, so that the sums of
-    all patterns of signs can be counted, however many there are; where each item is judged once, this is McNemar's
-    exact test. Beyond ``MAX_STEPS`` it is ``sign_flip_test``.
+    Zero changes are ignored. Shares of a few judges are multiples of one small step, so that the sums over all sign
+    patterns can be counted; if each item is judged once, this is McNemar's exact test. Beyond ``MAX_STEPS`` it is
+    ``sign_flip_test``.
 
     >>> paired_p(np.array([1.0, 1.0, 1.0, 0.0]))
     (0.25, 0.25, True)
@@ -342,13 +342,13 @@ def paired_p(changes: Float64Array) -> tuple[float, float, bool]:
 
 
 def _sign_flip_of_steps(steps: Int64Array) -> float:
-    """How likely a sum of ``steps`` with random signs is as far from 0 as theirs, from the distribution of the sum."""
+    """The probability that a sum of ``steps`` with random signs is at least as far from 0, from its distribution."""
     sizes = np.abs(steps)
     far = int(sizes.sum())
     shares = np.zeros(2 * far + 1)
     shares[far] = 1.0
     for size in sizes:
-        # the ends are 0 until the last step, so that nothing comes round
+        # the ends are 0 until the last step, so that nothing wraps around
         shares = (np.roll(shares, size) + np.roll(shares, -size)) / 2.0
     at_least = abs(int(steps.sum()))
     return min(1.0, float(shares[np.abs(np.arange(-far, far + 1)) >= at_least].sum()))
@@ -412,7 +412,7 @@ def write_scores(folder: Path, scores: Scores) -> Path:
 
 
 def read_scores(path: Path) -> Scores:
-    """The scores in a file or its folder; ``DataError`` if ``sheets score`` did not write it."""
+    """The scores in a file or its folder; ``DataError`` if it was not written by ``sheets score``."""
     return items.read_record(path / FILE if path.is_dir() else path, Scores, "sheets score")
 
 
@@ -441,7 +441,7 @@ def _entry(look: ReviewItem) -> Entry:
 
 
 def disputed_csv(key: Key, looks: Iterable[ReviewItem]) -> str:
-    """A line for each question of ``looks``, as ``--exclude`` reads it, with why it stands there."""
+    """One line per question of ``looks``, in the format for ``--exclude``, with the reason."""
     of_item = {item.id: item for item in key.items}
     why: dict[str, list[str]] = defaultdict(list)
     texts: dict[str, str] = {}

@@ -24,7 +24,7 @@ from su3d_bench.human_eval.drafts import Draft
 from su3d_bench.human_eval.items import PICTURES, AnnotatorShare, Key, KeyItem, Sheet
 from su3d_bench.reports.sheet.page import page_html
 
-# The columns of an answers file stand among these; what nobody needs to see is hidden.
+# These include the columns of an answers file; those that annotators need not see are hidden.
 COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")
 HIDDEN = ("question", "sheet_id", "annotator", "check")
 LETTERS = dict(zip(COLUMNS, "ABCDEFGHI", strict=True))
@@ -33,8 +33,8 @@ HEADER_ROW = 3
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of every file in a workbook
 PICTURE_WIDTH = 600  # pixels as shown; the file has more
 POINTS_PER_PIXEL = 0.75
-MAX_ROW_POINTS = 400.0  # a spreadsheet's rows end at 409
-FONT = "Calibri"  # that of a plain cell; without a name a bold one gets another
+MAX_ROW_POINTS = 400.0  # the maximum row height of spreadsheets is 409
+FONT = "Calibri"  # the font of a plain cell; without a name a bold cell gets a different one
 HEAD_FILL, OPEN_FILL = "FF1857B8", "FFFFF4CC"
 
 
@@ -86,7 +86,7 @@ def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mappin
 def text_cell(page: Any, row: int, column: int, text: str) -> Any:
     """Write ``text`` into a cell as text, never as a formula, even after editing."""
     cell = page.cell(row, column)
-    # Line breaks stay; whatever else cannot be printed is shown as its escape.
+    # Line breaks are kept; other non-printable characters are escaped.
     cell.value = "\n".join(printable(line, 2000) for line in text.split("\n")) or None
     if cell.value is not None:
         cell.data_type = "s"
@@ -103,7 +103,7 @@ def _choice_list(choices: tuple[str, ...]) -> Any:
 
 
 def _put_picture(page: Any, first: int, last: int, content: bytes) -> None:
-    """Anchor a picture at its first row, and make its rows high enough for it."""
+    """Anchor a picture at its first row, and set the heights of its rows accordingly."""
     from openpyxl.drawing.image import Image
 
     picture = Image(io.BytesIO(content))
@@ -118,7 +118,7 @@ def _put_picture(page: Any, first: int, last: int, content: bytes) -> None:
 
 
 def _write_head(page: Any, title: str, last: int) -> None:
-    """Title, progress and the names of the columns, which stay in sight."""
+    """Title, progress and column names, which stay visible."""
     from openpyxl.styles import Alignment, Font, PatternFill
 
     text_cell(page, 1, 2, title).font = Font(name=FONT, bold=True, size=15)
@@ -139,7 +139,7 @@ def _answer_cells(last: int) -> str:
 
 
 def _dress(page: Any, last: int) -> None:
-    """Widths, hidden columns, a colour for what is open, and a lock on all but the answers."""
+    """Widths, hidden columns, a colour for unanswered cells, and a lock on all cells except the answers."""
     from openpyxl.formatting.rule import FormulaRule
     from openpyxl.styles import PatternFill
 
@@ -149,12 +149,12 @@ def _dress(page: Any, last: int) -> None:
     fill = PatternFill("solid", start_color=OPEN_FILL, bgColor=OPEN_FILL)
     is_open = FormulaRule(formula=[f"ISBLANK({LETTERS['answer']}{HEADER_ROW + 1})"], fill=fill)
     page.conditional_formatting.add(_answer_cells(last), is_open)
-    page.protection.sheet = True  # without a password: it keeps from slips, not from intent
+    page.protection.sheet = True  # without a password: it prevents accidental changes only
     page.protection.formatColumns = page.protection.formatRows = False
 
 
 def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
-    """What the pictures show, and what each choice means."""
+    """Write what the pictures show, and what each choice means."""
     from openpyxl.styles import Alignment, Font
 
     text_cell(page, 1, 1, title).font = Font(name=FONT, bold=True, size=15)
@@ -175,7 +175,7 @@ def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
 
 
 def _without_time(content: bytes) -> bytes:
-    """The archive with every date in it set to one day, so that the same sheet gives the same bytes."""
+    """The archive with all dates set to one day, so that the same sheet gives the same bytes."""
     stamp = datetime(*ZIP_EPOCH, tzinfo=UTC).strftime("%Y-%m-%dT%H:%M:%SZ").encode()
     buffer = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w") as new:
@@ -205,7 +205,7 @@ class GeneratedSheets:
 def make_sheets(
     origin: Key, drafts: Sequence[Draft], drawn: Sequence[bytes], *, seed: int, annotators: int, overlap: float
 ) -> GeneratedSheets:
-    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them.
+    """The set of all ``drafts``, assigned evenly to ``annotators``; a share ``overlap`` of it goes to all of them.
 
     ``origin``: the key without an id and items; ``drawn``: the picture of each draft, a PNG.
     """
@@ -242,7 +242,7 @@ def check_split(n_items: int, annotators: int, overlap: float) -> None:
 def assign_items(
     item_ids: Sequence[str], annotators: int, overlap: float, random: np.random.Generator
 ) -> tuple[AnnotatorShare, ...]:
-    """Who gets what: a share of the items goes to all, the others are dealt in turn; each in an order of their own.
+    """Items per annotator: a share goes to all, the others are assigned in turn; each annotator has a random order.
 
     >>> shares = dealt(["a", "b", "c", "d"], 2, 0.5, np.random.default_rng(0))
     >>> [len(one.item_ids) for one in shares], len(set(shares[0].item_ids) & set(shares[1].item_ids))
@@ -264,9 +264,9 @@ def _key_item(item_id: str, draft: Draft) -> KeyItem:
 
 
 def write_sheets(made: GeneratedSheets, folder: Path, key_folder: Path) -> list[Path]:
-    """Write everything into ``folder`` and the key into ``key_folder``; the files for annotators, a folder each.
+    """Write everything into ``folder`` and the key into ``key_folder``; returns the files for annotators.
 
-    Raises ``ConfigError``, before anything is written, where the folders hold another set, or answers.
+    Raises ``ConfigError``, before anything is written, if the folders contain another set, or answers.
     """
     if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
         raise ConfigError(f"--key {printable(str(key_folder), 200)}: is among the sheets; choose a separate folder")
@@ -280,7 +280,7 @@ def write_sheets(made: GeneratedSheets, folder: Path, key_folder: Path) -> list[
     _check_same_sheets(made.sheet.id, folder, key_folder, files)
     for path in (folder, key_folder, folder / PICTURES):
         make_folder(path)
-    for name, content in made.pictures.items():  # in the order of their numbers, which is drawn
+    for name, content in made.pictures.items():  # in the order of their numbers, which is random
         write_bytes(folder / PICTURES / name, content)
     for path, content in files.items():
         make_folder(path.parent)
@@ -291,7 +291,7 @@ def write_sheets(made: GeneratedSheets, folder: Path, key_folder: Path) -> list[
 
 
 def _check_same_sheets(sheet_id: str, folder: Path, key_folder: Path, files: Mapping[Path, bytes]) -> None:
-    """Answers belong to one set and its key: neither gives way to another, and no answer to an empty table."""
+    """``ConfigError`` if files of another set, or a table with answers, would be overwritten."""
     sheet, key = folder / items.SHEET_FILE, key_folder / items.KEY_FILE
     known = {
         "--out": items.read_sheet(sheet).id if is_file(sheet) else sheet_id,

@@ -30,7 +30,7 @@ from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.store.predictions import read_prediction
 
-MAX_FRAMES = 32  # of a scene, among which the best view of an object is looked for
+MAX_FRAMES = 32  # frames per scene among which the best view of an object is searched
 
 
 def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
@@ -43,7 +43,7 @@ def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[s
 
 
 class RunSource:
-    """The maps of a run and the data that they were made from; other data are refused."""
+    """The maps of a run and the data that they were made from; other data are rejected."""
 
     def __init__(self, run: FinishedRun, methods: Sequence[str] = (), scenes: Sequence[str] = ()) -> None:
         self.run = run
@@ -60,24 +60,24 @@ class RunSource:
         return partial(_opened, self.run.folder.path, self.methods)
 
     def of_methods(self, methods: Sequence[str]) -> RunSource:
-        """The same run with these of its methods alone; what was read is shared."""
+        """The same run with only these of its methods; data already read are shared."""
         other = copy(self)
         other.methods = tuple(methods)
         return other
 
     def has_instances(self, scene: str, method: str) -> bool:
-        """Whether the map of a scene has instances, of which labels, masks and answers about them can be judged."""
+        """Whether the map of a scene has instances, so that labels, masks and answers about them can be judged."""
         return isinstance(self.prediction(scene, method), Instances)
 
     def has_features(self, scene: str, method: str) -> bool:
-        """Whether the map of a scene can be asked for what a text says: it has features of instances or of points."""
+        """Whether the map of a scene can be queried by text: it has features of instances or of points."""
         prediction = self.prediction(scene, method)
         if isinstance(prediction, Instances):
             return prediction.features is not None
         return isinstance(prediction, DenseFeatures)
 
     def instances(self, scene: str, method: str) -> Instances:
-        """The map of a scene; a ``PredictionError`` where it has no instances."""
+        """The map of a scene; a ``PredictionError`` if it has no instances."""
         prediction = self.prediction(scene, method)
         if not isinstance(prediction, Instances):
             raise errors.PredictionError(
@@ -100,11 +100,11 @@ class RunSource:
         return refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
 
     def scene_map(self, scene: str, method: str) -> SceneMap:
-        """The map as questions are put to it, under labels n' and without what they leave out, where it has them."""
+        """The map for answering questions, under labels n' and without the instances they exclude, if it has them."""
         return map_of(self.instances(scene, method), self.refined(scene, method))
 
     def frames(self, scene: str) -> tuple[Frame, ...]:
-        """Some of the frames from which the maps were made, spread over the scene: the same whatever the method."""
+        """Some of the frames from which the maps were made, spread over the scene, and equal for all methods."""
         n = len(self.run.dataset(scene).frames(scene.partition("/")[2], 1))
         maps = (self.prediction(scene, method) for method in self.methods)
         views = [a_map.views[:, 0] for a_map in maps if isinstance(a_map, Instances)]
@@ -118,7 +118,7 @@ class RunSource:
         return tuple(frames[index] for index in indices)
 
     def rules(self, scene: str, kind: str) -> ProtocolRules | None:
-        """The rules that judge a scene automatically, the first that fit; None where there are none."""
+        """The first rules that can judge a scene automatically; None if there are none."""
         name = scene.partition("/")[0]
         known = protocol_names()
         own = [self.run.rules(protocol) for protocol in self.run.protocols if protocol not in known]
@@ -140,7 +140,7 @@ class RunSource:
         return truth
 
     def covered(self, scene: str, rules: ProtocolRules | None, instances: Instances) -> CoveredObjects | None:
-        """What of the truth each instance covers, found once for equal masks; None where there is no truth."""
+        """The ground truth covered by each instance, computed once for equal masks; None without ground truth."""
         truth = self.truth(scene, rules)
         if rules is None or truth is None:
             return None
@@ -156,7 +156,7 @@ def _opened(run: Path, methods: Sequence[str]) -> RunSource:
 
 
 def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
-    """A key of where the instances lie, so that equal masks of several maps are known as one."""
+    """A key of the instances' points, so that equal masks of several maps are recognised."""
     total = hashlib.sha256()
     for row in rows:
         total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
@@ -165,7 +165,7 @@ def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
 
 
 class TruthSource:
-    """The truth of ``scenes`` (``<dataset>/<scene>``); ``run`` and ``run_digest`` are empty where no run names them."""
+    """The ground truth of ``scenes`` (``<dataset>/<scene>``); ``run`` and ``run_digest`` are empty without a run."""
 
     def __init__(
         self,
@@ -197,20 +197,20 @@ class TruthSource:
         return Instances.of(truth.points, list(rows_of.values()), names=names, ids=list(rows_of))
 
     def _frames(self, scene: str) -> tuple[Frame, ...]:
-        """Those in which it was looked up what can be asked about."""
+        """The frames that decide which objects are visible enough for questions."""
         dataset, name = self.dataset(scene), scene.partition("/")[2]
         return tuple(evaluated(dataset, name))
 
 
 def truth_of_run(folder: Path, scenes: Sequence[str] = ()) -> TruthSource:
-    """That of these scenes of a run, of all without any; other data than the run's are refused."""
+    """The ground truth of these scenes of a run (default: all); data other than the run's are rejected."""
     run = read_run(folder)
     chosen = chosen_of(run, "scene", scenes, run.scenes)
     return TruthSource(chosen, run.dataset, partial(truth_of_run, folder, chosen), run.name, run.record.code)
 
 
 def ground_truth_of_addresses(addresses: Sequence[str]) -> TruthSource:
-    """That of every scene that an address or a pattern names."""
+    """The ground truth of every scene named by an address or a pattern."""
     settings = read_assignments((), (), ())
     parts = {target: part_of("dataset", target, settings) for target in dataset_targets(addresses)}
     chosen, _ = expand_scenes(addresses, parts)

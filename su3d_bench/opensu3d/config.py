@@ -75,7 +75,7 @@ class OpenSU3DConfig(BaseModel):
     # The paper's 20 px belong to 1200x680 images; other widths use the same fraction of the width. 0: do not scale.
     border_reference_width: int = Field(default=1200, ge=0)
     border_shape: Literal["disc", "square"] = "disc"
-    # Ring pixels that lie in another mask: points of no instance in the map, because M' holds the ring and
+    # Ring pixels that are in another mask: points of no instance in the map, because M' contains the ring and
     # Eq. 1 back-projects M'; points of that mask's instance, excluded from matching; or no points.
     border_pixels: Literal["background", "owner", "drop"] = "background"
     # Pixels in no mask: Eq. 1 back-projects every pixel.

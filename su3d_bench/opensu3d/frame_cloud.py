@@ -60,7 +60,7 @@ class FrameCloud:
 
     ``owner`` (N,) holds detection indices, NO_DETECTION outside masks; the first ``n_inside`` points are the segments
     that are matched and counted, the others have no instance in the ID image. ``n_swallowed``: detections whose visible
-    pixels all lie in rings of other detections; ``n_too_far``: pixels beyond ``depth_max``.
+    pixels are all in rings of other detections; ``n_too_far``: pixels beyond ``depth_max``.
     """
 
     points: Float64Array

@@ -9,7 +9,7 @@ import numpy as np
 from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.clusters import ABSENT, slot_of
 
-LABEL_SHIFT = 40  # a view spans fewer voxels than 2**39, at any voxel that a depth image can fill
+LABEL_SHIFT = 40  # a view spans fewer than 2**39 voxels, at any voxel size that a depth image can fill
 OWNED, BACKGROUND, DROPPED = 0, 1, 2  # treatment of ring pixels
 UNUSED = -9  # not a label: labels are at least ABSENT * 3 + 2
 
@@ -86,7 +86,7 @@ def _grown(table, keys, n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _label_row(pixels, ids, owner, rings, drop_background, labels):  # type: ignore[no-untyped-def]
-    """Owner * 3 + rank of each pixel of a row, UNUSED where it gives no point; ranks as in ``cloud``."""
+    """Owner * 3 + rank of each pixel of a row, UNUSED if it gives no point; ranks as in ``cloud``."""
     for column in range(len(pixels)):
         k = owner[column]
         is_ring = k != ABSENT and ids[column] == ABSENT
@@ -249,7 +249,7 @@ def insert(  # type: ignore[no-untyped-def]
 def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
     """Write the squared distance along one axis from ``x`` to the voxels -2 to +2 of its own into ``gaps`` (5,).
 
-    Rounded down, so that rounding never skips a voxel: the outer ones can hold a point within eps if ``x`` lies on the
+    Rounded down, so that rounding never skips a voxel: the outer ones can contain a point within eps if ``x`` is on the
     border of its voxel, up to rounding.
     """
     slack = abs(x) * 1e-15

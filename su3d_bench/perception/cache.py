@@ -1,8 +1,8 @@
 """On-disk cache of the perception results of a frame, keyed by everything that affects them.
 
-An entry is an npz file without pickled objects that carries a checksum of its arrays. Entries are written under a
-temporary name and renamed, so that concurrent processes see complete entries only; a damaged entry is treated
-as missing and recomputed.
+An entry is an npz file without pickled objects, with a checksum of its arrays. Entries are written under a temporary
+name and renamed, so that concurrent processes only see complete entries; a damaged entry is treated as missing and
+recomputed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def crop_window(box: Sequence[float] | Float32Array, ratio: float, width: int, h
     """Integer window (4,) x0 y0 x1 y1 of ``box`` scaled by ``ratio`` about its centre and clipped to the image.
 
     Each border is rounded to the nearest pixel border, halves towards the right and the bottom, after clipping; a
-    window that would be empty is one pixel wide. So a whole-pixel box at ratio 1.0 is returned as it is.
+    window that would be empty is one pixel wide. So a whole-pixel box at ratio 1.0 is returned unchanged.
     """
     x0, y0, x1, y1 = (float(value) for value in box)
     left, right = _scaled((x0, x1), ratio, width)
@@ -97,9 +97,9 @@ def cached_regions(
 
 
 def region_under(masks: BoolArray, points: Int64Array) -> tuple[int, float]:
-    """Which of ``masks`` (K, H, W) holds most of the pixels ``points`` (P, 2), x y, and the share of them in it.
+    """The index of the mask (K, H, W) with most of the pixels ``points`` (P, 2), x y, and the share of points in it.
 
-    The first on ties; -1 and 0 where no mask holds any.
+    The first on ties; -1 and 0 if no mask contains any.
     """
     if not len(masks) or not len(points):
         return -1, 0.0
@@ -130,7 +130,7 @@ class CropsOnDemand:
         self._encoder = encoder
 
     def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
-        """Features (B, dim) of the crops ``boxes`` (B, 4), none of them empty, whatever the mask.
+        """Features (B, dim) of the crops ``boxes`` (B, 4), none of them empty; the mask is ignored.
 
         The context of a region is informative too.
         """
@@ -147,7 +147,7 @@ class RegionsOnDemand(CropsOnDemand):
         self._regions = LastFrameCache(regions_of)
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
-        """The mask and score of the region that contains most of ``points``; or an empty mask and 0.
+        """The mask and score of the region with most of ``points``; otherwise an empty mask and 0.
 
         The score is the region's score times the share of points inside it.
         """
@@ -218,7 +218,7 @@ class CropEncoder:
         compute: Callable[[NDArray[np.intp]], Float32Array],
         timer: StageTimer,
     ) -> Float32Array:
-        """Rows ``wanted`` of the table of ``n`` features under ``key``; ``compute`` makes the missing ones."""
+        """Rows ``wanted`` of the table of ``n`` features under ``key``; ``compute`` returns the missing ones."""
         with timer.stage("cache"):
             entry = self._cache.load(key)
         if entry is None or entry["rows"].shape != (n, self._encoder.dim):
@@ -236,15 +236,15 @@ class CropEncoder:
 
 Arrays = dict[str, NDArray[Any]]
 
-# The code that can move what is kept: keys follow it.
+# The code that affects cached values: keys depend on it.
 CODE = ("core", "numerics", "perception")
-# Moves every key: raise it when the format of an entry changes.
+# Part of every key: increment it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"
 
 
 def content_key(*parts: str) -> str:
-    """A hex key of texts; the order counts, and no two lists of parts share a key."""
+    """A hex key of texts; the order matters, and no two lists of parts share a key."""
     hasher = hashlib.sha256(CACHE_VERSION.encode())
     for part in parts:
         encoded = part.encode()
@@ -263,7 +263,7 @@ def array_digest(*arrays: NDArray[Any]) -> str:
 
 
 class FrameCache:
-    """Entries of named arrays below ``root``; with ``root`` None nothing is read or written."""
+    """Entries of named arrays below ``root``; if ``root`` is None, nothing is read or written."""
 
     def __init__(self, root: Path | None) -> None:
         self._root = None if root is None else root / "perception"
@@ -275,14 +275,14 @@ class FrameCache:
         return self._root is not None
 
     def image_digest(self, rgb: UInt8Array) -> str:
-        """A digest of an image, taken once while it is asked for that one image: it is in the key of many entries."""
+        """A digest of an image, remembered for the last image because it is part of many keys."""
         last = self._last_image
         if last is None or last[0] is not rgb:
             last = self._last_image = rgb, array_digest(rgb)
         return last[1]
 
     def frame_digest(self, frame: Frame, with_pose: bool) -> str:
-        """A digest of colour, depth and intrinsics, and of the pose where the answer depends on it."""
+        """A digest of colour, depth and intrinsics, and of the pose if the result depends on it."""
         pose: tuple[Float64Array, ...] = (frame.camera_to_world,) if with_pose else ()
         return self.image_digest(frame.rgb) + array_digest(frame.depth_m, frame.intrinsics, *pose)
 
@@ -327,7 +327,7 @@ def _checksum(arrays: Mapping[str, NDArray[Any]]) -> UInt8Array:
 
 
 def pack_masks(masks: BoolArray) -> Arrays:
-    """``masks`` (K, H, W) as compact arrays: the bits of each mask inside its own box, end to end."""
+    """``masks`` (K, H, W) as compact arrays: the concatenated bits of each mask inside its own box."""
     windows = mask_boxes(masks).astype(np.int32)
     bits = [np.packbits(mask[y0:y1, x0:x1]) for mask, (x0, y0, x1, y1) in zip(masks, windows.tolist(), strict=True)]
     return {

@@ -15,12 +15,12 @@ from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNee
 from su3d_bench.perception.cache import CropEncoder, FrameCache
 from su3d_bench.perception.embedded.lexicon import Namer, colour_word, scene_caption
 
-# Words that end in the same noun and mean something else.
+# Phrases that end in the same noun but mean something else.
 _OTHER_THINGS = frozenset((("coffee", "ground"), ("video", "wall")))
 
 
 def is_background(name: str, background_names: Iterable[str]) -> bool:
-    """Whether all that ``name`` names is one of ``background_names``, with whatever stands before it.
+    """Whether everything that ``name`` names is one of ``background_names``, with any modifiers before it.
 
     >>> names = ("Brick walls", "hardwood flooring", "wall lamp", "floor mat")
     >>> [is_background(name, ("wall", "floor")) for name in names]
@@ -32,19 +32,19 @@ def is_background(name: str, background_names: Iterable[str]) -> bool:
 
 
 def _ends_in_one(phrase: tuple[str, ...], background: list[tuple[str, ...]]) -> bool:
-    # Flooring is floor and roofing is roof.
+    # Flooring counts as floor and roofing as roof.
     spoken = phrase, (*phrase[:-1], phrase[-1].removesuffix("ing"))
     return phrase[-2:] not in _OTHER_THINGS and any(
         one and each[-len(one) :] == one for one in background for each in spoken
     )
 
 
-# Regions that are kept, with what they are to be called and how they are described.
+# Returns the kept regions with their names and captions.
 Describe = Callable[[Frame, Regions, StageTimer], Regions]
 
 
 def captioned(frame: Frame, regions: Regions, timer: StageTimer) -> Regions:
-    """``regions`` with the template caption of their names, where they have no captions of their own."""
+    """``regions`` with the template caption of their names, unless they already have captions."""
     if regions.captions is not None:
         return regions
     return replace(regions, captions=tuple(scene_caption(name) for name in regions.names or ()))
@@ -80,9 +80,9 @@ class Assembler:
         known: Mapping[float, Float32Array] | None = None,
         global_feature: Float32Array | None = None,
     ) -> Detections:
-        """Those of the named ``regions`` that ``needs`` asks for, called and described by ``describe``.
+        """The named ``regions`` that ``needs`` requests, with names and captions from ``describe``.
 
-        Features that are ``known``, by crop ratio for all regions (K, D), and the ``global_feature`` are not computed.
+        ``known`` features, by crop ratio for all regions (K, D), and the ``global_feature`` are not computed again.
         """
         assert regions.names is not None
         kept = regions_to_keep(regions.names, regions.boxes, frame.depth_m.shape, needs)
@@ -107,9 +107,9 @@ class Assembler:
     def named(
         self, frame: Frame, regions: Regions, namer: Namer, needs: PerceptionNeeds, timer: StageTimer
     ) -> tuple[Regions, Mapping[float, Float32Array]]:
-        """``regions`` named by ``namer``, scored by its confidence, and features that are known by that.
+        """``regions`` named by ``namer``, scored by its confidence, and the features computed for that.
 
-        What has a name (other than "") keeps it, at a confidence of 1.
+        A region with a name (other than "") keeps it, with a confidence of 1.
         """
         everything = np.arange(len(regions.boxes))
         best_fit = self._crops.crops(frame, regions.boxes, everything, (1.0,), timer, {})[:, 0]
@@ -133,7 +133,7 @@ class Assembler:
 def regions_to_keep(
     names: Sequence[str], boxes: Float32Array, image_shape: tuple[int, ...], needs: PerceptionNeeds
 ) -> NDArray[np.intp]:
-    """Indices of the regions whose name is no background name and whose box is not too large a part of the image."""
+    """Indices of the regions without a background name whose box is not too large a share of the image."""
     exact = {name.lower() for name in needs.background_names}
     is_left_out = {
         name: is_background(name, needs.background_names) if needs.background_by_head else name.lower() in exact

@@ -1,4 +1,4 @@
-"""Perfect detections: masks projected from the annotated mesh or the boxes of objects, with noise on request."""
+"""Ground-truth detections: masks projected from the annotated mesh or the object boxes, with optional noise."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class OracleNoise(BaseModel):
     """Noise added to the oracle's masks and names; all values are 0 (no noise) by default.
 
     Applied in this order: drop a mask; merge it with a touching one; split it by a line through its centre; erode or
-    dilate what is left by whole pixels (a grown mask may overlap its neighbour); flip its name to another class of the
-    scene.
+    dilate the remaining masks by whole pixels (a dilated mask may overlap its neighbour); change its name to another
+    class of the scene.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -77,7 +77,7 @@ def apply_noise(
 
 
 def _merge(regions: list[Region], probability: float, generator: np.random.Generator) -> list[Region]:
-    """Each drawn mask joins the touching mask of the most pixels, under the name of the larger of the two."""
+    """Each drawn mask is merged into the largest touching mask, with the name of the larger of the two."""
     is_drawn = generator.random(len(regions)) < probability
     merged = dict(enumerate(regions))
     for k in np.flatnonzero(is_drawn).tolist():
@@ -141,18 +141,18 @@ if TYPE_CHECKING:
 class OracleConfig(BaseModel):
     """Parameters for projecting the ground truth into a frame.
 
-    A pixel takes the instance of the surface that its ray hits where that surface lies within ``depth_tolerance_m`` of
-    the measured depth. Pixels that hit nothing, or another surface, take the instance of the nearest labelled pixel
-    within ``fill_px`` whose depth is within the tolerance: scanned surfaces have small holes. Instances below
-    ``min_pixels`` are dropped.
+    A pixel takes the instance of the surface hit by its ray if that surface is within ``depth_tolerance_m`` of the
+    measured depth. Pixels that hit nothing, or another surface, take the instance of the nearest labelled pixel within
+    ``fill_px`` whose depth is within the tolerance, because scanned surfaces have small holes. Instances with fewer
+    than ``min_pixels`` are dropped.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     depth_tolerance_m: float = Field(default=0.05, gt=0)
     fill_px: int = Field(default=3, ge=0)
-    min_pixels: int = Field(default=100, ge=1)  # as many as a region of 10x10 pixels, the least that a crop can show
-    prompt: str = Field(default="{} in a scene", pattern=r"\{\}")  # whose text feature stands for a region
+    min_pixels: int = Field(default=100, ge=1)  # 10x10 pixels, the minimum for a crop
+    prompt: str = Field(default="{} in a scene", pattern=r"\{\}")  # its text feature is used for a region
     noise: OracleNoise = OracleNoise()
 
 
@@ -209,7 +209,7 @@ class MeshProjector:
 
 
 class BoxProjector:
-    """Instance images of objects whose boxes are known: what a pixel measures is of the smallest box that holds it."""
+    """Instance images of objects with known boxes: a measured point belongs to the smallest box that contains it."""
 
     def __init__(self, boxes: ObjectBoxes, config: OracleConfig) -> None:
         self._boxes = boxes
@@ -285,7 +285,7 @@ ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; 
 
 
 class OraclePerception:
-    """The ground truth seen from the frame; features are those of the class names, alike at every ratio."""
+    """The ground truth seen from the frame; features are those of the class names, equal at every ratio."""
 
     profile = "oracle"
     caveat: str | None = ORACLE_CAVEAT
@@ -317,19 +317,19 @@ class OraclePerception:
     def features_of(self, names: tuple[str, ...]) -> Float32Array:
         """The features (K, D) of class names in the prompt."""
         prompts = [self._prompt.replace("{}", with_article(name)) for name in names]
-        rows = [self._assembler.text_features([prompt]) for prompt in prompts]  # one by one: none depends on another
+        rows = [self._assembler.text_features([prompt]) for prompt in prompts]  # one by one: independent
         return np.array(rows, np.float32).reshape(len(names), self.encoder.dim)
 
 
 class OracleRegions(RegionsOnDemand):
-    """``RegionPerception`` from the truth: the instance under the points, the feature of its name for every crop."""
+    """``RegionPerception`` from ground truth: the instance under the points, its name feature for every crop."""
 
     def __init__(self, oracle: OraclePerception) -> None:
         super().__init__(oracle.segmenter.segment, oracle.encoder)
         self._features_of = oracle.features_of
 
     def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
-        """The name feature of the instance that most of ``mask`` belongs to; zeros where it belongs to none."""
+        """The name feature of the instance with most of ``mask``; zeros if there is none."""
         regions = self._regions(frame)
         rows, columns = np.nonzero(mask)
         best, _ = region_under(regions.masks, np.stack([columns, rows], axis=1))

@@ -1,4 +1,4 @@
-"""The paper's own front end: RAM++, GroundingDINO, SAM and CLIP; captions by a vision model on request."""
+"""The paper's own perception: RAM++, GroundingDINO, SAM and CLIP; optionally captions by a vision model."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h
 def paper_deviations(
     config: PaperConfig, networks: Networks, encoder: Encoder, captioner: Captioner | None
 ) -> list[str]:
-    """What is computed here otherwise than in OpenSU3D's paper, a sentence each; nothing where all is the paper's."""
+    """The differences from OpenSU3D's paper, one clause each; empty if there are none."""
     said = [networks.tagger.caveat] if networks.tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
         said.append(f"masks: {config.segmenter} replaces the paper's {PAPER_SEGMENTER}")
@@ -46,7 +46,7 @@ def paper_deviations(
 
 
 def _non_default_settings(config: GroundedConfig) -> list[str]:
-    """The settings of named masks, boxes among them, that are not the defaults."""
+    """The settings of named masks, including those of boxes, that differ from the defaults."""
     given, papers = (
         {f"boxes.{name}": value for name, value in one.boxes} | {name: value for name, value in one if name != "boxes"}
         for one in (config, GroundedConfig())
@@ -55,7 +55,7 @@ def _non_default_settings(config: GroundedConfig) -> list[str]:
 
 
 class PaperPerception:
-    """Foundation models; a method gets the masks that its own program makes of them where it names the settings."""
+    """Foundation models; a method that names its own program's settings gets masks computed with these."""
 
     profile = "paper"
 
@@ -93,7 +93,7 @@ class PaperPerception:
         return SamRegions(self._networks, self.encoder)
 
     def _described(self, frame: Frame, regions: Regions, timer: StageTimer) -> Regions:
-        """``regions`` called and described by the vision model."""
+        """``regions`` named and described by the vision model."""
         assert self._captioner is not None and regions.names is not None
         with timer.stage("caption"):
             replies = self._captioner.captions(crop_images(frame.rgb, regions.boxes, 1.0), regions.names)
@@ -106,6 +106,6 @@ class PaperPerception:
         if kind not in known:
             hint = suggest(kind, known)
             raise ConfigError(
-                f"profile 'paper': the method asks for {needs.masks} masks '{kind}', which are not available{hint}"
+                f"profile 'paper': the method needs {needs.masks} masks '{kind}', which are not available{hint}"
             )
         return known[kind]

@@ -32,12 +32,12 @@ from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerceptio
 from su3d_bench.perception.stored_masks import LabelImages
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
-# Replies of vision models, below the cache's folder: a rerun asks nothing twice.
+# Replies of vision models, below the cache's folder, so that a rerun sends no request twice.
 REPLIES = "replies"
 
 
 class PerceptionConfig(BaseModel):
-    """All parameters of all profiles; ``cache`` off: nothing is read from or written to the cache."""
+    """All parameters of all profiles; ``cache`` false: nothing is read from or written to the cache."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -52,7 +52,7 @@ class PerceptionConfig(BaseModel):
 
 
 class Perception(Protocol):
-    """What a run asks of perception; ``digest`` moves with everything that moves the answer of ``detect``."""
+    """The interface of perception for a run; ``digest`` changes with everything that affects ``detect``."""
 
     profile: str
     encoder: Encoder
@@ -64,13 +64,13 @@ class Perception(Protocol):
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections: ...
 
     def regions(self) -> RegionPerception:
-        """Perception on demand, for methods that look into images themselves."""
+        """Perception on demand, for methods that process images themselves."""
         ...
 
 
 CAMERA_CAVEAT = (
-    "embedded perception on camera images: its encoder has seen rendered rooms only, so names and labels mean little "
-    "here; use --profile paper, or --profile stored with detections made by real models"
+    "embedded perception on camera images: its encoder was trained on rendered rooms only, so names and labels are "
+    "unreliable here; use --profile paper, or --profile stored with detections of real models"
 )
 
 
@@ -108,9 +108,9 @@ class EmbeddedPerception:
 
 
 def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionConfig | None = None) -> str:
-    """The profile behind ``profile``: ``auto`` is ``paper`` on camera images where its models are here.
+    """The profile selected by ``profile``: ``auto`` is ``paper`` on camera images if its models are installed.
 
-    Elsewhere ``auto`` is ``embedded``: on rendered rooms, which its encoder was made for, and without ``config``.
+    Otherwise ``auto`` is ``embedded``: on rendered rooms, which its encoder was trained on, and without ``config``.
     """
     if profile not in PROFILES:
         raise ConfigError(f"unknown profile '{profile}'{suggest(profile, PROFILES)}")
@@ -124,7 +124,7 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
 
 
 def check_models(profile: str, config: PerceptionConfig) -> None:
-    """Raises ``ModelMissing`` for the first model that is certainly needed and not here; nothing heavy is imported."""
+    """Raises ``ModelMissing`` for the first required model that is not installed, without any heavy import."""
     if profile == "paper":
         from su3d_bench.perception.models.loading import check_front_end
 
@@ -147,10 +147,10 @@ def build_perception(
     replies: Path | None = None,
     is_offline: bool = False,
 ) -> Perception:
-    """Perception for one scene; ``mesh``, or the boxes of objects, for the oracle alone.
+    """Perception for one scene; ``mesh`` (or object boxes) only for the oracle.
 
     Without ``encoder`` the configured one is loaded, or the profile's own; ``job_index`` chooses among several GPUs.
-    ``replies``: where those of a language model are kept (None: in the cache); ``is_offline``: only these are used.
+    ``replies``: the folder of language-model replies (None: in the cache); ``is_offline``: only stored ones are used.
     """
     resolved = resolve_profile(profile, scene.image_domain, config)
     cache = FrameCache(cache_root if config.cache else None)

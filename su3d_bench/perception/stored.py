@@ -1,16 +1,16 @@
 """Precomputed detections: the profile ``stored`` and its format of one npz file per frame.
 
-``<folder>/<dataset>.<scene>/frame000040.npz`` holds the K regions of the frame with index 40:
+``<folder>/<dataset>.<scene>/frame000040.npz`` contains the K regions of the frame with index 40:
 
 - ``image_size`` (2,) integers: height, width of the masks, which must be the frame's
 - ``masks`` (K, ceil(height * width / 8)) uint8: ``numpy.packbits`` of each mask, row by row
-- ``boxes`` (K, 4) numbers: x0 y0 x1 y1 in pixels, right and bottom exclusive. As detectors have them they may reach
-  beyond the image, by its own size at most, and as SAM has them those of a mask one pixel wide have no width
+- ``boxes`` (K, 4) numbers: x0 y0 x1 y1 in pixels, right and bottom exclusive. As with detectors, they may extend
+  beyond the image by at most its own size; as with SAM, the box of a mask one pixel wide has no width
 - ``scores`` (K,) numbers in 0..1;  ``names`` (K,) texts, none empty;  ``captions`` (K,) texts, optional
 - optional, all four together: ``crop_ratios`` (R,), ``crop_features`` (K, R, D), ``global_feature`` (D,) and
-  ``encoder`` (), the digest of the encoder that made them, which must be the encoder of the run
+  ``encoder`` (), the digest of the encoder that computed them, which must be the encoder of the run
 
-Files are plain arrays: nothing in them is unpickled. ``write_stored`` writes the format.
+Files are plain arrays; nothing is unpickled. ``write_stored`` writes the format.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from su3d_bench.perception.detections import Assembler, captioned_by_colour
 from su3d_bench.perception.embedded.lexicon import Namer
 
 INDEX = "{index}"
-MAX_REGIONS = 2_000  # of one image; SAM gives some hundred
-MAX_MASK_BYTES = 512 << 20  # of all masks of an image, a byte a pixel: 400 of 1296x968, 1,700 of 640x480
+MAX_REGIONS = 2_000  # per image; SAM returns a few hundred
+MAX_MASK_BYTES = 512 << 20  # of all masks of an image, one byte per pixel: 400 of 1296x968, 1,700 of 640x480
 
 
 def check_masks(n: int, shape: tuple[int, ...], where: str) -> None:
-    """Refuses more masks (H, W) than any image has, which take far more memory than their file, before they do."""
+    """Reject more masks (H, W) than any image has before they are unpacked and use far more memory than their file."""
     if n > MAX_REGIONS or n * shape[0] * shape[1] > MAX_MASK_BYTES:
         raise DataError(f"{where}: has {n} regions of {shape[1]}x{shape[0]} pixels; expected one region per object")
 
 
 class StoredConfig(BaseModel):
-    """Where the detections of the profile ``stored`` lie: npz files, unless one of the two patterns is set.
+    """Where the detections of the profile ``stored`` are: npz files, unless one of the two patterns is set.
 
     ``images`` (``frame-{index}.segm.png``) names label images, ``detections``
     (``{scene}/gsa_detections_none/frame{index}.pkl.gz``) ConceptGraphs' files, both relative to ``folder``; ``names``
@@ -72,10 +72,10 @@ class StoredConfig(BaseModel):
 
 @dataclass(frozen=True)
 class StoredFrame:
-    """The named regions of a frame, and the features that came with them.
+    """The named regions of a frame, and the features stored with them.
 
-    ``features`` (K, D) by crop ratio; ``global_feature`` (D,) of the image. They count for the encoder called
-    ``made_by`` and for crops with ``made_at_px`` around the box; None: for whatever the run asks.
+    ``features`` (K, D) by crop ratio; ``global_feature`` (D,) of the image. They are valid for the encoder ``made_by``
+    and for crops with ``made_at_px`` pixels around the box; None: for any encoder or padding.
     """
 
     regions: Regions
@@ -85,13 +85,13 @@ class StoredFrame:
     made_at_px: int | None = None
 
     def features_for(self, needs: PerceptionNeeds, encoder: Encoder) -> Mapping[float, Float32Array]:
-        """Those of ``features`` that ``needs`` would have ``encoder`` make."""
+        """Those of ``features`` that are valid for ``encoder`` and ``needs``."""
         is_same = self.made_by in (None, encoder.name) and self.made_at_px in (None, needs.crop_padding_px)
         return {ratio: rows for ratio, rows in self.features.items() if is_same and rows.shape[1] == encoder.dim}
 
 
 class StoredSource(Protocol):
-    """The detections of a scene in one format, called ``name``; ``files`` are those that a run may read."""
+    """The detections of a scene in the format ``name``; ``files`` are those that a run may read."""
 
     name: str
 
@@ -102,7 +102,7 @@ class StoredSource(Protocol):
 
 
 def _inside(folder: Path, name: str, where: str, key: str) -> Path:
-    """``folder / name``, unless that leads out of the folder."""
+    """``folder / name``; ``ConfigError`` if that is outside the folder."""
     path = folder / name
     is_plain = name.isprintable() and bool(name) and not name.startswith("/") and ".." not in PurePosixPath(name).parts
     try:
@@ -116,14 +116,14 @@ def _inside(folder: Path, name: str, where: str, key: str) -> Path:
 def numbered_files(
     folder: Path, pattern: str, scene: SceneInfo, where: str, what: str = "label image", key: str = "images"
 ) -> dict[int, Path]:
-    """Frame number -> file; ``what`` such a file is, and the ``key`` of the configuration that holds ``pattern``."""
+    """Frame number -> file; ``what`` describes such a file, ``key`` is the configuration key of ``pattern``."""
     key = f"perception.stored.{key}"
     filled = pattern.replace("{dataset}", scene.dataset).replace("{scene}", scene.scene)
     directory, _, name_pattern = filled.rpartition("/")
     if INDEX not in name_pattern or filled.count(INDEX) > 1 or "{" in filled.replace(INDEX, ""):
         raise ConfigError(
             f"{key} = {pattern[:80]!r}: expected one {{index}} in the file's name, such as 'frame{{index}}.png', and "
-            "no other braces but {dataset} and {scene}"
+            "no other braces except {dataset} and {scene}"
         )
     parent = _inside(folder, directory or ".", where, key)
     before, _, behind = name_pattern.partition(INDEX)
@@ -139,7 +139,7 @@ def numbered_files(
                     )
                 files[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
     except OSError as error:
-        raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should hold {what}s") from error
+        raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should contain {what}s") from error
     if not files:
         raise DataError(f"{where}: no {what} in {parent} matches {pattern!r}")
     return dict(sorted(files.items()))
@@ -151,7 +151,7 @@ _OPTIONAL = ("captions", *_FEATURES)
 
 
 def stored_path(folder: Path, dataset: str, scene: str, frame_index: int) -> Path:
-    """The file that holds the detections of a frame."""
+    """The file with the detections of a frame."""
     return folder / f"{dataset}.{scene}" / f"frame{frame_index:06d}.npz"
 
 
@@ -173,7 +173,7 @@ class NpzFiles:
 
 
 def write_stored(path: Path, detections: Detections, encoder: Encoder | None) -> None:
-    """Write ``detections`` in the stored format, with their features where the ``encoder`` that made them is given."""
+    """Write ``detections`` in the stored format, with their features if the ``encoder`` of them is given."""
     n, height, width = detections.masks.shape
     arrays: dict[str, NDArray[Any]] = {
         "image_size": np.array([height, width], np.int64),
@@ -222,7 +222,7 @@ def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
     n_features = len(set(_FEATURES) & set(arrays))
     if not {*_REQUIRED} <= set(arrays) <= {*_REQUIRED, *_OPTIONAL} or n_features not in (0, len(_FEATURES)):
         raise DataError(
-            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, optional captions, all or none of "
+            f"{where}: has {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, optional captions, all or none of "
             f"{', '.join(_FEATURES)}"
         )
 
@@ -235,7 +235,7 @@ def _check_rows(arrays: Mapping[str, NDArray[Any]], where: str) -> int:
             raise DataError(f"{where}: '{key}' has shape {arrays[key].shape}; expected {n_axes} axes and {n} rows")
     for key in ("masks", "boxes", "scores", "image_size"):
         if arrays[key].dtype.kind not in "biuf":
-            raise DataError(f"{where}: '{key}' holds {arrays[key].dtype}; expected numbers")
+            raise DataError(f"{where}: '{key}' has type {arrays[key].dtype}; expected numbers")
     return n
 
 
@@ -282,18 +282,18 @@ def _scores(arrays: Mapping[str, NDArray[Any]], where: str) -> Float32Array:
 def _texts(arrays: Mapping[str, NDArray[Any]], key: str, where: str) -> tuple[str, ...]:
     values = arrays[key]
     if values.dtype.kind != "U" and len(values):
-        raise DataError(f"{where}: '{key}' holds {values.dtype}; expected texts (numpy type U)")
+        raise DataError(f"{where}: '{key}' has type {values.dtype}; expected texts (numpy type U)")
     texts = tuple(str(value) for value in values)
     for k, text in enumerate(texts):
         if not text.strip():
-            raise DataError(f"{where}, region {k}: '{key}' holds an empty text")
+            raise DataError(f"{where}, region {k}: '{key}' is an empty text")
     return texts
 
 
 def _features(
     arrays: Mapping[str, NDArray[Any]], encoder: Encoder, n: int, where: str
 ) -> tuple[dict[float, Float32Array], Float32Array | None]:
-    """Features (K, D) of crops by their ratio, and that of the image."""
+    """Features (K, D) of crops by ratio, and the feature of the image."""
     if "encoder" not in arrays:
         return {}, None
     made_by = str(arrays["encoder"])
@@ -322,10 +322,9 @@ STORED_CAVEAT = "stored perception: masks and names are precomputed and used unc
 
 
 class StoredPerception:
-    """Detections from files; features are computed where the files lack them.
+    """Detections from files; features missing in the files are computed.
 
-    With a ``namer`` regions without a name get one as any other region does, and its confidence, and captions tell
-    their colour.
+    With a ``namer``, regions without a name get a name and confidence from it, and captions include the colour.
     """
 
     profile = "stored"
@@ -350,7 +349,7 @@ class StoredPerception:
         return self._assembler.assemble(frame, stored.regions, needs, timer, known=known, global_feature=whole)
 
     def regions(self) -> RegionPerception:
-        """Perception on demand over the masks from the files: as sure as the share of the points in one."""
+        """Perception on demand over the masks from the files; the score is the share of the points in the mask."""
         return RegionsOnDemand(self._regions_of, self.encoder)
 
     def _regions_of(self, frame: Frame) -> Regions:

@@ -5,9 +5,9 @@ A label image is a PNG with one channel of 8 or 16 bits and the frame's size; ea
 it, ``{dataset}`` and ``{scene}`` for the scene. ``names``, a TOML or JSON file, maps values to names (``48 = "book"``);
 a region without one is named by the encoder.
 
-ConceptGraphs' ``gsa_detections_*`` are one gzipped pickle a frame, read as data: a dict of ``xyxy`` (N, 4),
+ConceptGraphs' ``gsa_detections_*`` are one gzipped pickle per frame, read as data: a dict of ``xyxy`` (N, 4),
 ``confidence`` (N,), ``class_id`` (N,), ``mask`` (N, H, W) bool, ``classes``, a list of names, ``image_crops``, which
-are passed over, ``image_feats`` and ``text_feats`` (N, D), as ``generate_gsa_results.py`` writes it.
+are ignored, ``image_feats`` and ``text_feats`` (N, D), as written by ``generate_gsa_results.py``.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_NAME_LENGTH = 100
 
 
 class LabelImages:
-    """The label images of a scene; ``files`` are those that a run reads, the names' file first."""
+    """The label images of a scene; ``files`` are those that a run reads, the file of names first."""
 
     name = "label images"
 
@@ -46,7 +46,7 @@ class LabelImages:
         self.files = (*(() if names is None else (names,)), *self._images.values())
 
     def frame(self, frame: Frame) -> StoredFrame:
-        """Regions by ascending value, "" for a name that is not given, no score below another; raises ``DataError``."""
+        """Regions by ascending value, "" for a missing name, all scores equal; raises ``DataError``."""
         path = self._images.get(frame.index)
         if path is None:
             raise DataError(
@@ -64,7 +64,7 @@ class LabelImages:
 
 
 def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any]:
-    """Values (H, W) of a label image of this ``shape``; its header is believed before anything is decoded."""
+    """Values (H, W) of a label image of this ``shape``; its header is checked before anything is decoded."""
     import cv2
 
     try:
@@ -89,7 +89,7 @@ def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any
 
 
 def read_names(path: Path, where: str) -> dict[int, str]:
-    """Value -> name out of a TOML or JSON table whose keys are the values."""
+    """Value -> name from a TOML or JSON table whose keys are the values."""
     where = f"{where}: {path.name}"
     try:
         if path.stat().st_size > MAX_NAMES_BYTES:
@@ -113,7 +113,7 @@ def read_names(path: Path, where: str) -> dict[int, str]:
 
 
 _SKIPPED = ("image_crops",)
-# Who made the features in the files, and of which crops: boxes and 20 px on every side.
+# The encoder of the features in the files, and the padding of their crops: 20 px on every side of the box.
 FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20
 
 
@@ -128,7 +128,7 @@ class GsaFiles:
         self.files = tuple(self._paths.values())
 
     def frame(self, frame: Frame) -> StoredFrame:
-        """The detections of ``frame``; raises ``DataError`` or, for what is no plain pickle, ``PredictionError``."""
+        """The detections of ``frame``; raises ``DataError``, or ``PredictionError`` if the pickle is not plain data."""
         path = self._paths.get(frame.index)
         if path is None:
             raise DataError(
@@ -153,13 +153,13 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> Stored
     corners = _numbers(content, "xyxy", where).astype(np.float64).reshape(-1, 4) if n else np.zeros((0, 4))
     if corners.shape != (n, 4) or not np.isfinite(corners).all():
         raise DataError(f"{where}: xyxy is {corners.shape}; expected {n} boxes of finite numbers")
-    # As the detector has them: a box may reach beyond the image, by half its size at most. That bounds hostile ones.
+    # As from the detector: a box may extend beyond the image, by at most half its size. This bounds hostile ones.
     size = np.array([width, height, width, height])
     boxes: Float32Array = np.clip(corners, -size, 2 * size).astype(np.float32)
     names = _names(content, n, where)
     features = _features(content, n, where)
-    # SAM's predicted IoU may be a little above 1. A mask without pixels is no region; one that is a pixel wide is one,
-    # though SAM's box of it, from the first to the last pixel, has no width.
+    # SAM's predicted IoU may be slightly above 1. A mask without pixels is not a region; one that is one pixel wide is,
+    # although SAM's box of it, from the first to the last pixel, has no width.
     kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] >= boxes[:, :2]).all(axis=1))
     scores = np.clip(scores[kept], 0, 1).astype(np.float32)
     regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept), rows=kept.astype(np.int64))
@@ -208,7 +208,7 @@ def _features(content: Mapping[object, object], n: int, where: str) -> Float32Ar
         return None
     features = _numbers(content, "image_feats", where)
     lengths = np.linalg.norm(features.astype(np.float64), axis=-1) if features.ndim == 2 else np.zeros(0)
-    # Made in half precision in the original, whose lengths are 1 to the third decimal.
+    # Computed in half precision in the original, so that lengths are 1 to the third decimal.
     if len(features) != n or features.ndim != 2 or not (np.abs(lengths - 1) < 1e-2).all():
         raise DataError(f"{where}: image_feats are {features.shape}; expected {n} rows of length 1")
     return (features / lengths[:, None]).astype(np.float32)

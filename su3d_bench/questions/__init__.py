@@ -1,1 +1,1 @@
-"""Questions about a scene and their answers where known."""
+"""Questions about a scene and their answers, if known."""

@@ -1,8 +1,8 @@
-"""What pictures show of an object, and what its vertices say of how it looks: colour, sides, words for its shape.
+"""What images show of an object, and what its vertices imply about its looks: colour, sides, words for its shape.
 
-People are asked only about what they can see: an object that no frame shows large enough is not asked about. Looks are
-for truths that come from scans, of which nobody noted what their things were made like. A word is sure, or some people
-might say it, or nobody would; between sure and nobody nothing is asked.
+Only visible objects are asked about: an object that no frame shows large enough is not. Looks are for ground truth from
+scans, which has no annotated appearance. A word for an object is certain, possible or ruled out; if it is merely
+possible, no question uses it.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from su3d_bench.core.english import last_word
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, GroundTruth, Int64Array
 from su3d_bench.numerics.relations import FIXTURES, FLAT_M
 
-N_FRAMES = 40  # ours: spread evenly, enough to see nearly everything of a room
-MAX_VERTICES = 3000  # of one object: at 0.5 m a scan of 0.02 m still hits most cells of its image
-SAME_SURFACE_M = 0.05  # a vertex is seen where the depth image agrees with it
+N_FRAMES = 40  # ours: spread evenly, enough to see nearly everything in a room
+MAX_VERTICES = 3000  # per object: at 0.5 m a scan with 0.02 m spacing still hits most cells of its image
+SAME_SURFACE_M = 0.05  # a vertex is seen if the depth image agrees with it within this
 CELLS_PER_SIDE = 80  # of the grid over an image in which seen vertices are counted
-MIN_PART_SHARE = 0.002  # ours: of an image; 25 pixels a side of 640 x 480, of which one can tell what they are
-MIN_PIXELS = 60  # ours: fewer say too little of a colour
-OTHER_LIGHT = 1.25  # ours: a colour that nobody vouches for is named where so much more and less light leaves its word
-END_M = 0.05  # of an object within this of a side of its box some vertex must be seen away from the image's border
+MIN_PART_SHARE = 0.002  # ours: of an image; about 25 x 25 pixels of 640 x 480, enough to recognise an object
+MIN_PIXELS = 60  # ours: fewer are too few to name a colour
+OTHER_LIGHT = 1.25  # ours: an unannotated colour is named if this much more or less light does not change its word
+END_M = 0.05  # within this of each side of an object's box, some vertex must be seen away from the image's border
 BORDER_SHARE = 0.05  # of the image's longer side
-# Things whose colour is that of what they show, or of their frame, and nobody's name for them.
+# Objects whose colour is that of what they show or of their frame, which is not used to name them.
 WITHOUT_COLOUR = frozenset(("picture", "painting", "poster", "photo", "mirror", "window", "screen", "tv", "monitor"))
-MIN_SHARE = 0.6  # ours: of the pixels of an object that have the same word
-MAYBE_SHARE = 0.2  # ours: of so many somebody may name the object by that word
+MIN_SHARE = 0.6  # ours: of the pixels of an object that must have the same word
+MAYBE_SHARE = 0.2  # ours: from this share of pixels on, the word is possible for the object
 # CIELAB, all ours: below this chroma a colour is black, grey or white, by its lightness.
 GREY_CHROMA, BLACK_L, WHITE_L = 12.0, 25.0, 75.0
 HUES_DEGREES = (
@@ -38,17 +38,17 @@ HUES_DEGREES = (
 COLOURS = frozenset(("black", "grey", "white", "brown", "beige", "pink", *(name for _, name in HUES_DEGREES)))
 BROWN_L, BROWN_CHROMA, BEIGE_CHROMA = 60.0, 45.0, 30.0  # a dull dark orange is brown, a pale orange or yellow beige
 PINK_L = 60.0  # a light red is pink
-DARK_L, LIGHT_L = 35.0, 70.0  # whatever the hue
+DARK_L, LIGHT_L = 35.0, 70.0  # for any hue
 TONES = frozenset(("dark", "light-coloured"))
 
 
 @dataclass(frozen=True)
 class Sight:
-    """``share``: the largest part of an image that an object fills; ``colour``: a word, empty where none fits.
+    """``share``: the largest share of an image that an object fills; ``colour``: a word, empty if none fits.
 
-    ``is_certain_colour``: whether it is the same in a little other light; ``possible_colours``: what a good part of its
-    pixels has in one of these lights; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a
-    side of its box was seen only where the images end.
+    ``is_certain_colour``: whether it stays the same in slightly different light; ``possible_colours``: words for many of its
+    pixels in one of these lights; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a side of
+    its box was seen only at the border of the images.
     """
 
     share: float
@@ -66,7 +66,7 @@ class Sight:
 
 
 def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> Mapping[int, Sight]:
-    """Instance id -> what the frames show of it, for the instances of the truth that some frame sees."""
+    """Instance id -> what the frames show of it, for the ground-truth instances seen in any frame."""
     rows = _sampled_vertices(truth, min_vertices)
     points, owner = truth.points[rows].astype(np.float64), truth.instance[rows].astype(np.int64)
     pixels: dict[int, list[Float64Array]] = {}
@@ -107,13 +107,13 @@ def _is_cut(points: Float64Array, is_inside: BoolArray) -> bool:
 
 
 def evaluated(dataset: Any, scene: str) -> Iterator[Frame]:
-    """The frames of a scene, one at a time, in which it is looked up what people can be asked about."""
+    """The frames of a scene, one at a time, that decide which objects are visible enough for questions."""
     frames = dataset.frames(scene, max(1, int(dataset.info(scene, 1).n_frames) // N_FRAMES))
     return (frames[k] for k in range(min(len(frames), N_FRAMES)))
 
 
 def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:
-    """Id and rows, both ascending, of each instance of the truth with at least ``min_vertices`` vertices."""
+    """Id and rows, both ascending, of each ground-truth instance with at least ``min_vertices`` vertices."""
     order = np.argsort(truth.instance, kind="stable")
     ids, starts = np.unique(truth.instance[order], return_index=True)
     for instance, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
@@ -122,7 +122,7 @@ def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, 
 
 
 def _sampled_vertices(truth: GroundTruth, min_vertices: int) -> Int64Array:
-    """Rows of the truth: up to 3000 of each instance that is large enough, spread evenly in its order."""
+    """Ground-truth rows: up to 3000 of each instance that is large enough, spread evenly in its order."""
     parts = [
         rows[np.linspace(0, len(rows) - 1, min(len(rows), MAX_VERTICES)).astype(np.int64)]
         for _, rows in instance_rows(truth, min_vertices)
@@ -131,7 +131,7 @@ def _sampled_vertices(truth: GroundTruth, min_vertices: int) -> Int64Array:
 
 
 def _seen(frame: Frame, points: Float64Array) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """The rows of the points that the frame sees, with the line and the column of the pixel of each."""
+    """The rows of the points seen in the frame, with the image row and column of the pixel of each."""
     rotation, centre = frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3]
     camera = (points - centre) @ rotation
     rows = np.flatnonzero(camera[:, 2] > 0)
@@ -145,7 +145,7 @@ def _seen(frame: Frame, points: Float64Array) -> tuple[Int64Array, Int64Array, I
 
 
 def colour_word(rgb: Float64Array) -> str:
-    """The word for pixels (N, 3), 0..255, empty where they are too few or of too many colours.
+    """The colour word for pixels (N, 3), 0..255, empty if they are too few or of too many colours.
 
     >>> colour_word(np.tile([200.0, 40.0, 40.0], (100, 1))), colour_word(np.tile([200.0, 40.0, 40.0], (3, 1)))
     ('red', '')
@@ -158,7 +158,7 @@ def colour_word(rgb: Float64Array) -> str:
 
 
 def possible_colours(lights: Sequence[Float64Array]) -> frozenset[str]:
-    """The words of a good part of the same pixels (N, 3) in one of several lights; all words where they are too few."""
+    """The words for many of the same pixels (N, 3) in one of several lights; all words if there are too few pixels."""
     if len(lights[0]) < MIN_PIXELS:
         return COLOURS
     found = set()
@@ -169,7 +169,7 @@ def possible_colours(lights: Sequence[Float64Array]) -> frozenset[str]:
 
 
 def tones_of(lights: Sequence[Float64Array]) -> tuple[frozenset[str], frozenset[str]]:
-    """Whether most of the same pixels (N, 3) are dark or light in all of several lights, and a good part in one."""
+    """The tones of most of the same pixels (N, 3) in all of several lights, and of many of them in at least one."""
     if len(lights[0]) < MIN_PIXELS:
         return frozenset(), TONES
     lightness = np.stack([_lab(rgb)[:, 0] for rgb in lights])
@@ -201,35 +201,35 @@ def _words_of(rgb: Float64Array) -> np.ndarray:
     return np.where(chroma < GREY_CHROMA, greys, words)
 
 
-# Things whose shape people name, by the last word: seen from above, or from the front where they hang flat.
+# Objects commonly named by shape, by the last word: seen from above, or from the front if they hang flat.
 WITH_TOP = frozenset(("table", "desk", "nightstand", "stool", "ottoman", "bench"))
 WITH_SHAPE = WITH_TOP | frozenset((
     "rug", "mat", "carpet", "tray", "bin", "basket", "box",
     "mirror", "clock", "picture", "painting", "poster", "window",
 ))  # fmt: skip
 SHAPES = frozenset(("round", "square", "rectangular"))
-# Things that have no height of their own, however they lie, and no shape: the face of what leans is not its footprint.
+# Objects without a fixed height or shape: the face of a leaning object is not its footprint.
 SOFT = frozenset(("blanket", "towel", "cloth", "clothes", "comforter", "cushion", "pillow", "bag", "backpack", "shoe"))
-MIN_SIDE_M = 0.2  # ours: of a smaller face the noise of a scan hides the shape
-TOP_M = 0.05  # ours: so deep are the tops, of which the legs may stand out
-FLAT_SHARE = 0.2  # ours: a face stands upright where the thing is so much thinner than it is long and high
-# All ours. Area over that of the circle about the longest way across: an octagon has 0.90, a square 0.64.
+MIN_SIDE_M = 0.2  # ours: for a smaller face, the noise of a scan hides the shape
+TOP_M = 0.05  # ours: the depth of a top, beyond which legs may stick out
+FLAT_SHARE = 0.2  # ours: a face is upright if the object is this much thinner than it is long and high
+# All ours. Area over that of the circle with the longest diameter: an octagon has 0.90, a square 0.64.
 ROUND, MAYBE_ROUND = 0.92, 0.80
-# Area over that of the smallest rectangle about it: a circle has 0.79, an octagon 0.83.
+# Area over that of the smallest enclosing rectangle: a circle has 0.79, an octagon 0.83.
 STRAIGHT, MAYBE_STRAIGHT = 0.93, 0.86
 # Height over length; length over width, and twice that over the height.
 BUILDS = frozenset(("tall", "long"))
 TALL, MAYBE_TALL, LONG, MAYBE_LONG = 1.8, 1.3, 2.5, 1.8
-MIN_LONG_M = 1.0  # so much at least is long or tall by itself; a smaller thing may be so for its kind
+MIN_LONG_M = 1.0  # minimum to be long or tall in general; a smaller object may be so for its kind
 # Longer over shorter side of that rectangle.
 SQUARE, MAYBE_SQUARE = 1.1, 1.25
 
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """``sides`` (3,): length, width and height in metres by the thing's own directions, the longer of the two first.
+    """``sides`` (3,): length, width and height in metres along the object's own axes, with length >= width.
 
-    ``words`` are sure; ``maybe`` are those that some people might say, the sure ones among them.
+    ``words`` are certain; ``maybe`` are possible, including the certain ones.
     """
 
     sides: Float64Array
@@ -244,13 +244,13 @@ class Appearance:
 
 
 def appearance_of(name: str, points: Float64Array, sight: Sight | None, *, is_cut: bool) -> Appearance:
-    """How a thing of that name looks, by its points (N, 3), z up, without strays; of a shape that is cut all may be."""
+    """The looks of a named object by its points (N, 3), z up, without outliers; if it is cut, any shape is possible."""
     sides, words, maybe = _shape(points, has_top=last_word(name) in WITH_TOP)
     if is_cut or min(sides[0], max(sides[1:])) < MIN_SIDE_M:
         words, maybe = frozenset(), SHAPES
-    elif sides[2] < FLAT_M:  # what lies on the floor may go on under the furniture
+    elif sides[2] < FLAT_M:  # objects on the floor may continue under the furniture
         words, maybe = words - {"square", "rectangular"}, maybe | {"square", "rectangular"}
-    elif last_word(name) == "box" and sides[2] > SQUARE * sides[0]:  # its side is as much its face as its lid
+    elif last_word(name) == "box" and sides[2] > SQUARE * sides[0]:  # its side is as much its face as its top
         words, maybe = words - {"square"}, maybe | {"rectangular"}
     if last_word(name) not in WITH_SHAPE:
         words, maybe = frozenset(), SHAPES
@@ -264,7 +264,7 @@ def appearance_of(name: str, points: Float64Array, sight: Sight | None, *, is_cu
 
 
 def _build(name: str, sides: Float64Array) -> tuple[frozenset[str], frozenset[str]]:
-    """Whether a thing is long or tall by itself, for sure and perhaps; of what is soft or built in nobody says so."""
+    """Words for a long or tall object, certain and possible; none for soft or built-in objects."""
     length, width, height = map(float, sides)
     if last_word(name) in SOFT | FIXTURES:
         return frozenset(), frozenset()
@@ -278,7 +278,7 @@ def _words(**holds: bool) -> frozenset[str]:
 
 
 def _shape(points: Float64Array, *, has_top: bool) -> tuple[Float64Array, frozenset[str], frozenset[str]]:
-    """The sides of a thing, the words that are sure for the shape of its face, and those that may be."""
+    """The sides of an object, the certain words for the shape of its face, and the possible ones."""
     import cv2
 
     height = float(np.ptp(points[:, 2]))
@@ -312,22 +312,22 @@ def _shape(points: Float64Array, *, has_top: bool) -> tuple[Float64Array, frozen
     return sides, words, maybe
 
 
-# A word for more of a measure, one for less where people have one that says nothing else, and how much more the
-# extreme one of a name must have than every other; ours.
+# A word for more of a measure, one for less if there is an unambiguous one, and the factor by which the extreme object
+# of a name must differ from every other; ours.
 SIZES: tuple[tuple[str, str, float], ...] = (
     ("large", "small", 2.0),
     ("long", "", 1.5),
     ("wide", "narrow", 1.5),
     ("tall", "", 1.5),
 )
-LEAD = 1.25  # ours: of the longest side, by which one sees a size from where one stands
+LEAD = 1.25  # ours: lead in the longest side from which a size difference is visible from any viewpoint
 
 
 def measure_of(name: str, looks: Appearance, word: str) -> float | None:
-    """How large, long, wide or tall a thing of that name is, as people see it; None where they would not say so of it.
+    """How large, long, wide or tall a named object appears; None if the word does not apply.
 
-    Large is the volume, of what is flat or soft the area of its face, for how thick a cushion is depends on how it
-    leans; what stands is wide and not long, what lies flat is not tall, and what is soft is none of these three.
+    Large is the volume, for flat or soft objects the area of the face, because how thick a cushion is depends on how it
+    leans; upright objects are wide and not long, flat-lying ones are not tall, and soft ones none of the three.
     """
     length, width, height = map(float, looks.sides)
     least, middle, longest = sorted((length, width, height))

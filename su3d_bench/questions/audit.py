@@ -18,8 +18,8 @@ from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, ques
 from su3d_bench.questions.model import GENERATED_KINDS, REASONING, Answer, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 
-RETRIEVAL = "retrieval"  # stands for all kinds of queries, as ``REASONING`` for all templates
-MIN_PER_TEMPLATE = 20  # questions of a template and scene among which is drawn: enough for every kind to have its share
+RETRIEVAL = "retrieval"  # selects all kinds of queries, as ``REASONING`` selects all templates
+MIN_PER_TEMPLATE = 20  # minimum pool of questions per template and scene: enough for every kind to get its share
 Things = tuple[MapObject, ...]
 
 
@@ -133,7 +133,7 @@ def _called_as(things: Sequence[MapObject], objects: SceneMap) -> Things:
 
 
 def _related(query: Question, right: Things, objects: SceneMap) -> Things:
-    """The reference objects of a relation query: those related to an answer, or else all of the name."""
+    """The reference objects of a relation query: those related to an answer, otherwise all with the name."""
     first, _, second = query.text.partition(" between the ")[2].partition(" and the ")
     if first and second:
         return tuple(thing for thing in objects.objects if thing.name in (first, second))

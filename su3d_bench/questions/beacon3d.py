@@ -1,16 +1,16 @@
 """Beacon3D: file formats, metrics and an LLM judge for free-form answers.
 
-A metadata file (``metadata_*.json``) has scenes, in these classes, in these objects by their numbers. Of grounding an
-object has three chains of ``text``, ``obj_id`` and ``tag``, the finest text first; of question answering it has ``qa``,
-three of ``question``, ``answer``, ``tag`` and ``extra_knowledge``. The lists without ``metadata`` in their names, in
-whose order systems answer, have each text of a scene once. Numbers are shares of 1.
+A metadata file (``metadata_*.json``) has the nested levels scene, class, and object by number. For grounding an object
+has three chains of ``text``, ``obj_id`` and ``tag``, the most specific text first; for question answering it has
+``qa``, three entries of ``question``, ``answer``, ``tag`` and ``extra_knowledge``. The lists without ``metadata`` in
+their names, which define the order of answers, have each text of a scene once. Numbers are fractions of 1.
 
 Source: README.md, data/, utils.py, evaluate_grounding.py and evaluate_qa.py of beacon-3d/beacon-3d at 9cd8f1f. There a
-language model scores the answers from 1 to 5 that do not match a right one; here such scores are read where answers
-have them, and where not, the least and the most are given that any judge could make of it. The cleaning of answers is
-that of SQA3D. What seems odd is the original's: any right answer with "no" in it, north too, is one to a question of
-yes or no, and an empty answer is a part of every right one. The judge's prompt is ours; a reply whose first number is
-none from 1 to 5 leaves the answer open, where the original would stop or take it.
+language model scores answers that do not match a correct one from 1 to 5; here such scores are read if answers have
+them, otherwise the minimum and maximum over all possible scores are reported. Answers are cleaned as in SQA3D. These
+oddities are the original's: any correct answer containing "no", such as north, counts as one to a yes-no question, and
+an empty answer is a part of every correct one. The judge's prompt is ours; a reply whose first number is not 1 to 5
+leaves the answer open, whereas the original would stop or accept it.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.questions.query_files import ObjectId, Words, validated
 
 PAGE = "https://github.com/beacon-3d/beacon-3d"
-MAX_BYTES = 64 << 20  # the largest of the release has half of one MiB
-MAX_CHARACTERS = 10_000  # of an answer
+MAX_BYTES = 64 << 20  # the largest file of the release has 0.5 MiB
+MAX_CHARACTERS = 10_000  # per answer
 ANSWER_KEYS = ("response_pred", "answer_pred", "text", "answer_top10", "pred_response", "pred")  # in this order
 
 
@@ -55,7 +55,7 @@ class ObjectQuestion:
 
 @dataclass(frozen=True)
 class Chains:
-    """The cases of each scene, and of every entry of the list in whose order answers come: scene and case."""
+    """The cases of each scene, and (scene, case) of every entry of the list that defines the order of answers."""
 
     cases: Mapping[str, tuple[ChainedText, ...]]
     entries: tuple[tuple[str, int], ...]
@@ -72,14 +72,14 @@ class Reply:
 
 @dataclass(frozen=True)
 class Questions:
-    """Three questions of each object, one after the other; ``entries``: those of the list, each text once a scene."""
+    """Three questions per object, in order; ``entries``: those of the list, each text once per scene."""
 
     asked: tuple[ObjectQuestion, ...]
     entries: tuple[ObjectQuestion, ...]
 
 
 def kind_of_metadata(content: Any) -> str | None:
-    """``grounding`` or ``qa``, as the first object of a metadata file has chains or questions; None for others."""
+    """``grounding`` or ``qa``, if the first object of a metadata file has chains or questions; otherwise None."""
     for _ in range(3):
         if not isinstance(content, Mapping) or not content:
             return None
@@ -134,10 +134,10 @@ Asking = Annotated[dict[str, dict[str, dict[str, _AskedObject]]], Field(min_leng
 
 
 def chains_of(content: Any, where: str) -> Chains:
-    """The chains of all objects; an object's id is one more than in the file, as ScanNet's truth numbers them here.
+    """The chains of all objects; an object's id is one more than in the file, as in ScanNet's ground truth here.
 
-    A text that is spelt in several ways is one case, with the objects of the spelling that comes last, as the original
-    has it. Its tags must agree wherever it stands.
+    A text with several spellings is one case, with the objects of the last spelling, as in the original. Its tags must
+    agree in all places.
     """
     cases: dict[str, dict[str, ChainedText]] = {}
     order: dict[tuple[str, str], None] = {}
@@ -151,7 +151,7 @@ def chains_of(content: Any, where: str) -> Chains:
                     ids = tuple(dict.fromkeys(object_id + 1 for object_id in entry.obj_id))
                     before = known.get(key) or ChainedText(entry.text, ids, tags=tags)
                     if before.tags != tags:
-                        raise DataError(f"{where}: '{printable(entry.text, 60)}' of {scene} has two sorts of tags")
+                        raise DataError(f"{where}: '{printable(entry.text, 60)}' of {scene} has two different tags")
                     is_new = (scene, entry.text) not in order
                     text, ids = (entry.text, ids) if is_new else (before.text, before.object_ids)
                     order[scene, entry.text] = None
@@ -170,7 +170,7 @@ def questions_of_objects(content: Any, where: str) -> Questions:
     for scene, classes in validated(Asking, content, where).items():
         for row in (row for of_class in classes.values() for known in of_class.values() for row in known.qa):
             if tags.setdefault((scene, row.question.lower()), row.tag) != row.tag:
-                raise DataError(f"{where}: '{printable(row.question, 60)}' of {scene} has two sorts of tags")
+                raise DataError(f"{where}: '{printable(row.question, 60)}' of {scene} has two different tags")
             asked.append(ObjectQuestion(scene, row.question, row.answer, row.tag.lower()))
             entries.setdefault((scene, row.question), asked[-1])
     if not asked:
@@ -181,7 +181,7 @@ def questions_of_objects(content: Any, where: str) -> Questions:
 def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
     """Correctness of each case per scene, from answers in the order of the list.
 
-    An answer says ``correct``, or ``object_id``, which is right where the text means that object.
+    An answer has ``correct``, or ``object_id``, which is correct if the text refers to that object.
     """
     found = _answers(path, _Found, len(chains.entries))
     right: dict[str, dict[int, bool]] = {}
@@ -198,8 +198,8 @@ def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
 def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Reply]:
     """The answers of each scene, keyed by the lower-case question.
 
-    Where the first answer is of another scene than the first question, answers come in the order of the scenes' names,
-    as the original takes them.
+    If the first answer and the first question are of different scenes, answers are in the order of the scene names, as
+    in the original.
     """
     found = _answers(path, _Replied, len(questions.entries))
     entries = list(questions.entries)
@@ -231,7 +231,7 @@ def _judging() -> dict[str, Any]:
 
 
 def cleaned(answer: str) -> str:
-    """An answer without articles and signs, small numbers in words.
+    """An answer without articles and punctuation, with small numbers in words.
 
     >>> cleaned(" The  2 chairs. ")
     'two chairs'
@@ -243,7 +243,7 @@ def cleaned(answer: str) -> str:
 
 
 def match(given: str, right: Sequence[str]) -> tuple[bool, bool]:
-    """Whether a cleaned answer is a right one (EM), and whether one is at least part of the other (EM-R).
+    """Whether a cleaned answer equals a correct one (EM), and whether one contains the other (EM-R).
 
     >>> match("white", ["off-white"]), match("white", ["white"]), match("red", ["white"])
     ((False, True), (True, True), (False, False))
@@ -263,14 +263,14 @@ def is_yes_or_no(right: Sequence[str]) -> bool:
 
 
 MIN_SCORE, MAX_SCORE = 1.0, 5.0
-RIGHT_FROM = 4.0  # the score from which an answer counts as right for its object
-FIRST = ("case", "object")  # of the numbers
+RIGHT_FROM = 4.0  # the score from which an answer counts as correct for its object
+FIRST = ("case", "object")  # the first of the numbers
 TAGS = ("class", "appearance", "geometry", "spatial", "existence", "functionality")
 
 
 @dataclass(frozen=True)
 class Number:
-    """A share of ``n``; ``least`` and ``most`` differ where answers wait for a judge."""
+    """A fraction of ``n``; ``least`` and ``most`` differ if answers have no judge score."""
 
     name: str
     least: float
@@ -279,9 +279,9 @@ class Number:
 
 
 def grounding_numbers(chains: Chains, right: Mapping[str, Mapping[int, bool]]) -> list[Number]:
-    """The numbers of all scenes together; those of which nothing was asked are left out.
+    """The numbers over all scenes, without those for which there are no questions.
 
-    ``right``: of each scene, for each case by its place, whether it was found.
+    ``right``: for each scene and each case by position, whether it was found.
     """
     rows: dict[str, list[bool]] = {}
     for scene, cases in chains.cases.items():
@@ -294,7 +294,7 @@ def grounding_numbers(chains: Chains, right: Mapping[str, Mapping[int, bool]]) -
 
 
 def answer_numbers(questions: Questions, replies: Mapping[tuple[str, str], Reply]) -> list[Number]:
-    """EM, EM-R, the share that needs no judge or has one, and the scores per case, object and kind of knowledge."""
+    """EM, EM-R, the share with a final score, and the scores per case, object and kind of knowledge."""
     each = [scored(replies[one.scene, one.question.lower()]) for one in questions.asked]
     em, em_r, low, high = (np.array(column, float) for column in zip(*each, strict=True))
     n, tags = len(each), [one.tag for one in questions.asked]
@@ -311,7 +311,7 @@ def answer_numbers(questions: Questions, replies: Mapping[tuple[str, str], Reply
 
 
 def scored(reply: Reply) -> tuple[bool, bool, float, float]:
-    """EM and EM-R of an answer and its least and most score.
+    """EM and EM-R of an answer and its minimum and maximum score.
 
     >>> scored(Reply("Yes, there is.", "Yes", None))
     (False, True, 5.0, 5.0)
@@ -330,9 +330,9 @@ def _share(scores: Float64Array | Sequence[float]) -> float:
 
 
 _NUMBER = re.compile(r"\d+")
-MAX_READ = 8000  # characters of a reply
+MAX_READ = 8000  # characters per reply
 
-Key = tuple[str, str]  # of a question: its scene, and its text in lower case
+Key = tuple[str, str]  # of a question: its scene and its lower-case text
 
 
 @dataclass(frozen=True)
@@ -378,7 +378,7 @@ def judged(replies: Mapping[Key, Reply], model: LanguageModel, config: LanguageC
 
 
 def score_of(reply: ModelReply) -> float | None:
-    """The first number of a reply if it is a valid score, else None.
+    """The first number of a reply if it is a valid score, otherwise None.
 
     >>> score_of(ModelReply("Score: 4")), score_of(ModelReply("10")), score_of(ModelReply("good"))
     (4.0, None, None)
@@ -444,7 +444,7 @@ def answered_table(answered: Answered) -> Table:
 
 def _judge_summary(judged: Judged) -> str:
     model, asked = printable(judged.model, 100), counted(judged.n_asked, "answer")
-    line = f"judge: {model}, asked for {asked} that match no right one, with a prompt of this program's own"
+    line = f"judge: {model}, asked for {asked} that match no correct one, with this program's own prompt"
     if not judged.n_open:
         return line
     return f"{line}; {counted(judged.n_open, 'reply')} without a score, shown as a range"

@@ -1,12 +1,13 @@
 """Text chains and questions about single objects in the style of Beacon3D, generated from ground truth.
 
-The finest text of a chain means one object alone: by a property, by where it is, or by its name. Before it comes the
-name, which means every thing so called. An object has three chains; one with fewer such texts is not asked for.
+The most specific text of a chain refers to exactly one object: by a property, by its position, or by its name. The
+other text is the name, which refers to every object with it. An object has three chains; one with fewer such texts is
+not used.
 
-An object that has three chains of texts is asked about three times, each time under a text that means it alone: what
-it stands on (class), its colour (appearance), whether it is taller or larger than another (geometry), what it is next
-to or closer to (spatial), what is next to it (existence). What a slightly other threshold would answer otherwise, or no
-frame shows plainly, is not asked. Templates are ours.
+For an object with three chains there are three questions, each using an unambiguous text: what it stands on (class),
+its colour (appearance), whether it is taller or larger than another (geometry), what it is next to or closer to
+(spatial), what is next to it (existence). A question is excluded if a slightly different threshold would change its
+answer, or if no frame shows the answer clearly. Templates are ours.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def chains_of(
 ) -> tuple[ChainedText, ...]:
     """All distinct texts of the chains, in the order of the objects.
 
-    Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
+    If several texts refer to an object, those that come first by a digest are used, alternating between the sorts.
     """
     cases: dict[str, ChainedText] = {}
     for number, (_, chains) in enumerate(islice(_chains(questions, objects), max_objects)):
@@ -71,7 +72,7 @@ def _chains(questions: Sequence[Question], objects: SceneMap) -> Iterator[tuple[
 
 
 def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
-    """Properties and relations that one object alone has, one sort after the other, each sort by a digest."""
+    """Properties and relations of only this object, alternating between the sorts, each sort ordered by a digest."""
     alone = {
         one.text: one for one in questions if one.answers == (object_id,) and one.kind.startswith((PROPERTY, RELATIVE))
     }
@@ -85,7 +86,7 @@ def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
 
 
 def _tags(question: Question) -> frozenset[str]:
-    """By what a text tells its objects, in Beacon3D's words.
+    """The tags of what a text refers to its objects by, as in Beacon3D.
 
     >>> from su3d_bench.questions.model import new_question
     >>> sorted(_tags(new_question("a/b", "property", "red chair", (1,), "")))
@@ -99,15 +100,15 @@ def _tags(question: Question) -> frozenset[str]:
     return frozenset(("class", "geometry" if is_form else "appearance"))
 
 
-MIN_HEIGHT_RATIO = 1.5  # ours: times as high, from which anybody says so
-LEAD_M, FAR_M = 0.5, 1.5  # ours: by how much the closer one leads; how far away is surely not next to it
+MIN_HEIGHT_RATIO = 1.5  # ours: the height ratio from which taller is undisputed
+LEAD_M, FAR_M = 0.5, 1.5  # ours: the margin of the closer one; the distance from which it is clearly not next to it
 MAX_UNQUOTED_WORDS = 3  # words of a text that needs no quotation marks in a question
-MAX_PER_TEMPLATE = 4  # of one template about one object
+MAX_PER_TEMPLATE = 4  # questions of one template about one object
 
 
 @dataclass(frozen=True)
 class GeneratedQuestionRecord:
-    """A question of an object; ``hint`` are the words on which the answer rests: a text with them gives it away."""
+    """A question about an object; ``hint`` are the words that determine the answer: a text with them reveals it."""
 
     text: str
     answer: str
@@ -116,9 +117,9 @@ class GeneratedQuestionRecord:
 
 
 def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -> tuple[dict[str, Any], ...]:
-    """The classes of a scene in the form of ``metadata_*_grounding.json`` and of ``metadata_*_qa.json``.
+    """The classes of a scene in the format of ``metadata_*_grounding.json`` and of ``metadata_*_qa.json``.
 
-    Ids are one less than here, as in ScanNet. Objects of which fewer than three questions can be asked are in neither.
+    Ids are one less than here, as in ScanNet. Objects with fewer than three possible questions are in neither.
     """
     grounding: dict[str, Any] = {}
     asked: dict[str, Any] = {}
@@ -141,7 +142,7 @@ def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -
 
 
 def made_files(scenes: Mapping[str, SceneMap], per_scene: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The contents of both metadata files for scenes by their names, ``per_scene`` objects of each at most."""
+    """The contents of both metadata files for scenes by name, with at most ``per_scene`` objects of each."""
     grounding: dict[str, Any] = {}
     asked: dict[str, Any] = {}
     for scene, objects in scenes.items():
@@ -159,8 +160,8 @@ def _entry(case: ChainedText) -> dict[str, Any]:
 
 
 def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[GeneratedQuestionRecord]:
-    """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
-    # a text that holds the words on which an answer rests gives it away
+    """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
+    # a text with the words that determine an answer reveals it
     asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
     every = [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
     turn = Counter[str]()
@@ -258,7 +259,7 @@ def _beside(
 
 
 def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
-    """Whether something of a name is next to an object; the answer is no where none is within reach."""
+    """Whether an object with a name is next to an object; the answer is no if all such objects are far away."""
     names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
     ways = Counter[str]()
     for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):

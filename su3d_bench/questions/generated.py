@@ -1,9 +1,9 @@
 """Questions about a scene generated from templates, with answers computed from geometry.
 
-Each question is about names that stand in the scene, asked so that the answer is one and that nobody would dispute it:
-what is closest leads by a margin, references are single objects, pairs near a threshold are left out, yes and no are
-equally frequent, and what no frame shows plainly is neither asked for nor an answer. Left and right depend on who
-looks, and are asked only where an eye is given.
+Each question is about object names of the scene and has one undisputed answer: the closest object leads by a margin,
+references are single objects, pairs near a threshold are excluded, yes and no are equally frequent, and objects that no
+frame shows clearly are neither asked about nor answers. Left and right depend on the viewpoint and are only asked if an
+eye position is given.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from su3d_bench.questions.model import Answer
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
-MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # by which the closest leads: metres, and of the longest side of what is compared
-LEVEL_M = 0.75  # things whose middles differ more in height are not compared by distance
-FAR_M = 1.5  # of what is asked about with the answer no
-MAX_BETWEEN = 2  # more things between two are no answer that one would give
-BETWEEN_M = 2.5  # nobody looks farther for what is between
-MAX_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
-DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess is right within this
-PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated by the row or the pile
+MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of the longest side compared
+LEVEL_M = 0.75  # objects whose centres differ more in height are not compared by distance
+FAR_M = 1.5  # minimum distance of objects in questions with the answer no
+MAX_BETWEEN = 2  # questions with more objects between two are not asked
+BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
+MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
+DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated per row or pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 CENTRES = ", measured between centres"
 Random = np.random.Generator
@@ -48,8 +48,8 @@ Random = np.random.Generator
 class GeneratedQuestion:
     """A question with its ground-truth answer; ``kind`` names the template.
 
-    ``by_chance``: how often a guess among what could be answered is right; ``by_name``: how often one is who knows what
-    each object is called and nothing else.
+    ``by_chance``: how often a random guess among the possible answers is correct; ``by_name``: how often a guess is
+    correct that only uses the object names.
     """
 
     text: str
@@ -61,7 +61,7 @@ class GeneratedQuestion:
 
 @dataclass(frozen=True)
 class _Draft:
-    """A text with the shares that are right ``by_chance`` and ``by_name``; of one ``part`` as many as of another."""
+    """A text with its accuracies ``by_chance`` and ``by_name``; each ``part`` is drawn equally often."""
 
     text: str
     by_chance: float
@@ -72,7 +72,7 @@ class _Draft:
 def generate_questions(
     scene: SceneMap, *, n_each: int = 5, seed: int = 0, eye: Float64Array | None = None
 ) -> tuple[GeneratedQuestion, ...]:
-    """Up to ``n_each`` questions of each kind, drawn with ``seed``; the built-in solver supplies the truth."""
+    """Up to ``n_each`` questions of each kind, drawn with ``seed``; the built-in solver computes the answers."""
     random = np.random.default_rng(seed)
     solver = Solver(scene, eye)
     questions: list[GeneratedQuestion] = []
@@ -86,9 +86,9 @@ def generate_questions(
 
 
 def _drawn(drafts: Sequence[_Draft], n: int, random: Random) -> list[_Draft]:
-    """``n`` at most, in the order of their texts: as many of one part as of the other, of several in turn.
+    """At most ``n``, ordered by text: equally many of two parts, or of several parts in turn.
 
-    A single one is of any part.
+    A single draft may be of any part.
     """
     parts: dict[str, list[_Draft]] = {}
     for draft in sorted({draft.text: draft for draft in drafts}.values(), key=lambda draft: draft.text):
@@ -227,7 +227,7 @@ class _Drafts:
                     yield _Draft(text, 0.5, 0.5, "yes" if is_locked[name] else "no")
 
     def _holds(self, relation: Relation, a: MapObject, b: MapObject) -> bool:
-        """Whether people would say so: a cushion is within the box of a sofa, and on it."""
+        """Whether the relation holds in common usage: a cushion within the box of a sofa is on it, not in it."""
         is_also_on = relation == "in" and self._scene.holds("on", a, b)
         return self._scene.holds(relation, a, b) and not is_also_on
 
@@ -259,7 +259,7 @@ def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool
 
 
 RANDOM, POPULAR, ADVERSARIAL = SAMPLINGS
-# Labels of what nobody sorted: no thing to ask for.
+# Labels of unsorted points, which are not objects to ask for.
 _NO_NAMES = frozenset((
     "object", "objects", "other", "undefined", "background", "unannotated", "void",
     "unknown", "unknown/remove", "partial",  # HM3DSem's
@@ -270,10 +270,10 @@ Rooms = Sequence[Sequence[str]]
 def presence_questions(
     scene: str, truth: GroundTruth, objects: SceneMap, n_things: int, rooms: Rooms
 ) -> tuple[PresenceQuery, ...]:
-    """At most ``n_things`` things that a scene has, each with one that it has not, under every sampling.
+    """At most ``n_things`` object names of a scene, each with an absent one, under every sampling.
 
-    Asked for is what a frame shows plainly; absent is what is called like nothing that is there, seen or not. ``rooms``
-    list what stands in each of some rooms.
+    Present names are of objects that a frame shows clearly; absent names match no object of the scene, seen or not.
+    ``rooms`` lists the object names in each of several rooms.
     """
     seen = {thing.name for thing in objects.objects if thing.is_query_target}
     there = _by_digest(scene, (name for name in seen if _is_name(name)))[:n_things]
@@ -288,7 +288,7 @@ def presence_questions(
 
 
 def absent_names(truth: GroundTruth, objects: SceneMap) -> tuple[str, ...]:
-    """The classes of the truth's label set that no object of the scene, however small, may be called."""
+    """The classes of the label set that match no object of the scene, however small."""
     ids = np.unique(truth.semantic)
     there = {plain_name(truth.labels.name_of(int(class_id))) for class_id in ids[ids > 0]}
     there |= {thing.name for thing in objects.objects}
@@ -308,11 +308,11 @@ def _may_be(one: str, other: str) -> bool:
 def drawn(
     scene: str, sampling: str, there: Sequence[str], absent: Sequence[str], rooms: Rooms
 ) -> Iterator[tuple[str, str | None]]:
-    """Each thing that is ``there`` with the next ``absent`` one, none twice; None where there is none left.
+    """Each name in ``there`` with the next ``absent`` one, each used once; None if none is left.
 
-    At random: by a digest of scene and name. Popular: the next in falling number of rooms that have it. Adversarial:
-    the next in falling number of rooms that have both. Equal numbers in the order of first appearance, as POPE has it;
-    where nothing is left of these, at random.
+    Random: by a digest of scene and name. Popular: by decreasing number of rooms that contain it. Adversarial: by
+    decreasing number of rooms that contain both. Ties keep the order of first appearance, as in POPE; if none of these
+    is left, random.
 
     >>> rooms = [["bed", "lamp", "pillow"], ["bed", "pillow"], ["sink", "lamp"], ["lamp"]]
     >>> [list(drawn("a/b", way, ["bed"], ["pillow", "lamp", "sink"], rooms)) for way in ("popular", "adversarial")]
@@ -336,7 +336,7 @@ def _by_digest(scene: str, names: Iterable[str]) -> list[str]:
 
 
 def _listed(name: str, listed: Sequence[str]) -> str | None:
-    """What rooms have a thing under: its own name, or else the first that means the same."""
+    """The name used for an object in the room lists: its own name, otherwise the first with the same meaning."""
     return name if name in listed else next((one for one in listed if _may_be(name, one)), None)
 
 
@@ -352,6 +352,6 @@ def _often_with(name: str | None, rooms: Rooms) -> list[str]:
 
 @cache
 def counted_rooms() -> tuple[tuple[str, ...], ...]:
-    """What stands in each of the built-in rooms over which it is counted, by the names of classes."""
+    """The class names in each of the built-in rooms, for the popular and adversarial samplings."""
     table = parse_toml(file_text(Path(__file__).with_name("rooms.toml")))
     return tuple(tuple(names) for names in table["rooms"].values())

@@ -1,9 +1,9 @@
-"""Questions with known answers, made from any ground truth that has classes: names, uses, sizes, colours, relations.
+"""Questions with known answers, generated from any ground truth with classes: names, uses, sizes, colours, relations.
 
-All objects that answer are carried. What more than a third of a scene's objects answer is dropped, and so is what an
-object answers that no frame shows plainly, or that a little other threshold would decide otherwise. Properties and
-relations are asked where another object of the same name is not an answer; where the name alone gives the answer they
-are of a kind of their own.
+Every question has all its answer objects. Questions are dropped if more than a third of a scene's objects are answers,
+if no frame shows an answer object clearly, or if a slightly different threshold would change the answer. Properties and
+relations are asked if another object of the same name is not an answer; if the name alone gives the answer, they are a
+separate kind.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
 
 SOURCE = "generated"
-MAX_ANSWER_SHARE = 1 / 3  # ours: what more objects answer asks for nothing
-TWICE = 2.0  # ours: volume, as a multiple of the others', from which anybody calls a thing large
-FLAT_SHARE = 0.2  # ours: a thing is flat whose least side is so much of the next; nobody speaks of its volume
-WITHOUT_SIZE = frozenset(("book",))  # in scans they are annotated by the row
-BETWEEN_M = 2.0  # ours: nobody looks farther for what something is between
+MAX_ANSWER_SHARE = 1 / 3  # ours: questions with a larger share of answer objects are too general
+TWICE = 2.0  # ours: the volume ratio from which an object is clearly large
+FLAT_SHARE = 0.2  # ours: an object is flat if its shortest side is below this share of the next; volume is meaningless
+WITHOUT_SIZE = frozenset(("book",))  # in scans they are annotated per row
+BETWEEN_M = 2.0  # ours: objects farther apart are not asked about with "between"
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """A text of a kind with some of its answers; ``name``: what its subject is called, empty where it asks for that."""
+    """A text of a kind with some of its answers; ``name`` of its subject, empty if the question asks for the name."""
 
     kind: str
     text: str
@@ -44,7 +44,7 @@ class _Asked:
 
 
 def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
-    """The questions of all kinds, ``per_kind`` of each at most, drawn by a digest of the text: always the same."""
+    """The questions of all kinds, at most ``per_kind`` of each, drawn deterministically by a digest of the text."""
     right: dict[tuple[str, str, str], set[int]] = {}
     doubtful: set[str] = set()
     for asked in _texts(objects):
@@ -74,9 +74,9 @@ def chosen(questions: Sequence[Question], per_kind: int | None) -> tuple[Questio
 
 
 def accuracy_by_name(question: Question, objects: SceneMap) -> float:
-    """How often a system is right that knows what each object is called and nothing else; 0 without known answers.
+    """The accuracy of a system that only knows the object names; 0 without known answers.
 
-    It takes one of those that the question names, and where it names none (a use) it knows which serve.
+    It picks one of the objects that the question names; if it names none (a use), the system knows which ones serve it.
     """
     if not question.answers:
         return 0.0
@@ -89,13 +89,13 @@ def accuracy_by_name(question: Question, objects: SceneMap) -> float:
 
 @cache
 def _table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """``names``: a class -> its other names; ``uses``: what things are for -> every class that serves."""
+    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it."""
     table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
     return {phrase: tuple(entries) for phrase, entries in table[section].items()}
 
 
 def _texts(objects: SceneMap) -> Iterator[_Asked]:
-    """Texts with some of their answers each; one without an answer must not be asked at all."""
+    """Texts, each with some of its answers; a text without an answer must not be asked."""
     names = sorted({thing.name for thing in objects.objects})
     for name in names:
         yield _Asked("instance", name, _ids(objects, name))
@@ -117,13 +117,13 @@ def _ids(objects: SceneMap, name: str) -> tuple[int, ...]:
 
 
 def _called(objects: SceneMap, name: str) -> tuple[int, ...]:
-    """The objects that are called so, or something that ends so: an office chair is a chair, a plant stand no plant."""
+    """The objects whose name is or ends with ``name``: an office chair is a chair, a plant stand is not a plant."""
     wanted = words(name)
     return tuple(thing.id for thing in objects.objects if words(thing.name)[-len(wanted) :] == wanted)
 
 
 def _sizes(objects: SceneMap) -> Iterator[_Asked]:
-    """Large and small things among those of one name, where their boxes are those of the things themselves."""
+    """Large and small objects among those of one name, if their boxes are complete."""
     for name, n in Counter(thing.name for thing in objects.objects).items():
         named = [thing for thing in objects.objects if thing.name == name]
         if n < 2 or not all(thing.is_whole for thing in named) or any(map(is_flat, named)):
@@ -134,13 +134,13 @@ def _sizes(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def is_flat(thing: MapObject) -> bool:
-    """Whether a thing is so flat that nobody speaks of its volume."""
+    """Whether an object is so flat that its volume is not a meaningful size."""
     least, middle, _ = sorted(thing.size.tolist())
     return bool(least < FLAT_SHARE * middle)
 
 
 def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
-    """The largest (``sign`` 1) or smallest (-1), by twice the volume of the next and by its longest side; else None."""
+    """The largest (``sign`` 1) or smallest (-1), if it leads twofold in volume and in its longest side, else None."""
     ranked = sorted(things, key=lambda thing: -sign * float(np.prod(thing.size)))
     volumes, sides = ([measure(thing.size) for thing in ranked] for measure in (np.prod, np.max))
     if len(ranked) < 2 or max(volumes[:2]) < TWICE * min(volumes[:2]):
@@ -149,9 +149,9 @@ def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
 
 
 def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
-    """The words that are known of an object before its name, "red chair".
+    """The known adjectives of an object before its name, "red chair".
 
-    No colours where one so called has none that is known, and no materials: a painted chair may be of wood.
+    No colours if an object of that name has no known one; likewise for materials: a painted chair may be of wood.
     """
     words_of = {thing.id: frozenset(thing.caption.split()) for thing in objects.objects}
     without_colour = {thing.name for thing in objects.objects if not words_of[thing.id] & COLOURS}
@@ -163,9 +163,9 @@ def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def _looks(objects: SceneMap) -> Iterator[_Asked]:
-    """Shapes, colours and sizes in a recording: of those of one name, or whose names end with one word.
+    """Shapes, colours and sizes in a recording, among objects with one name or whose names end with one word.
 
-    A word is asked where it is sure of the answers and nobody would say it of another. Sizes are of what is seen whole.
+    A word is asked if it is certain for the answers and ruled out for all others. Sizes need completely seen objects.
     """
     names = {thing.name for thing in objects.objects}
     heads = Counter(last_word(name) for name in names)
@@ -186,7 +186,7 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def _none_is_more(word: str, known: Sequence[tuple[MapObject, Appearance]]) -> bool:
-    """Whether nothing that is not long (tall) by itself is as long (high) as what is; true of any other word."""
+    """Whether no object not called long (tall) is as long (high) as one that is; true for any other word."""
     axis = {"long": 0, "tall": 2}.get(word)
     if axis is None:
         return True
@@ -195,7 +195,7 @@ def _none_is_more(word: str, known: Sequence[tuple[MapObject, Appearance]]) -> b
 
 
 def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Iterator[_Asked]:
-    """The one that is large, small, long or tall beside every other of its name."""
+    """The object that is large, small, long or tall compared with every other of its name."""
     if len(known) < 2 or len({looks.is_flat for _, looks in known}) > 1:
         return
     for more, less, factor in SIZES:
@@ -215,7 +215,7 @@ def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Itera
 
 
 def _relations(objects: SceneMap) -> Iterator[_Asked]:
-    """What holds for sure; where a pair of these names is doubtful the text is not asked."""
+    """Relations that hold with certainty; if a pair of these names is doubtful, the text is not asked."""
     things = objects.objects
     for relation in RELATIONS:
         if relation == "near":
@@ -232,7 +232,7 @@ def _relations(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def _between(objects: SceneMap) -> Iterator[_Asked]:
-    """What stands between two things of which the scene has one each, on one level with both."""
+    """Objects between two others with unique names, all on one level."""
     n_of = Counter(thing.name for thing in objects.objects)
     single = [
         thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_query_target and not thing.is_cut
@@ -249,6 +249,6 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
 
 
 def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:
-    """Whether nothing can be between the two: they stand side by side, or one holds the other."""
+    """Whether nothing can be between the two, because they are next to each other or one is on or in the other."""
     held = any(objects.holds(name, *pair) for name in ("on", "in") for pair in ((a, b), (b, a)))
     return held or objects.holds("next to", a, b)

@@ -28,11 +28,11 @@ from su3d_bench.questions.solver import BUILT_IN, MapSolver, built_in, given_ans
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
-# The truth with the most classes, where it is not the first that a dataset gives.
+# The ground truth with the most classes, if it is not the first of a dataset.
 FULLEST = ("scannet200-vertices",)
-BOXES = "boxes"  # the truth of which the least must be here
-MAX_KEPT = 4  # scenes whose objects are kept: every method and protocol asks for the same
-_Kept = OrderedDict[tuple[int, str, str, int], tuple[Any, SceneMap]]  # with the dataset, whose id is in the key
+BOXES = "boxes"  # the ground truth that needs the fewest files
+MAX_KEPT = 4  # scenes whose objects are cached: every method and protocol needs the same
+_Kept = OrderedDict[tuple[int, str, str, int], tuple[Any, SceneMap]]  # keeps the dataset, whose id is in the key
 _KEPT: _Kept = OrderedDict()
 
 
@@ -58,10 +58,9 @@ def question_truth(
     refine: Refine | None = None,
     solver: MapSolver | None = None,
 ) -> QuestionTruth | QueryTruth:
-    """The truth of a scene under a protocol that asks questions.
+    """The ground truth of a scene under a protocol that asks questions.
 
-    ``refine`` gives labels n', by vote where absent; ``solver`` answers questions to reasoning, the built-in one where
-    absent.
+    ``refine`` returns labels n' (default: by vote); ``solver`` answers reasoning questions (default: built-in).
     """
     assert rules.min_region_size is not None
     if rules.kind == "queries" and rules.questions == "dataset":
@@ -74,7 +73,7 @@ def question_truth(
     if rules.presence is not None:
         rooms = counted_rooms()
         asked = presence_questions(f"{dataset.name}/{scene}", truth, objects, rules.per_kind or len(objects), rooms)
-        return PresenceTruth(truth, asked, f"popular and adversarial by what stands in {len(rooms)} built-in rooms")
+        return PresenceTruth(truth, asked, f"popular and adversarial by the contents of {len(rooms)} built-in rooms")
     if rules.kind == "reasoning":
         return _reasoning_truth(rules, truth, objects, refine or voted_names, solver)
     if rules.questions == "dataset":
@@ -103,7 +102,7 @@ def _asked(question: Question, objects: SceneMap) -> score.TextTarget:
 
 
 def scene_objects(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> SceneMap:
-    """What questions on a scene are made from: its objects, whole where the dataset knows them, as frames show them."""
+    """The objects for the questions of a scene, complete if the dataset knows them, as frames show them."""
     key = (id(dataset), scene, truth.variant, min_vertices)
     if key not in _KEPT:
         while len(_KEPT) >= MAX_KEPT:
@@ -115,7 +114,7 @@ def scene_objects(dataset: Any, scene: str, truth: GroundTruth, min_vertices: in
 
 
 def _sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> Mapping[int, Sight] | None:
-    """What frames show of the objects; None where there are none, or where boxes do not tell which pixels are whose."""
+    """What frames show of the objects; None without frames, or if boxes do not determine which pixels are whose."""
     try:
         return None if truth.boxes is not None else sights(dataset, scene, truth, min_vertices)
     except FramesMissing:
@@ -151,7 +150,7 @@ def _reasoning_truth(
 def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:
     """The questions of a scene, at most ``per_kind`` of each kind.
 
-    Raises ``GroundTruthMissing`` where the scene has no truth to make them from.
+    Raises ``GroundTruthMissing`` if the scene has no ground truth to generate them from.
     """
     if own and has_own_queries(dataset):
         return chosen(own_questions(dataset, scene), per_kind)

@@ -19,7 +19,7 @@ from su3d_bench.metrics.matching.labelling import cosines
 from su3d_bench.opensu3d.tracking import cosine
 
 KINDS = ("instance", "affordance", "property", "relative")
-# Properties and relations that nothing else of the name lacks: the name alone gives the answer.
+# Properties and relations that all objects of the name have: the name alone gives the answer.
 BY_NAME = {"property": "property by name", "relative": "relative by name"}
 GENERATED_KINDS = (*KINDS, *BY_NAME.values())
 REASONING = "reasoning"
@@ -27,7 +27,7 @@ ALL_KINDS = (*GENERATED_KINDS, REASONING)
 
 
 def question_id(scene: str, kind: str, text: str) -> str:
-    """A short key that is the same wherever the same question is asked of the same scene.
+    """A short key that depends only on scene, kind and text.
 
     >>> question_id("rooms/living0", "instance", "chair")
     '3f6958fff541'
@@ -39,10 +39,9 @@ def question_id(scene: str, kind: str, text: str) -> str:
 class Question:
     """One question about one scene.
 
-    ``scene``: ``<dataset>/<scene>``; ``kind``: one of ``KINDS``, or ``reasoning``; ``answers``: ids of all instances
-    of the ground truth that are right, ascending, None where nobody knows; ``source``: where the question comes from.
-    ``reply``: the right answer in words, where a question has one besides objects; ``name`` and ``groups`` as in
-    ``TextQuery``.
+    ``scene``: ``<dataset>/<scene>``; ``kind``: one of ``KINDS``, or ``reasoning``; ``answers``: ids of all correct
+    ground-truth instances, ascending, None if unknown; ``source``: where the question comes from. ``reply``: the
+    correct answer in words, if a question has one besides objects; ``name`` and ``groups`` as in ``TextQuery``.
     """
 
     id: str
@@ -71,10 +70,10 @@ def new_question(
 
 @dataclass(frozen=True)
 class Answer:
-    """``text`` says it; ``object_ids`` are the answer, ``reference_ids`` what it was held against.
+    """``text`` is the answer in words, ``object_ids`` the answer objects, ``reference_ids`` the reference objects.
 
-    ``value`` is the number of a count, the metres of a distance, the truth of a yes-no question, else None; ``notes``
-    say what was assumed. Where ``is_decided`` is false, ``text`` says why.
+    ``value`` is a count, a distance in metres, or the boolean answer of a yes-no question, otherwise None; ``notes``
+    list assumptions. If ``is_decided`` is false, ``text`` is the reason.
     """
 
     text: str
@@ -87,7 +86,7 @@ class Answer:
     solver: Literal["built-in", "llm"] = "built-in"
 
     def as_value(self, like: float | int | bool) -> float | int | bool | None:
-        """What it says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
+        """The answer as a value like ``like``, read from its text if it has no value; None if there is none."""
         value = self.value
         if value is None and isinstance(like, bool):
             word = re.search(r"\b(yes|no)\b", self.text.lower())
@@ -108,7 +107,7 @@ def undecided(reason: str, notes: tuple[str, ...] = ()) -> Answer:
 
 
 MIN_SHARE = 0.6  # similarity_thresh of ConceptFusion's examples/demo_text_query.py (fa4e95b)
-BLOCK_ROWS = 65536  # of features that are looked at together: the table may be larger than memory
+BLOCK_ROWS = 65536  # features per block: the table may be larger than memory
 
 
 @dataclass(frozen=True)
@@ -139,10 +138,10 @@ def rank_all(instances: Instances, texts: Sequence[str], encoder: Encoder) -> tu
 
 
 def retrieved_points(dense: DenseFeatures, texts: Sequence[str], encoder: Encoder) -> Instances:
-    """An instance a text, of the points that ConceptFusion's own program shows for it.
+    """One instance per text, of the points that ConceptFusion's own program shows for it.
 
-    Similarities run from that of the least similar point, 0, to that of the most similar, 1; found is what reaches
-    ``MIN_SHARE`` of that. Points without a feature have no part; where all are equally similar nothing is found.
+    Similarities are scaled from 0 (least similar point) to 1 (most similar); points reaching ``MIN_SHARE`` are found.
+    Points without a feature are ignored; if all points are equally similar, none is found.
     """
     encoded = _encoded(texts, encoder, dense.features.shape[1] if len(dense.points) else None)
     low, high = np.full(len(texts), np.inf), np.full(len(texts), -np.inf)

@@ -1,9 +1,9 @@
-"""A user's text queries with the objects that they speak of: a TOML file of ``[[query]]`` tables, or a CSV file.
+"""A user's text queries with the objects that they refer to: a TOML file of ``[[query]]`` tables, or a CSV file.
 
 Each has ``scene`` (``room0`` or ``replica/room0``), ``text``, and ``objects``: instance ids of the ground truth, a
-list in TOML, separated by blanks in CSV. It may have ``kind`` (instance, affordance, ...) and ``source``. Texts are
-data: anything but control characters stands in them as it is. Also here: the groups in which sentences are scored
-apart (unique and multiple, easy and hard, view-dependent and not), and lists of questions that are not to be asked.
+list in TOML, separated by spaces in CSV. It may have ``kind`` (instance, affordance, ...) and ``source``. Texts are
+data: anything except control characters is kept as it is. Also here: the groups in which sentences are scored
+separately (unique and multiple, easy and hard, view-dependent and not), and lists of excluded questions.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from su3d_bench.formats.tables.table import meant, separated_rows
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
-MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
+MORE_COLUMNS = ("kind", "source")  # optional, in any order after the others
 MAX_OBJECTS_ID = 2**31 - 1
 ADVICE = "pass a TOML or CSV query file, e.g. from su3d-bench query make --out queries.toml"
 MAX_BYTES = 16 << 20  # some hundred thousand queries
-MAX_CHARACTERS = 20_000  # of one text
+MAX_CHARACTERS = 20_000  # per text
 VARIANT = "query-objects"
 
 
@@ -57,7 +57,7 @@ ObjectId = Annotated[int, Field(ge=0, lt=MAX_OBJECTS_ID)]
 
 
 def validated(kind: Any, content: Any, where: str) -> Any:
-    """``content`` as a pydantic type has it; ``DataError`` with the place and value of the first fault."""
+    """``content`` validated as a pydantic type; ``DataError`` with the place and value of the first error."""
     try:
         return _adapter(kind).validate_python(content)
     except ValidationError as error:
@@ -125,7 +125,7 @@ def query_truth(
 ) -> QueryTruth:
     """The queries of a scene over its ground-truth instances; unknown objects are an error.
 
-    Their groups are those of the file, by ``class_of`` where it names objects, and else by the classes of the truth.
+    Their groups are those of the file, by ``class_of`` if it names objects, otherwise by the classes of the truth.
     """
     known = set(np.unique(truth.instance[truth.instance > 0]).tolist())
     for query in queries:
@@ -152,7 +152,7 @@ def _toml_rows(text: str, where: str) -> Iterator[tuple[str, QueryRow]]:
 
 
 def csv_rows(text: str, where: str, separators: str = ",") -> list[list[str]]:
-    """The rows of a CSV text, parted by the one of ``separators`` that is most frequent in its first line."""
+    """The rows of a CSV text, split at the one of ``separators`` that is most frequent in its first line."""
     try:
         return separated_rows(text, max(separators, key=text.partition("\n")[0].count))
     except csv.Error as error:
@@ -181,9 +181,9 @@ def _number(word: str) -> int | str:
 UNIQUE, MULTIPLE = "unique", "multiple"
 EASY, HARD = "easy", "hard"
 BY_VIEW, BY_ANY_VIEW = "view-dependent", "view-independent"
-LEFT_OUT = "left out"  # of the evaluation of Nr3D with its candidates
+LEFT_OUT = "left out"  # excluded from the evaluation of Nr3D with its candidates
 PAIRS = ((UNIQUE, MULTIPLE), (EASY, HARD), (BY_VIEW, BY_ANY_VIEW))
-# ``type2class`` of data/scannet/model_util_scannet.py: what the table calls otherwise is one class, others.
+# ``type2class`` of data/scannet/model_util_scannet.py: all other names of the table are one class, others.
 CLASSES = frozenset((
     "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter", "desk", "curtain",
     "refrigerator", "shower curtain", "toilet", "sink", "bathtub",
@@ -193,16 +193,16 @@ OTHERS = "others"
 VIEW_WORDS = frozenset(
     ("front", "behind", "back", "right", "left", "facing", "leftmost", "rightmost", "looking", "across")
 )
-MAX_EASY_OBJECTS = 2  # objects of the class of the one that is meant, itself among them
-MAX_TOKENS = 24  # of a sentence that is scored: ``--max-seq-len``
+MAX_EASY_OBJECTS = 2  # objects of the target's class, including the target
+MAX_TOKENS = 24  # per scored sentence: ``--max-seq-len``
 ClassOfName = Callable[[str], str | None]  # the class of NYU40 that ScanNet's table gives a raw category
 
 
 def scanrefer_groups(queries: Sequence[TextQuery], class_of: ClassOfName) -> tuple[TextQuery, ...]:
     """The queries of a scene of ScanRefer's file, each with ``unique`` or ``multiple``.
 
-    Unique is what is the only object of its class among those that the file speaks of in the scene, by the name that
-    the first of its sentences has. Queries without a name stay as they are.
+    An object is unique if it is the only one of its class among the scene's objects in the file, by the name in its
+    first sentence. Queries without a name are unchanged.
     """
     known: dict[int, str] = {}
     for query in queries:
@@ -223,11 +223,11 @@ def _class(name: str, class_of: ClassOfName) -> str:
 
 
 def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str) -> tuple[str, ...]:
-    """The groups of a row of Nr3D's file, or ``LEFT_OUT``; ``at`` says where it stands.
+    """The groups of a row of Nr3D's file, or ``LEFT_OUT``; ``at`` is its location for messages.
 
-    ``stimulus`` is ``scan-class-n-target-others``, ``n`` the number of objects of the class; ``tokens`` a list of words
-    as Python writes it, ``mentions`` whether the sentence names the class: where it does not it is left out, and so is
-    one of more than 24 words or of an object that has none beside it.
+    ``stimulus`` is ``scan-class-n-target-others``, ``n`` the number of objects of the class; ``tokens`` a Python list
+    of words, ``mentions`` whether the sentence names the class: if it does not, it is excluded, and so is a sentence of
+    more than 24 words or about the only object of its class.
 
     >>> nr3d_groups("scene0011_00-office_chair-3-1-2-4", "['the', 'left', 'chair']", "True", "row 2")
     ('hard', 'view-dependent')
@@ -257,10 +257,9 @@ def _words(text: str, at: str) -> list[str]:
 
 
 def grouped_by_truth(queries: Iterable[TextQuery], truth: GroundTruth) -> tuple[TextQuery, ...]:
-    """The queries with a group of every pair of which they have none yet, by the classes of the truth's objects (ours).
+    """The queries with a group of every pair that is still missing, by the classes of the ground-truth objects (ours).
 
-    Of several objects that are meant the class of the first counts; by the view is what has a word of those that Nr3D
-    goes by.
+    With several target objects the class of the first counts; a query is view-dependent if it has one of Nr3D's words.
     """
     ids, first = np.unique(truth.instance, return_index=True)
     class_of = {
@@ -290,7 +289,7 @@ def with_group(query: TextQuery, group: str) -> TextQuery:
     return replace(query, groups=(*query.groups, group))
 
 
-COLUMN = "question_id"  # others are for the reader alone
+COLUMN = "question_id"  # other columns are for readers only
 _ID = re.compile(r"[0-9a-f]{12}")
 
 

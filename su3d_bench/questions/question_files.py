@@ -1,13 +1,13 @@
-"""Question sets in files: TOML and CSV of our own, and the forms of ScanRefer, Nr3D (Sr3D), SQA3D and Beacon3D.
+"""Question sets in files: our own TOML and CSV, and the formats of ScanRefer, Nr3D (Sr3D), SQA3D and Beacon3D.
 
-In a CSV a text that a spreadsheet would compute begins with ``'``, which is left out again where it is read.
+In a CSV, a text that a spreadsheet would evaluate begins with ``'``, which is removed when it is read.
 
-ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is
-unique or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
-``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with
-``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of
-annotations beside it. Beacon3D: ``metadata_*.json``, see ``beacon3d``. Object ids are ScanNet's own, one less than the
-ground truth's here. Sources: Beacon3D's data and daveredrum/ScanRefer.
+ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name``, which decides whether a
+sentence is unique or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``,
+``tokens`` and ``mentions_target_class``, which decide whether one is easy or hard, view-dependent or not, or excluded.
+SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers are in a
+separate annotation file. Beacon3D: ``metadata_*.json``, see ``beacon3d``. Object ids are ScanNet's own, one less than
+in the ground truth here. Sources: Beacon3D's data and daveredrum/ScanRefer.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ PAPER_FIGURES = ("comparison", "schemes", "teaser")
 def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
     """The questions of a file, each scene as ``<dataset>/<scene>``.
 
-    ``dataset`` completes scenes that name none; an empty one leaves them as they are.
+    ``dataset`` completes scenes that name none; an empty one leaves them unchanged.
 
-    A query without a kind is one of kind instance. The same question of the same scene may stand there once.
+    A query without a kind is of kind instance. A question may occur only once per scene.
     """
     if is_foreign(path):
         return _each_once(read_external_questions(path))
@@ -64,7 +64,7 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
 
 
 def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
-    """The first of each id: people wrote some sentences twice; where objects or replies differ, all are right."""
+    """The first of each id, because some sentences occur twice; if objects or replies differ, all are correct."""
     answers: dict[str, set[int]] = {}
     replies: dict[str, dict[str, None]] = {}
     for question in questions:
@@ -78,9 +78,9 @@ def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
 
 
 def paper_queries() -> tuple[Question, ...]:
-    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning of one scene.
+    """The queries on the paper's page, for each of its 13 scenes, and its reasoning questions about one scene.
 
-    Of these alone an answer is published, in words.
+    An answer, in words, is only published for the latter.
     """
     content = _paper()
     asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
@@ -110,13 +110,13 @@ def _paper() -> dict[str, Any]:
 
 
 def check_form(path: Path) -> None:
-    """``DataError`` where the name of a file to be written says no form."""
+    """``DataError`` if the name of an output file has no supported ending."""
     if path.suffix.lower() not in (".toml", ".csv"):
         raise DataError(f"{printable(str(path), 200)}: unsupported file type; use .toml or .csv")
 
 
 def write_questions(path: Path, questions: Sequence[Question]) -> None:
-    """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
+    """Write a set for ``read_questions``, as TOML or CSV by the file's name; answers in words are not written."""
     check_form(path)
     make_folder(path.parent)
     write_text(path, csv_text(questions) if path.suffix.lower() == ".csv" else toml_text(questions))
@@ -154,7 +154,7 @@ ADVICE = (
 _FIRST_BYTES = 65536
 Row = TypeVar("Row", bound=BaseModel)
 Scene = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,100}$")]
-# On one line: what people typed holds line ends and tabs.
+# On one line: annotators' texts contain line breaks and tabs.
 Sentence = Annotated[str, AfterValidator(lambda text: only_words(" ".join(text.split())))]
 OptionalText = Annotated[str, AfterValidator(lambda text: only_words(text) if text else text)]
 
@@ -192,7 +192,7 @@ class _Reply(BaseModel):
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a file is of one of these forms, by its ending or, for a CSV, its first line."""
+    """Whether a file is in one of the foreign formats, by its ending or, for a CSV, its first line."""
     if path.suffix.lower() != ".csv" or not path.is_file():
         return path.suffix.lower() in (".json", ".jsonl")
     with opened(path) as file:
@@ -201,7 +201,7 @@ def is_foreign(path: Path) -> bool:
 
 
 def read_external_questions(path: Path) -> tuple[Question, ...]:
-    """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
+    """The sentences of a file: descriptions and utterances as relative queries, SQA3D's questions as reasoning."""
     where = printable(str(path), 200)
     text = read_text(path, where, ADVICE, MAX_BYTES)
     if path.suffix.lower() == ".csv":
@@ -217,7 +217,7 @@ def read_external_questions(path: Path) -> tuple[Question, ...]:
 
 
 def read_external_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
-    """The sentences of each scene that name an object, each as often as the file has it; Beacon3D's in their chains."""
+    """The sentences of each scene that name an object, including duplicates; Beacon3D's in their chains."""
     if path.suffix.lower() == ".json" and kind_of_metadata(content := read_metadata(path)) == "grounding":
         return dict(chains_of(content, printable(str(path), 200)).cases)
     queries_of_scene: dict[str, list[TextQuery]] = {}
@@ -254,7 +254,7 @@ def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
 
 
 def _nr3d(text: str, where: str) -> Iterator[Question]:
-    """The utterances, in the groups of the file where it has such columns."""
+    """The utterances, in the groups of the file if it has the columns for them."""
     header, *cells = query_files.csv_rows(text, where) or [[]]
     lines = [dict(zip(header, row, strict=False)) for row in cells if row]
     for number, row in enumerate(_rows(_Nr3D, lines, where, "row", 2), 2):
@@ -275,7 +275,7 @@ def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterat
 
 
 def _replies(path: Path) -> dict[str, str]:
-    """The first answer to each question, from ``..._sqa_annotations_...`` beside ``..._questions_...``."""
+    """The first answer to each question, from ``..._sqa_annotations_...`` next to ``..._questions_...``."""
     beside = path.with_name(path.name.replace("_questions_", "_sqa_annotations_"))
     if beside == path or not beside.is_file():
         return {}

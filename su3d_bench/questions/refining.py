@@ -1,6 +1,6 @@
-"""Label n': one name for an instance out of the names that its best views gave it, by vote or by a language model.
+"""Label n': one name for an instance, chosen from the names of its best views by vote or by a language model.
 
-The file of labels n' lies beside a map, which itself stays as the run sealed it. The paper's filter of large background
+The file of labels n' is stored next to a map, which itself stays unchanged. The paper's filter of large background
 objects is applied again under labels n': "Large background objects (walls, ground, roof, ceiling) and objects with
 bounding boxes > 95 % of image area are excluded" (section IV, Filtering and Post-Processing); labels n' "help to filter
 out undesired large instances" (the text beside Table V).
@@ -36,13 +36,13 @@ _OF_IMAGES = OpenSU3DConfig()
 
 
 class FilterConfig(BaseModel):
-    """Which instances labels n' leave out; no ``background_names`` and a ``max_map_fraction`` of 1 leave out none."""
+    """Which instances labels n' exclude; no ``background_names`` and a ``max_map_fraction`` of 1 exclude none."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    # The paper's list, by the head noun of a name, as for what is found in images.
+    # The paper's list, compared with the head noun of a name, as for detections in images.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = _OF_IMAGES.background_names
-    # The paper's share is of an image's area; the map has no image, so that of its floor plan stands here (ours).
+    # The paper's share is of an image's area; the map has no image, so its floor plan is used instead (ours).
     max_map_fraction: float = Field(default=_OF_IMAGES.max_box_fraction, gt=0, le=1)
 
 
@@ -60,7 +60,7 @@ def exclusion_reasons(instances: Instances, names: Sequence[str], config: Filter
 
 
 def _map_fractions(instances: Instances) -> Float64Array:
-    """The share (K,) of the map's box from above that the box of each instance has; 0 where the map has no area."""
+    """The share (K,) of the map's area from above covered by the box of each instance; 0 if the map has no area."""
     k, points, boxes = len(instances), instances.points, instances.boxes.astype(np.float64)
     if boxes.shape != (k, 2, 3) or points.ndim != 2 or points.shape[1] != 3:
         raise PredictionError(f"this map has boxes {boxes.shape} for {k} instances, and points {points.shape}")
@@ -72,8 +72,8 @@ def _map_fractions(instances: Instances) -> Float64Array:
     return answer
 
 
-MAX_NAMES = 5  # the paper's m: n' comes from the names of so many best views
-MAX_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
+MAX_NAMES = 5  # the paper's m: n' is chosen from the names of this many best views
+MAX_ANSWER_TOKENS = 200  # a name needs few; models that reason in their answer need more
 Source = Literal["model", "vote", "label"]
 
 
@@ -88,7 +88,7 @@ class TopNames:
 
 @dataclass(frozen=True)
 class RefinedName:
-    """Label n' of an instance and who chose it; ``label``: n stayed, for the ``reason`` given."""
+    """Label n' of an instance and its ``source``; ``label`` means that n was kept, for the ``reason`` given."""
 
     name: str
     source: Source
@@ -97,7 +97,7 @@ class RefinedName:
 
 
 def top_names(instances: Instances, m: int) -> list[TopNames]:
-    """Names of the ``m`` views of highest prediction score of each instance; ties: the earlier view."""
+    """Names of the ``m`` views with the highest prediction score of each instance; ties: the earlier view."""
     if instances.view_names is None or instances.view_scores is None:
         raise PredictionError("the map has no per-view names; run a method that stores them (opensu3d)")
     tops = []
@@ -114,8 +114,8 @@ def top_names(instances: Instances, m: int) -> list[TopNames]:
 def vote(top: TopNames) -> RefinedName:
     """The name with the greatest sum of prediction scores; ties: the one with the best view.
 
-    Names that differ in case, hyphens or plural alone count together, under the spelling of the best view. No language
-    model takes part: names of different words stay different.
+    Names that differ only in case, hyphens or plural count together, in the spelling of the best view. No language
+    model is used: names of different words stay different.
 
     >>> vote(TopNames("sofa", ("sofa", "couch", "couch"), (0.9, 0.5, 0.5))).name
     'couch'
@@ -157,7 +157,7 @@ class ModelRefiner:
         ]
 
     def refine(self, tops: Sequence[TopNames]) -> list[RefinedName]:
-        """n' of each instance: the model's name if usable, else n with the reason."""
+        """n' of each instance: the model's name if usable, otherwise n with the reason."""
         requests = self.requests(tops)
         answers = iter(zip(requests, self._model.ask_all(requests), strict=True))
         return [_chosen(top, *next(answers)) if top.names else _unnamed(top) for top in tops]
@@ -181,16 +181,16 @@ Refiner = Literal["vote", "model"]
 
 
 def voted_names(instances: Instances) -> RefinedNames | None:
-    """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
+    """Label n' by vote: among the names of the best views, the one with the greatest sum of prediction scores."""
     if instances.view_names is None or instances.view_scores is None:
         return None
     names = tuple(vote(top).name for top in top_names(instances, MAX_NAMES))
     left_out = exclusion_reasons(instances, names, FilterConfig())
-    return RefinedNames(names, f"the vote of the names of {MAX_NAMES} views, no language model", left_out)
+    return RefinedNames(names, f"by vote over the names of {MAX_NAMES} views, no language model", left_out)
 
 
 class NameRecord(BaseModel):
-    """Labels n and n' of one instance, the names that n' was chosen from, and why n' leaves it out, '' where not."""
+    """Labels n and n' of one instance, the candidates for n', and why it is excluded under n' ('' if it is not)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -240,7 +240,7 @@ def records_of(
     top_m: int,
     config: FilterConfig,
 ) -> NameRecords:
-    """The records of one map, an instance each; what is large background under its label n' is left out."""
+    """The records of one map, one per instance; large background objects under their label n' are excluded."""
     ids = instances.ids.tolist() if len(instances.ids) else range(len(instances))
     left_out = exclusion_reasons(instances, [name.name for name in refined], config)
     names = tuple(
@@ -293,7 +293,7 @@ def read_records(job: JobFolder) -> NameRecords | None:
 
 
 def refined_digest(job: JobFolder) -> dict[str, str]:
-    """What of the file moves numbers, for the key of the scores; nothing where there is none."""
+    """The digest of the file, for the key of the scores; empty if there is none."""
     path = job.path / FILE_NAME
     return {"refined": digest_file(path)} if path.is_file() else {}
 

@@ -1,7 +1,7 @@
-"""A map without points and features, as reasoning is given it, which of its objects a noun means, and that of a truth.
+"""A map without points and features, as used for reasoning, the objects that a noun refers to, and a ground-truth map.
 
-A noun means objects by name, by other English names, by adjectives of the caption; the nearest name by a text encoder
-is the last resort, and is said.
+A noun refers to objects by name, by synonyms, or by adjectives of the caption; the nearest name by a text encoder is
+the last resort, and is noted in the answer.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, RELATIONS, SURFACE
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
 
-MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
+MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may have texts of any length
 
 
 @dataclass(frozen=True, eq=False)
 class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
-    Of a truth: ``is_query_target``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
-    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended;
-    ``looks``, of a recording alone.
+    For ground truth: ``is_query_target``, whether it is visible enough to be asked about; ``is_whole``, whether its box is
+    that of the complete object and not only of its recorded part; ``is_cut``, whether it ends at the border of the
+    images; ``looks``, only for a recording.
     """
 
     id: int
@@ -58,13 +58,13 @@ class MapObject:
 
 
 def is_room_surface(name: str) -> bool:
-    """Whether what is called so is a part of the room itself."""
+    """Whether an object with this name is a part of the room itself."""
     return last_word(name) in SURFACES
 
 
 @dataclass(frozen=True)
 class SceneMap:
-    """M' of the paper: the map minus points and feature vectors; ``row`` of an object leads back to the map."""
+    """M' of the paper: the map without points and feature vectors; ``row`` of an object is its row in the map."""
 
     objects: tuple[MapObject, ...]
 
@@ -76,7 +76,7 @@ class SceneMap:
 
     @cached_property
     def relations(self) -> Relations:
-        """How the objects lie to one another, by their rows here."""
+        """The spatial relations between the objects, by their rows here."""
         boxes = np.array([thing.box for thing in self.objects], np.float64).reshape(-1, 2, 3)
         return Relations(boxes, [last_word(thing.name) for thing in self.objects])
 
@@ -89,7 +89,7 @@ class SceneMap:
         return bool(self.relations.of(relation)[self._row_of[subject.id], self._row_of[other.id]])
 
     def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether a slightly other threshold, another reading or an object that is seen whole may decide otherwise."""
+        """Whether a slightly different threshold, another reading or a completely seen object might change it."""
         return bool(self.doubtful[relation][self._row_of[subject.id], self._row_of[other.id]])
 
     @cached_property
@@ -100,21 +100,21 @@ class SceneMap:
         return {relation: self.relations.doubtful(relation) | beside_cut for relation in RELATIONS}
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
-        """Whether an object stands between two others; what one of them holds, or stands on, does not."""
+        """Whether an object is between two others; objects on or in one of them, or under it, are not."""
         return geometry.is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
 
     def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
-        """Whether some people would say that an object stands between two others."""
+        """Whether an object could be called between two others."""
         return geometry.may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
 
     def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
-        """Whether an object is one of ``ends``, or holds or is held by one."""
+        """Whether an object is one of ``ends``, or on or in one, or the reverse."""
         pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
         return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
     @staticmethod
     def is_usual(relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether people speak so of such things: windows, blinds and vents are above whatever is in the room."""
+        """Whether the relation is natural for such objects: windows, blinds and vents are above everything."""
         if relation not in ("above", "under"):
             return True
         if relation == "under" and last_word(other.name) in BUILT_IN:
@@ -142,10 +142,10 @@ class SceneMap:
 
 
 def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMap:
-    """The map of ``instances``; names are n' where ``refined`` gives them, else the method's own label, else n.
+    """The map of ``instances``; names are n' if ``refined`` has them, otherwise the method's own label, otherwise n.
 
-    What the filter of labels n' leaves out is left out, and so is what has no finite box; without ids of their own
-    instances are numbered from 0.
+    Instances excluded by the filter of labels n', or without a finite box, are excluded; without ids, instances are
+    numbered from 0.
     """
     k = len(instances)
     names = labels_n(instances) if refined is None else refined.names
@@ -173,21 +173,21 @@ def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMa
 
 
 Words = tuple[str, ...]
-# A name, and how near it is by the encoder (cosine).
+# A name and its cosine similarity by the encoder.
 NearestName = Callable[[str, Sequence[str]], tuple[str, float]]
 
 ANYTHING = frozenset({"object", "thing", "item", "anything", "something", "everything", "one"})
-GATHERED = frozenset({"row", "pile", "stack", "heap"})  # of things of one name
+GATHERED = frozenset({"row", "pile", "stack", "heap"})  # of objects of one name
 MAX_ADJECTIVES = 3
-# Ours: by the embedded encoder other words of a thing reach 0.84 ("carpeting") to 0.93 ("armchair"), words of another
-# thing up to 0.72 ("wastebasket" for a basket).
+# Ours: with the embedded encoder, synonyms reach 0.84 ("carpeting") to 0.93 ("armchair"), words for other objects at
+# most 0.72 ("wastebasket" for a basket).
 MIN_SIMILARITY = 0.8
 COLOUR_SPELLINGS = {"gray": "grey", "wood": "wooden"}
 
 
 @dataclass(frozen=True)
 class NounMatch:
-    """The objects that a noun means, in the map's order, and what must be said of it."""
+    """The objects that a noun refers to, in the map's order, and notes on how they were found."""
 
     objects: tuple[MapObject, ...]
     notes: tuple[str, ...] = ()
@@ -204,7 +204,7 @@ def _class_of_words() -> dict[Words, str]:
 
 
 def noun_objects(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> NounMatch:
-    """The objects that ``noun`` means; without relation words in it."""
+    """The objects that ``noun`` refers to; it must not contain relation words."""
     noun_words = words(noun)
     if not noun_words:
         return NounMatch(())
@@ -217,15 +217,15 @@ def noun_objects(noun: str, scene: SceneMap, nearest: NearestName | None = None)
         if held:
             return NounMatch(held)
     if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
-        # of which a map may know the single ones, or one of all
+        # a map may have the single objects, or one object for all
         return noun_objects(" ".join(noun_words[2:]), scene, nearest)
     if noun_words in _class_of_words():
-        return NounMatch(())  # a word that is known, for a thing that is not there
+        return NounMatch(())  # a known word for an object that is not in the map
     return _by_encoder(noun, scene, nearest)
 
 
 def name_suggestion(noun: str, scene: SceneMap) -> str:
-    """A clause ``; did you mean 'x'?`` for a noun that nobody knows and that is spelt nearly as a thing of the map."""
+    """A clause ``; did you mean 'x'?`` for an unknown noun with a spelling similar to an object of the map."""
     noun_words = words(noun)
     if not noun_words or {noun_words, noun_words[-1:]} & (_class_of_words().keys() | groups().keys()):
         return ""
@@ -253,12 +253,12 @@ def _named(noun_words: Words, objects: Iterable[MapObject]) -> list[MapObject]:
 
 
 def _means(name: Words, noun_words: Words, kind: str | None) -> bool:
-    """Whether an object called ``name`` is what ``asked`` (of class ``kind``) asks for: a coffee table is a table."""
+    """Whether ``noun_words`` (of class ``kind``) refers to an object named ``name``: a coffee table is a table."""
     if name == noun_words:
         return True
     own = _class_of_words().get(name)
     if own is not None:
-        # A name of its own class: a paper towel is no towel.
+        # A name with its own class: a paper towel is not a towel.
         return own == kind
     is_kind_of = len(name) > len(noun_words) and name[len(name) - len(noun_words) :] == noun_words
     return is_kind_of or (kind is not None and _class_of_words().get(name[-1:]) == kind)
@@ -277,9 +277,7 @@ def _by_encoder(noun: str, scene: SceneMap, nearest: NearestName | None) -> Noun
     if similarity < MIN_SIMILARITY:
         return NounMatch(())
     things = tuple(thing for thing in scene.objects if thing.name == name)
-    note = (
-        f"the map has no '{noun}'; taken for '{name}', the nearest name by the text encoder (cosine {similarity:.2f})"
-    )
+    note = f"the map has no '{noun}'; used '{name}', the nearest name by the text encoder (cosine {similarity:.2f})"
     return NounMatch(things, (note,))
 
 
@@ -295,7 +293,7 @@ def nearest_by(encoder: Encoder) -> NearestName:
     return nearest
 
 
-STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
+STRAY_PERCENT = 1.0  # ours: share of an object's vertices at either end of an axis, in a scan often a neighbour's
 
 
 def known_objects(
@@ -306,9 +304,9 @@ def known_objects(
 ) -> SceneMap:
     """The objects of a scene without the room's own surfaces, by ascending id.
 
-    Those of the truth with at least ``min_vertices`` vertices; an object's class is that of most of them. ``whole``
-    gives all objects of the scene as they are. Where ``seen`` says what frames show, colours are in the captions and
-    what is not plain to see is not to be asked about; nor is a cabinet where there are base cabinets too.
+    Ground-truth instances with at least ``min_vertices`` vertices, with the class of most of their vertices. ``whole``
+    has all objects of the scene in full. If ``seen`` has what frames show, colours are in the captions, and objects
+    that are not clearly visible must not be asked about; nor must a cabinet if there are base cabinets too.
     """
     rows_of = dict(instance_rows(truth, min_vertices))
     objects = [_of_vertices(truth, instance, rows) for instance, rows in rows_of.items()] if whole is None else whole
@@ -341,7 +339,7 @@ def known_objects(
 
 
 def _colour(known: WholeObject, sight: Sight | None) -> tuple[str, ...]:
-    """The word for what frames show, where it is what the thing was made in, or nobody knows and it is plain."""
+    """The colour that frames show, if it is the object's true colour, or if that is unknown and it is certain."""
     if sight is None or not sight.colour or last_word(known.name) in WITHOUT_COLOUR:
         return ()
     return (sight.colour,) if known.colour == sight.colour or (not known.colour and sight.is_certain_colour) else ()
@@ -362,7 +360,7 @@ def _box_of(truth: GroundTruth, rows: Int64Array) -> Float64Array:
 
 
 def _without_strays(truth: GroundTruth, rows: Int64Array) -> Float64Array:
-    """The points of an object within the box that is taken for it."""
+    """The points of an object within its robust box."""
     points, (low, high) = truth.points[rows].astype(np.float64), _box_of(truth, rows)
     kept: Float64Array = points[((points >= low) & (points <= high)).all(axis=1)]
     return kept
@@ -378,10 +376,10 @@ def plain_name(name: str) -> str:
 
 
 def is_called(label: str, class_name: str) -> bool:
-    """Whether a label is right for an object of a class, by the lexicon's other names and by what it is a kind of.
+    """Whether a label is correct for an object of a class, by the lexicon's synonyms and by hyponyms.
 
-    A more special name is right ("office chair" for a chair), a more general one too ("chair" for an office chair), a
-    word for many classes ("furniture") is not.
+    A more specific name is correct ("office chair" for a chair), and so is a more general one ("chair" for an office
+    chair), but not a word for many classes ("furniture").
 
     >>> is_called("couch", "sofa"), is_called("paper towel", "towel"), is_called("furniture", "sofa")
     (True, False, False)

@@ -1,8 +1,8 @@
 """The built-in solver: answers English questions from boxes and centroids without a model.
 
-A small grammar reads a question: closer and farther, distances, counts, presence, relations, between, sizes, places.
-Distances are Euclidean between centroids, as in the paper's prompting strategy; "next to" and "near" go by the gap
-between boxes. Where a noun means several objects, the nearest pair counts, and it is said.
+A small grammar parses a question: closer and farther, distances, counts, presence, relations, between, sizes, places.
+Distances are Euclidean between centroids, as in the paper's prompting strategy; "next to" and "near" use the gap
+between boxes. If a noun refers to several objects, the nearest pair counts, with a note.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ MAX_CHARACTERS = 400
 
 @cache
 def _grammar() -> dict[str, Any]:
-    """Patterns and words of English questions, and the sentences of the prompt."""
+    """Patterns and words for English questions, and the sentences of the prompt."""
     return parse_toml(file_text(Path(__file__).with_name("grammar.toml")))
 
 
 @cache
 def _relation() -> re.Pattern[str]:
-    """Finds the words for any relation; the group that matches is ``r`` and the number of the relation."""
+    """A pattern for the words of any relation; the matching group is ``r`` and the number of the relation."""
     spellings = _grammar()["relations"].values()
     return re.compile("|".join(rf"(?P<r{k}>\b(?:{pattern})\b)" for k, pattern in enumerate(spellings)))
 
@@ -61,7 +61,7 @@ def _patterns(kind: str) -> list[re.Pattern[str]]:
 
 @dataclass(frozen=True)
 class Phrase:
-    """A noun phrase: ``head``, and where it is restricted, the ``relation`` to ``others`` (two for "between")."""
+    """A noun phrase: ``head`` and, if it is restricted, the ``relation`` to ``others`` (two for "between")."""
 
     head: str
     relation: Relation | None = None
@@ -70,7 +70,7 @@ class Phrase:
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked: ``kind`` with its operands; which fields are set depends on the kind.
+    """A parsed question: ``kind`` with its operands; which fields are set depends on the kind.
 
     ``extreme``: which of ``subject`` (or of ``options``) is closest to or farthest from ``other``. ``closer``: whether
     ``subject`` is closer to (farther from) ``other`` than ``options[0]``. ``size``: which of ``subject`` is largest.
@@ -89,7 +89,7 @@ ANYTHING = Phrase("object")
 
 
 def read_question(text: str) -> Question | None:
-    """What ``text`` asks, or None.
+    """The parsed question of ``text``, or None.
 
     >>> read_question("Which sink is closer to bed?").subject
     Phrase(head='sink', relation=None, others=())
@@ -132,7 +132,7 @@ def _options(text: str) -> tuple[Phrase, ...]:
     return tuple(read_phrase(re.sub(r"^(?:either|is it|the)\s+", "", part)) for part in parts if part.strip())
 
 
-Groups = Mapping[str, str]  # of a pattern that matched; '' of those that have no part in it
+Groups = Mapping[str, str]  # of a matching pattern; '' for groups that did not take part
 
 
 def _extreme(found: Groups) -> Question | None:
@@ -181,7 +181,7 @@ _READERS: Mapping[str, Callable[[Groups], Question | None]] = {
     "holds": _holds,
     "list": _list,
 }
-CLOSE_CALL_M = 0.05  # a lead smaller than this is said
+CLOSE_CALL_M = 0.05  # a smaller lead gets a note
 MAX_LISTED = 12
 Objects = tuple[MapObject, ...]
 _Solved = tuple[str, Objects, Objects, float | int | bool | None]  # text, objects, references, value
@@ -201,7 +201,7 @@ class _Unsettled(Exception):
 
 
 class Solver:
-    """Answers questions about one map; ``eye`` (3,) is where one stands for left and right (the map's middle)."""
+    """Answers questions about one map; ``eye`` (3,) is the viewpoint for left and right (default: the middle)."""
 
     def __init__(self, scene: SceneMap, eye: Float64Array | None = None, nearest: NearestName | None = None) -> None:
         self._scene = scene
@@ -211,14 +211,14 @@ class Solver:
         self._notes = dict[str, None]()
 
     def answer(self, text: str) -> Answer:
-        """The answer to an English question; one that says so where it cannot be read or settled."""
+        """The answer to an English question; unsettled if it cannot be parsed or answered."""
         question = read_question(text)
         if question is None:
-            return undecided("the question is none of those that geometry settles; try --solver llm")
+            return undecided("the built-in solver cannot read the question; try --solver llm")
         return self.solve(question)
 
     def solve(self, question: Question) -> Answer:
-        """The answer to a question that was read."""
+        """The answer to a parsed question."""
         self._notes = dict[str, None]()
         solve: Callable[[Question], _Solved] = getattr(self, f"_{question.kind}")
         try:
@@ -234,7 +234,7 @@ class Solver:
     # Noun phrases.
 
     def _objects(self, phrase: Phrase) -> tuple[Objects, Objects]:
-        """What a phrase means, and what its restrictions were held against; empty where none meets them."""
+        """The objects of a phrase and the reference objects of its restrictions; empty if none satisfies them."""
         meant: scene_map.NounMatch = noun_objects(phrase.head, self._scene, self._nearest)
         self._notes |= dict.fromkeys(meant.notes)
         if not meant.objects:
@@ -261,12 +261,12 @@ class Solver:
         return f"the map has no '{noun}'{scene_map.name_suggestion(noun, self._scene)}"
 
     def _supporting_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
-        """Objects to which ``thing`` stands in ``relation``."""
+        """Objects to which ``thing`` has the ``relation``."""
         if relation == "between":
             if len(others) == 1 and len(others[0]) == 2:
                 others = [others[0][:1], others[0][1:]]
             if len(others) != 2:
-                raise _Unsettled("'between' needs two things, such as: between the bed and the door")
+                raise _Unsettled("'between' needs two objects, such as: between the bed and the door")
             pairs = ((a, b) for a in others[0] for b in others[1] if a.id != b.id)
             return next(((a, b) for a, b in pairs if self._scene.is_between(thing, a, b)), ())
         return tuple(
@@ -276,7 +276,7 @@ class Solver:
     def _relation_holds(self, thing: MapObject, relation: Relation, other: MapObject) -> bool:
         if relation == "left of" or relation == "right of":  # two comparisons narrow the type
             x, y = self._eye[:2]
-            where = "the eye given" if self._is_eye_given else "the middle of the map"
+            where = "the given eye" if self._is_eye_given else "the middle of the map"
             self._note(f"left and right as seen from {where} ({x:.2f}, {y:.2f})")
             a, b = (thing, other) if relation == "left of" else (other, thing)
             return is_left_of(a.centroid, b.centroid, self._eye)
@@ -300,7 +300,7 @@ class Solver:
         if question.subject == ANYTHING and not question.options:
             others = {key: thing for key, thing in others.items() if not scene_map.is_room_surface(thing.name)}
         if not others:
-            raise _Unsettled(f"the map has nothing else to hold against '{question.other.head}'")
+            raise _Unsettled(f"the map has nothing else to compare with '{question.other.head}'")
         self._note_several(references, question.other)
         ranked = sorted(
             (_nearest_pair((thing,), references) for thing in others.values()),
@@ -308,7 +308,7 @@ class Solver:
         )
         distance_m, best, reference = ranked[0]
         if len(ranked) == 1:
-            self._note(f"there is one '{_shown(question.subject)}' only")
+            self._note(f"there is only one '{_shown(question.subject)}'")
         elif abs(ranked[1][0] - distance_m) < CLOSE_CALL_M:
             self._note(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away, between centres")
         rest = "".join(f"; {thing.shown} {away_m:.2f} m" for away_m, thing, _ in ranked[1:4])
@@ -317,7 +317,7 @@ class Solver:
         return text, (best,), (reference,), None
 
     def _option(self, option: Phrase, subject: Phrase) -> Objects:
-        """Objects of an option; one that the map does not name so is left to the question's own noun."""
+        """Objects of an option; if the map has none of that name, those of the question's own noun."""
         try:
             return self._some(option)
         except _Unsettled:
@@ -341,7 +341,7 @@ class Solver:
         first, second = self._some(question.subject), self._some(question.other)
         distance_m, a, b = _nearest_pair(first, second)
         if a.id == b.id:
-            raise _Unsettled(f"'{_shown(question.subject)}' and '{_shown(question.other)}' are one thing in the map")
+            raise _Unsettled(f"'{_shown(question.subject)}' and '{_shown(question.other)}' are one object in the map")
         self._note_several(first, question.subject)
         self._note_several(second, question.other)
         return f"{distance_m:.2f} m between the centres of {a.shown} and {b.shown}", (a, b), (), distance_m
@@ -358,7 +358,7 @@ class Solver:
         return f"yes: {_listed(things)}", things, held, True
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
-        """As ``_objects``, but a noun that the map does not have means nothing, which answers the question."""
+        """As ``_objects``, but empty for a noun that the map does not have, which answers the question."""
         if not noun_objects(phrase.head, self._scene, self._nearest).objects:
             return (), ()
         return self._objects(phrase)
@@ -405,7 +405,7 @@ class Solver:
 
 
 def _nearest_pair(first: Objects, second: Objects) -> tuple[float, MapObject, MapObject]:
-    """The least distance between centroids, and whose it is; the lower ids on ties, one thing with itself last."""
+    """The least distance between centroids, with its objects; ties: the lower ids, an object with itself last."""
     pairs = [(a, b) for a in first for b in second if a.id != b.id] or [(first[0], second[0])]
     return min(
         ((float(np.linalg.norm(a.centroid - b.centroid)), a, b) for a, b in pairs),
@@ -424,32 +424,32 @@ def _listed(objects: Objects) -> str:
     return shown if len(objects) <= MAX_LISTED else f"{shown} and {len(objects) - MAX_LISTED} more"
 
 
-# What of the language model's settings moves an answer; times, prices and limits do not.
+# Settings of the language model that affect an answer; times, prices and limits do not.
 ANSWER_SETTINGS = {"text_model", "temperature", "seed", "max_answer_tokens", "context_tokens"}
-FEW_OBJECTS = 1  # what is always given, however small the model's context
+FEW_OBJECTS = 1  # always given, however small the model's context
 
 
 @dataclass(frozen=True)
 class Context:
-    """The objects that the model is given, in the map's order; ``note``: what must be said where these are not all."""
+    """The objects given to the model, in the map's order; ``note``: a remark if these are not all."""
 
     objects: tuple[MapObject, ...]
     note: str = ""
 
 
 def answers_digest(config: LanguageConfig) -> str:
-    """A key that moves with what moves the answers of a language model."""
+    """A key of everything that affects the answers of a language model."""
     return digest_json([system_prompt(), config.model_dump(mode="json", include=ANSWER_SETTINGS)])
 
 
 def system_prompt() -> str:
-    """The system prompt: what the list is, the paper's six rules, the form of the answer."""
+    """The system prompt: a description of the list, the paper's six rules, the form of the answer."""
     prompt = _grammar()["prompt"]
     return "\n".join((prompt["introduction"], *(f"- {rule}" for rule in STRATEGY), prompt["form"]))
 
 
 def object_line(thing: MapObject) -> str:
-    """One object as the model reads it, lengths to a millimetre."""
+    """One object in the prompt of the model, lengths rounded to a millimetre."""
     entry = {
         "ID": thing.id,
         "Name": thing.name,
@@ -465,7 +465,7 @@ def _rounded(values: Float64Array) -> list[float]:
 
 
 def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Context:
-    """The objects that fit into the model's context, the most relevant to ``question`` where not all do."""
+    """The objects that fit into the model's context, the most relevant to ``question`` if not all do."""
     room = config.context_tokens - config.max_answer_tokens - n_tokens(system_prompt()) - n_tokens(question) - 100
     costs = {thing.id: n_tokens(object_line(thing)) + 1 for thing in scene.objects}
     if sum(costs.values()) <= room:
@@ -476,7 +476,7 @@ def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Conte
             chosen.add(thing.id)
             room -= costs[thing.id]
     note = (
-        f"the map has {len(scene)} objects, more than the model reads at once; it was given the {len(chosen)} most "
+        f"the map has {len(scene)} objects, more than fit into the model's context; it got the {len(chosen)} most "
         "relevant to the question"
     )
     return Context(
@@ -485,8 +485,8 @@ def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Conte
 
 
 def by_relevance(scene: SceneMap, question: str) -> list[MapObject]:
-    """Objects in the order in which they matter: those that the question names, those whose name or caption shares a
-    word with it, then by how near they are to the former; large before small where none is named."""
+    """Objects by relevance: those that the question names, those whose name or caption shares a word with it, then by
+    distance to the former; large before small if none is named."""
     named = {thing.id for phrase in _phrases(question) for thing in noun_objects(phrase, scene).objects}
     question_words = set(_every_word(question))
     sharing = {thing.id for thing in scene.objects if question_words & {*words(thing.name), *words(thing.caption)}}
@@ -502,7 +502,7 @@ def by_relevance(scene: SceneMap, question: str) -> list[MapObject]:
 
 
 def _phrases(question: str) -> list[str]:
-    """Nouns that the question names, where the built-in grammar can read it."""
+    """Nouns in the question, if the built-in grammar can parse it."""
     read = read_question(question)
     if read is None:
         return []
@@ -546,11 +546,11 @@ class LanguageSolver:
         return ask_request(context_for(self._scene, question, self._config), question, self._config)
 
     def answer(self, question: str) -> Answer:
-        """The model's answer and the objects that it names; its failure or refusal as an unsettled one."""
+        """The model's answer and the objects that it names; a failure or refusal as an unsettled answer."""
         return self.answers([question])[0]
 
     def answers(self, questions: Sequence[str]) -> list[Answer]:
-        """The answers in the order of ``questions``, several of which may be under way at once."""
+        """The answers in the order of ``questions``, which may be requested in parallel."""
         contexts = [context_for(self._scene, question, self._config) for question in questions]
         requests = [ask_request(*both, self._config) for both in zip(contexts, questions, strict=True)]
         replies = self._model.ask_all(requests)
@@ -571,7 +571,7 @@ class LanguageSolver:
 
 
 def _dropped(names: tuple[str, ...]) -> str:
-    return f"the server does not take {', '.join(names)}; the model ran without" if names else ""
+    return f"the server does not accept {', '.join(names)}; the model ran without" if names else ""
 
 
 AskMap = Callable[[SceneMap, Sequence[str]], Sequence[Answer]]
@@ -603,8 +603,8 @@ def by_language_model(model: LanguageModel, config: LanguageConfig) -> MapSolver
 
 
 def given_answer(true: TrueAnswer, answer: Answer, scene: SceneMap) -> SolverAnswer:
-    """What ``answer`` about ``scene`` says of the kind of ``true``."""
+    """``answer`` about ``scene`` in the form of ``true``."""
     rows = [scene.by_id(object_id).row for object_id in answer.object_ids]
-    # the words of a language model are read for their yes or no, or their first number
+    # from the text of a language model, yes or no, or the first number is read
     value = answer.value if true.value is None or answer.solver == "built-in" else answer.as_value(true.value)
     return SolverAnswer(value, np.array(rows, np.int64), answer.is_decided)

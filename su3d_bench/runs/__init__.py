@@ -1,1 +1,1 @@
-"""``run``: a request to jobs, jobs to scenes, frames to methods, here or on clusters; taken up where it was left."""
+"""``run``: from a request to jobs, scenes and frames, on this machine or on clusters; interrupted runs are resumed."""

@@ -1,4 +1,4 @@
-"""A sweep over settings of one method, as variants of it in one run: perception is computed once for all."""
+"""A sweep over settings of one method, run as variants in one run, so that perception is computed once for all."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ class _Choice:
 
 
 def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[SweepRow, ...]:
-    """The rows of a sweep: each ``KEY=V1,V2`` of ``vary`` on its own, or every combination where ``is_grid``.
+    """The rows of a sweep: each ``KEY=V1,V2`` of ``vary`` on its own, or every combination if ``is_grid``.
 
-    ``KEY`` is a setting of the method or a short name that its class has in ``short_names``; values are TOML. Rows
-    whose settings are the defaults have the method itself. ``ConfigError`` for an unknown key or a wrong value.
+    ``KEY`` is a setting of the method or a short name defined in its class's ``short_names``; values are TOML. Rows
+    whose settings are the defaults name the method itself. ``ConfigError`` for an unknown key or an invalid value.
     """
     method_class = registry.load("method", method)
     choices = [_choices(method, method_class, text) for text in vary]
     n_rows = math.prod(map(len, choices)) if is_grid else sum(map(len, choices))
     if n_rows > MAX_VARIANTS:
-        raise ConfigError(f"ablate: {n_rows} variants; at most {MAX_VARIANTS} make one run")
+        raise ConfigError(f"ablate: {n_rows} variants; one run can have at most {MAX_VARIANTS}")
     combinations = itertools.product(*choices) if is_grid else ((choice,) for each in choices for choice in each)
     names = {_effective(method_class.Config()): str(method_class.name)}
     return tuple(_row(method_class, combination, names) for combination in combinations)
@@ -72,13 +72,13 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
 
 
 def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str]) -> SweepRow:
-    """``names``: what settings are called by their effect; a new one is entered."""
+    """The row of one variant; ``names`` maps the effective settings to a method name and is extended in place."""
     keys = [choice.key for choice in combination]
     if len(set(keys)) < len(keys):
         raise ConfigError(f"--vary: '{keys[0]}' is varied twice in one variant; name it once")
     values = {choice.key: choice.value for choice in combination}
     try:
-        # Through JSON, because strict models take a list for a tuple only there.
+        # Through JSON, because strict models accept a list for a tuple only there.
         effective = _effective(method_class.Config.model_validate_json(json.dumps(values)))
     except ValidationError as error:
         reason = error.errors()[0]["msg"].removeprefix("Value error, ")
@@ -94,28 +94,28 @@ def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str
 
 
 def _effective(config: BaseModel) -> str:
-    """What a model of settings comes to; one whose settings override each other has ``effective``."""
+    """The effective settings as text; a model whose settings override each other defines ``effective``."""
     return str(config.effective() if hasattr(config, "effective") else config.model_dump())
 
 
 def _bare(value: Any) -> str:
-    """A value in TOML, plain words without their quotes: the name of a variant is a folder's name too."""
+    """A value in TOML, plain words without quotes, because the name of a variant is also a folder name."""
     return value if isinstance(value, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value) else toml_value(value)
 
 
 def write_rows(folder: Path, rows: Sequence[SweepRow], *, joins: bool = False) -> None:
-    """Leave the rows beside the run's metrics, for whoever makes a table of them; ``joins``: behind those there."""
+    """Write the rows next to the run's metrics, for the table of the sweep; ``joins`` appends to the existing rows."""
     before = read_rows(folder) if joins and (folder / FILE).is_file() else ()
     rows = list(dict.fromkeys([*before, *rows]))
     write_json(folder / FILE, {"rows": [asdict(row) for row in rows]})
 
 
 def read_rows(folder: Path) -> tuple[SweepRow, ...]:
-    """The rows that ``write_rows`` left; ``StoreError`` where the run is no sweep."""
+    """The rows written by ``write_rows``; ``StoreError`` if the run is not a sweep."""
     if not (folder / FILE).is_file():
-        raise StoreError(f"{folder}: holds no {FILE}; make a sweep with su3d-bench ablate --vary KEY=V1,V2")
+        raise StoreError(f"{folder}: contains no {FILE}; run a sweep with su3d-bench ablate --vary KEY=V1,V2")
     value = read_json(folder / FILE)
     try:
         return _ROWS.validate_python(value["rows"])
     except (TypeError, KeyError, ValidationError, RecursionError) as error:
-        raise StoreError(f"{folder}: {FILE} is not as ablate writes it; run the sweep again") from error
+        raise StoreError(f"{folder}: {FILE} is damaged; run the sweep again") from error

@@ -1,4 +1,4 @@
-"""What a person reads before and after a run: how long it will take, its pictures, commands that come next."""
+"""What the user reads before and after a run: the estimated time, the pictures, and commands to run next."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 
-# Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
-# and drawing one room under two protocols, both on two cores of a 2020s server.
+# Used if there is no earlier run to measure: one update of opensu3d under the embedded profile at 640x480, and
+# reading, scoring and drawing one room under two protocols, both on two cores of a 2020s server.
 GUESSED_UPDATE_S = 0.5
 GUESSED_SCENE_S = 15.0
 N_RECENT = 8
@@ -26,7 +26,7 @@ N_RECENT = 8
 
 @dataclass(frozen=True)
 class JobEstimate:
-    """What one scene under one method will take; ``remark`` says why where its frames cannot be read."""
+    """The estimated time of one scene under one method; ``remark`` is the reason if its frames cannot be read."""
 
     scene: str
     method: str
@@ -38,7 +38,7 @@ class JobEstimate:
 
 
 def estimate(plan: Plan) -> list[JobEstimate]:
-    """One estimate a scene and method, in the order of the plan; reads no frame."""
+    """One estimate per scene and method, in the order of the plan; reads no frame."""
     methods, runs = plan.jobs[0].methods, plan.folder.path.parent
     update_s = {part: recent_update_s(runs, part.name) for part in methods}
     needs_frames = {part for part in methods if build_method(part).needs.frames}
@@ -62,7 +62,7 @@ def estimate(plan: Plan) -> list[JobEstimate]:
 
 
 def recent_update_s(runs: Path, method: str) -> float | None:
-    """Mean seconds an update in the latest runs below ``runs``, damaged tables aside; None where there is none."""
+    """Mean seconds per update in the latest runs below ``runs``, ignoring damaged tables; None if there are none."""
     files = [path for path in runs.glob(f"*/scenes/*/{glob.escape(method)}/updates.csv") if path.is_file()]
     newest = sorted(files, key=lambda path: path.stat().st_mtime)[-N_RECENT:]
     totals = [ms for path in newest for ms in _totals(path)]
@@ -81,26 +81,25 @@ THINGS_FIRST = ("instance", "boxes")  # kinds of protocols that score no walls a
 
 
 def pictures_of(result: RunResult) -> list[Path]:
-    """The pictures of the run's maps, those of each scene and method together."""
+    """The pictures of the run's maps, grouped by scene and method."""
     jobs = [result.plan.folder.job(outcome.scene, outcome.method) for outcome in result.outcomes]
     return [path for job in jobs for path in sorted(job.pictures.glob("*.png"))]
 
 
 def next_commands(result: RunResult) -> list[str]:
-    """Commands for what comes next, each of which works on this run; none for one that is not complete or lies in a
-    store."""
+    """Commands to run next, each of which works on this run; empty if it is incomplete or in a remote store."""
     if not result.is_complete or result.plan.place.url is not None:
         return []
     run = str(result.plan.folder.path)
     commands = [["report", "html", run, "--out", f"{run}/page.html"]]
-    with suppress(Su3dError):  # a map that nobody can read is told by what reads it
+    with suppress(Su3dError):  # an unreadable map is reported by the command that reads it
         commands += _query(result, run)
     commands += _numbers(result, run)
     return [shlex.join(["su3d-bench", *words]) for words in commands]
 
 
 def _query(result: RunResult, run: str) -> list[list[str]]:
-    """A text that means a class, asked of a map with features."""
+    """A text query with a class name, for a map with features."""
     for outcome in result.outcomes:
         job = result.plan.folder.job(outcome.scene, outcome.method)
         is_map = outcome.method in result.plan.methods and outcome.method != CEILING_METHOD and is_file(job.prediction)
@@ -113,7 +112,7 @@ def _query(result: RunResult, run: str) -> list[list[str]]:
 
 
 def _best_class(result: RunResult, method: str) -> str | None:
-    """The class on which ``method`` scores best, under the first protocol that tells classes."""
+    """The class on which ``method`` scores best, under the first protocol with values per class."""
     rows = [row for row in result.metrics["results"] if row["method"] == method and row["result"] is not None]
     for row in sorted(rows, key=lambda row: (row["kind"] not in THINGS_FIRST, row["protocol"])):
         first = {name: next(iter(values.values()), None) for name, values in row["result"]["per_class"].items()}
@@ -123,7 +122,7 @@ def _best_class(result: RunResult, method: str) -> str | None:
 
 
 def _numbers(result: RunResult, run: str) -> list[list[str]]:
-    """Two methods side by side, or the one as what later runs are held against; nothing without a number."""
+    """Compare two methods, or learn a reference from the only one; empty if nothing was scored."""
     scored: dict[str, list[str]] = {}
     for row in result.metrics["results"]:
         if row["result"] is not None:

@@ -1,4 +1,4 @@
-"""What there is to run: the datasets with the scenes that are here, and the methods."""
+"""What can be run: the datasets with their available scenes, and the methods."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from su3d_bench.core.errors import DataError, ScenesMissing, Su3dError, counted
 
 
 def known_datasets(names: Sequence[str], root: Path) -> list[dict[str, Any]]:
-    """What is known of each dataset, all where none is named, with its scenes below ``root``.
+    """A description of each named dataset (all if none is named), with its scenes below ``root``.
 
-    A dataset may say where it looks (``places``) and how a scene is (``status``).
+    A dataset may list the folders it searches (``places``) and the state of a scene (``status``).
     """
     return [_dataset(name, registry.load("dataset", name), root) for name in names or registry.names("dataset")]
 
@@ -50,12 +50,12 @@ def _status(dataset: Any, scene: str) -> str:
 
 
 def known_methods() -> list[dict[str, Any]]:
-    """What is known of every method that can be run by its name."""
+    """A description of every method that can be run by its name."""
     return [about_method(name, registry.load("method", name)) for name in registry.names("method")]
 
 
 def about_method(name: str, method: Any) -> dict[str, Any]:
-    """What a list says of a method; a plug-in need not say more than its first sentence."""
+    """The description of a method in a list; a plug-in only needs the first sentence of its docstring."""
     row: dict[str, Any] = {"name": name, "summary": (method.__doc__ or "").strip().partition("\n")[0]}
     about = getattr(method, "about", None)
     for field in ("paper", "source", "licence", "status"):

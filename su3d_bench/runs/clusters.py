@@ -1,10 +1,10 @@
-"""The executor of a run: this process, processes here, the machines of a Ray cluster, or Slurm jobs through submitit.
+"""The executor of a run: this process, local processes, the machines of a Ray cluster, or Slurm jobs through submitit.
 
-Under Ray each unit has a fresh worker process, as with processes here. Ray's own retries are switched off: only a unit
-whose worker or machine was lost runs again, a bounded number of times, and what its work answers is final.
+Under Ray each unit has a fresh worker process, as with local processes. Ray's own retries are switched off: only a unit
+whose worker or machine was lost runs again, a bounded number of times; the answer of its work is final.
 
-submitit hands units and outcomes over as pickles in a folder of the run, which all machines must see; nobody else may
-write there.
+submitit exchanges units and outcomes as pickles in a folder of the run, which all machines must see and no other user
+may write to.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from su3d_bench.store.run_folder import check_no_links
 
 RunUnits = Callable[..., Iterator[Any]]
 ENDED = "ended"  # the kind of answer of a worker that was asked to end
-MAX_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
+MAX_AT_ONCE = 1000  # a pending Ray task costs the driver memory; Slurm's default MaxArraySize is 1001
 
 
 def run_ray(
     work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, ray: Any
 ) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
+    """Outcomes of ``units`` as they complete, with at most ``jobs`` of them submitted to the cluster at once.
 
-    ``ray`` is what ``connected`` gave. A unit whose worker or machine was lost ``config.retries`` + 1 times has the
-    outcome that ``lost`` makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all.
+    ``ray`` is the result of ``connected``. A unit whose worker or machine was lost ``config.retries`` + 1 times gets
+    the outcome created by ``lost``. A ``Su3dError`` raised by ``work``, or an interrupt, stops all units.
     """
     remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
     versions = _versions()
@@ -62,18 +62,18 @@ def run_ray(
 
 
 def _answer(ray: Any, reference: Any) -> tuple[Any, str | None]:
-    """What a task answered, or a clause that says how the task was lost."""
+    """The answer of a task, or a clause describing how the task was lost."""
     errors = ray.exceptions
     try:
         answer = ray.get(reference)
         return answer, f"the worker was ended by {answer[1]}" if answer[0] == ENDED else None
-    except errors.RayTaskError as error:  # the task itself raises nothing, so it could not even begin
+    except errors.RayTaskError as error:  # the task itself raises nothing, so it could not start
         last = str(error).strip().splitlines()[-1]
         raise ConfigError(
             f"a machine of the Ray cluster cannot run su3d-bench ({last[:200]}); install the same version on each"
         ) from error
     except errors.OutOfMemoryError:
-        return None, "the worker was killed for want of memory"
+        return None, "the worker was killed because memory ran out"
     except (errors.WorkerCrashedError, errors.LocalRayletDiedError, errors.NodeDiedError):
         return None, "the worker or its machine was lost"
     except (errors.ObjectLostError, errors.OutOfDiskError, errors.RaySystemError) as error:
@@ -81,7 +81,7 @@ def _answer(ray: Any, reference: Any) -> tuple[Any, str | None]:
 
 
 def _on_node(work: Work[Unit, Outcome], unit: Unit, versions: dict[str, str]) -> tuple[str, Any]:
-    """What becomes of ``unit`` in a worker of the cluster; a worker of another version must not mix its numbers in."""
+    """The answer for ``unit`` in a cluster worker; an error if its versions differ, so that numbers never mix."""
     limit_threads()  # before numerical libraries are loaded
     own = _versions()
     for name in versions:
@@ -89,7 +89,7 @@ def _on_node(work: Work[Unit, Outcome], unit: Unit, versions: dict[str, str]) ->
             message = f"{socket.gethostname()}: has {name} {own.get(name)}, the run {versions[name]}; install the same"
             return "user-error", StoreError(message)
     try:
-        with ending_in_order():  # where Ray's own handler would leave the work as if it had failed
+        with ending_in_order():  # Ray's own handler would end the work as if it had failed
             return answer_of(work, unit, lambda event: None)
     except Terminated as end:
         return ENDED, str(end)
@@ -101,9 +101,9 @@ def _versions() -> dict[str, str]:
 
 @contextmanager
 def connected(config: RunConfig) -> Iterator[Any]:
-    """The module ``ray``, connected to the cluster that ``config`` names, which has a machine for each job.
+    """The module ``ray``, connected to the cluster named in ``config``, which has enough GPUs for a job.
 
-    The address ``local`` starts a cluster of this machine alone, for the time of the block.
+    The address ``local`` starts a single-machine cluster for the duration of the block.
     """
     try:
         import ray
@@ -122,38 +122,38 @@ def connected(config: RunConfig) -> Iterator[Any]:
 
 def _connect(ray: Any, address: str) -> None:
     try:
-        with restored_handlers():  # Ray's own would end the process as if a check had failed
+        with restored_handlers():  # Ray's own handlers would end the process as if a check had failed
             ray.init(address=address or "auto", log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
         named = address or os.environ.get("RAY_ADDRESS")
         where = f"at '{named}'" if named else "on this machine"
         raise ConfigError(
-            f"no Ray cluster {where} takes this run ({' '.join(str(error).split())[:300]}); start one with ray start "
-            "--head, add --ray-address local to start one here for this run, or name another with --ray-address"
+            f"no Ray cluster {where} accepts this run ({' '.join(str(error).split())[:300]}); start one with ray start "
+            "--head, add --ray-address local to start one for this run, or name another with --ray-address"
         ) from error
 
 
 def _check_gpu_count(ray: Any, gpus_per_job: float) -> None:
-    """Ray waits for ever for a machine that has what a task asks for."""
+    """A ``ConfigError`` if no machine has the GPUs: Ray would wait forever for one."""
     most = max((node["Resources"].get("GPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
     if gpus_per_job > most:
         raise ConfigError(
-            f"--gpus-per-job {gpus_per_job:g}: no machine of the Ray cluster has more than {most:g}; lower it"
+            f"--gpus-per-job {gpus_per_job:g}: no machine of the Ray cluster has more than {most:g} GPUs; lower it"
         )
 
 
-CLUSTERS = ("slurm", "local")  # submitit takes this machine for a cluster in silence where there is no Slurm
-DEFAULTS = {"timeout_min": 240}  # submitit's own limit is 5 minutes, less than a long scene takes
+CLUSTERS = ("slurm", "local")  # submitit silently uses this machine as a cluster if there is no Slurm
+DEFAULTS = {"timeout_min": 240}  # submitit's own limit is 5 minutes, less than a long scene needs
 POLL_S = 0.5
 
 
 def run_slurm(
     work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, folder: Path
 ) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
+    """Outcomes of ``units`` as they complete, with at most ``jobs`` of them submitted at once, as job arrays.
 
-    ``folder`` is on a shared disk. A unit whose job died ``config.retries`` + 1 times has the outcome that ``lost``
-    makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all.
+    ``folder`` is on a shared disk. A unit whose job died ``config.retries`` + 1 times gets the outcome created by
+    ``lost``. A ``Su3dError`` raised by ``work``, or an interrupt, stops all units.
     """
     check_no_links(folder.parent, folder)
     n_at_once = min(jobs, MAX_AT_ONCE)
@@ -198,7 +198,7 @@ def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
 
 
 def slurm_executor(folder: Path, config: RunConfig, n_at_once: int) -> tuple[Any, tuple[type[Exception], ...]]:
-    """submitit's executor, which may make ``folder``, and the errors by which it says that a job died."""
+    """submitit's executor, which may create ``folder``, and the errors it raises when a job died."""
     try:
         import submitit
     except ImportError as error:
@@ -209,8 +209,8 @@ def slurm_executor(folder: Path, config: RunConfig, n_at_once: int) -> tuple[Any
         raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")
     if cluster == CLUSTERS[0] and shutil.which("srun") is None:
         raise ConfigError(
-            "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster=local "
-            "to try it on this machine"
+            "no Slurm cluster here (srun not found); run the command on a machine of the cluster, or add --slurm "
+            "cluster=local to try it on this machine"
         )
     if config.gpus_per_job:
         parameters["gpus_per_node"] = int(config.gpus_per_job)
@@ -219,12 +219,12 @@ def slurm_executor(folder: Path, config: RunConfig, n_at_once: int) -> tuple[Any
         executor.update_parameters(**parameters)
     except (NameError, AssertionError, TypeError, ValueError, RuntimeError) as error:
         line = " ".join(str(error).split())[:300]
-        raise ConfigError(f"--slurm: submitit refuses it: {line}") from error
+        raise ConfigError(f"--slurm: submitit rejects the options: {line}") from error
     return executor, (submitit.core.utils.UncompletedJobError,)
 
 
 def _last_line(error: Exception) -> str:
-    """The last line of the job's own traceback where it left one, else the first of what submitit says."""
+    """The last line of the job's own traceback if it left one, otherwise the first line of submitit's message."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     rules = [k for k, line in enumerate(lines) if set(line) == {"-"}]
     return (lines[rules[-1] - 1] if len(rules) > 1 else lines[0])[:200] if lines else type(error).__name__
@@ -232,9 +232,9 @@ def _last_line(error: Exception) -> str:
 
 @contextmanager
 def executor_for(config: RunConfig, n_workers: int, folder: Path, report: Report) -> Iterator[RunUnits]:
-    """The executor of ``config`` as a function ``run(work, units, lost)`` that gives outcomes as they come in.
+    """The executor of ``config`` as a function ``run(work, units, lost)`` that yields outcomes as they complete.
 
-    ``folder`` is the run's. A ``Su3dError`` where no cluster answers, before a run has left anything.
+    ``folder`` is the run's. A ``Su3dError`` if no cluster answers, before the run has written anything.
     """
     executor = executors.executor_of(config, n_workers)
     if executor == "inline":
@@ -245,6 +245,6 @@ def executor_for(config: RunConfig, n_workers: int, folder: Path, report: Report
         with connected(config) as ray:
             yield partial(run_ray, jobs=n_workers, config=config, ray=ray)
     else:
-        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
+        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit creates the folder even for a mere check
             slurm_executor(scratch, config, n_workers)
         yield partial(run_slurm, jobs=n_workers, config=config, folder=folder.absolute() / "slurm")

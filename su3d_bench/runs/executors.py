@@ -1,7 +1,7 @@
-"""Where units of work run: in this process or each in a spawned process of its own; ``clusters`` has other machines.
+"""Where units of work run: in this process or each in its own spawned process; for other machines see ``clusters``.
 
-A unit that takes its process down (killed for memory, a crash in native code) fails alone. Numerical libraries are
-held to one thread everywhere, so that no result depends on how many units run side by side.
+A unit that crashes its process (killed for memory, a crash in native code) fails alone. Numerical libraries are
+limited to one thread everywhere, so that no result depends on how many units run in parallel.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from su3d_bench.core.errors import ConfigError, Su3dError
 from su3d_bench.core.safe_output import doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 
-ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
-# For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it
-# is ended then, as by a loss of power, after which all that is on disk is whole and the scene is taken up again.
+ENDING_S = 20.0  # for a worker without a parent to release its resources; Slurm kills a job 30 s after asking it to end
+# For a worker whose parent was asked to end. One that is loading a library or searching a tree cannot react meanwhile;
+# it is killed then, as by a power failure, after which all files on disk are intact and the scene can be resumed.
 PATIENCE_S = 1.0
 PARENT_SIGNALS = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
-SCENE_DONE = "scene"  # label of the event that says that a unit is finished
+SCENE_DONE = "scene"  # label of the event for a finished unit
 Unit = TypeVar("Unit")
 Outcome = TypeVar("Outcome")
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")
@@ -40,10 +40,9 @@ ONE_THREAD = {"VECLIB_MAXIMUM_THREADS": "1", **{f"{library}_NUM_THREADS": "1" fo
 
 @dataclass(frozen=True)
 class Event:
-    """Progress of one unit: ``done`` of ``total`` steps under ``label``, 0 where nobody knows their number yet;
-    ``n_instances`` of the map so far.
+    """Progress of one unit: ``done`` of ``total`` steps under ``label`` (0 while unknown), ``n_instances`` so far.
 
-    ``activity``: what is done from now on that is none of these steps.
+    ``activity``: the activity from now on that is not one of these steps.
     """
 
     unit: str
@@ -59,13 +58,13 @@ Work = Callable[[Unit, Report], Outcome]
 
 
 def limit_threads() -> None:
-    """Hold libraries that are loaded from now on, in this process and its children, to one thread."""
+    """Limit libraries that are loaded from now on, in this process and its children, to one thread."""
     os.environ.update(ONE_THREAD)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Hold the libraries that are loaded already to one thread for the time of the block."""
+    """Limit the libraries that are already loaded to one thread for the duration of the block."""
     import cv2
     from threadpoolctl import threadpool_limits
 
@@ -94,10 +93,10 @@ def run_processes(
     jobs: int,
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, at most ``jobs`` side by side, each unit in a fresh spawned process.
+    """Outcomes of ``units`` as they complete, at most ``jobs`` in parallel, each unit in a fresh spawned process.
 
-    ``lost`` makes the outcome of a unit whose process died, from a clause that says how. A ``Su3dError`` that leaves
-    ``work``, or an interrupt, stops all.
+    ``lost`` creates the outcome of a unit whose process died, from a clause describing how. A ``Su3dError`` raised by
+    ``work``, or an interrupt, stops all units.
     """
     waiting = list(reversed(units))
     running: dict[Connection, tuple[Unit, BaseProcess]] = {}
@@ -124,7 +123,7 @@ def run_processes(
 
 
 def _end(processes: Sequence[BaseProcess]) -> None:
-    """Have workers let go of what they hold, and end those that do not come to it at once."""
+    """Ask workers to release their resources and end, and kill those that do not in time."""
     for process in processes:
         process.terminate()
     until = time.monotonic() + PATIENCE_S
@@ -140,8 +139,8 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     ours, theirs = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     limit_threads()
-    # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet. The
-    # tracker, whose start would let them through again, has started by then.
+    # A worker that is still importing would answer an interrupt with a traceback, so it inherits blocked signals. The
+    # resource tracker, whose start would unblock them, has started by then.
     resource_tracker.ensure_running()
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, PARENT_SIGNALS)
     try:
@@ -159,7 +158,7 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
 
 
 def _receive(connection: Connection) -> tuple[str, Any] | None:
-    """The next message of a worker; None when it died, be it in the middle of a message."""
+    """The next message of a worker; None if it died, even in the middle of a message."""
     try:
         message: tuple[str, Any] = connection.recv()
     except (EOFError, OSError):
@@ -168,7 +167,7 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 
 
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
-    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises ``Terminated`` alone."""
+    """The outcome of ``unit`` in this process, as a message for ``unwrap`` in another one; raises only ``Terminated``."""
     try:
         with doors(), one_thread():
             return "outcome", work(unit, report)
@@ -192,7 +191,7 @@ def unwrap(message: tuple[str, Any]) -> Any:
 
 def _cause(exit_code: int | None) -> str:
     if exit_code == -signal.SIGKILL:
-        return "the worker was killed (signal 9), most often for want of memory; try fewer --jobs"
+        return "the worker was killed (signal 9), usually because memory ran out; try fewer --jobs"
     if exit_code is not None and exit_code < 0:
         return f"the worker crashed (signal {-exit_code}, {signal.Signals(-exit_code).name})"
     return f"the worker ended early (exit code {exit_code})"
@@ -207,8 +206,8 @@ def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> No
             threading.Thread(target=_end_with_parent, daemon=True).start()
             connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
             connection.close()
-        gc.freeze()  # all that is left goes with the process: nobody need search it for cycles
-    except Terminated as end:  # all is let go of; the parent is told how it came
+        gc.freeze()  # the process ends now: what is left need not be searched for cycles
+    except Terminated as end:  # all resources are released; the exit signal reports the cause to the parent
         signal.signal(end.number, signal.SIG_DFL)
         os.kill(os.getpid(), end.number)
 
@@ -223,44 +222,44 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-# The options of executors on other machines; a value other than the default is refused elsewhere.
+# The options of executors on other machines; a value other than the default is rejected for other executors.
 USED_BY = {
     "ray_address": ("ray",),
     "gpus_per_job": ("ray", "slurm"),
     "retries": ("ray", "slurm"),
     "slurm": ("slurm",),
 }
-ELSEWHERE = ("ray", "slurm")  # executors whose units run on machines that share no more than a disk or a store
+ELSEWHERE = ("ray", "slurm")  # executors whose units run on machines that share at most a disk or a store
 
 
 def executor_of(config: RunConfig, n_workers: int) -> str:
-    """The executor that ``auto`` stands for: this process for one job, else processes."""
+    """The executor that ``auto`` selects: this process for one job, otherwise processes."""
     if config.executor != "auto":
         return config.executor
     return "inline" if n_workers == 1 else "processes"
 
 
 def check_execution(config: RunConfig) -> None:
-    """A ``ConfigError`` where an option means nothing to the executor that was asked for."""
+    """A ``ConfigError`` if an option has no effect with the requested executor."""
     for name, executors in USED_BY.items():
         value = getattr(config, name)
         if value != RunConfig.model_fields[name].default and config.executor not in executors:
             shown = " ".join(value) if isinstance(value, tuple) else value
             wanted = " or ".join(f"--executor {executor}" for executor in executors)
             raise ConfigError(
-                f"--{name.replace('_', '-')} {shown}: means nothing to the executor '{config.executor}'; add {wanted}"
+                f"--{name.replace('_', '-')} {shown}: has no effect with the executor '{config.executor}'; add {wanted}"
             )
     if config.executor == "inline" and config.jobs > 1:
-        raise ConfigError(f"--jobs {config.jobs}: the executor 'inline' runs one; choose --executor processes")
+        raise ConfigError(f"--jobs {config.jobs}: the executor 'inline' runs one job; choose --executor processes")
     is_whole = config.gpus_per_job == int(config.gpus_per_job)
     if not is_whole and (config.executor == "slurm" or config.gpus_per_job > 1):
-        what = "Slurm gives whole GPUs" if config.executor == "slurm" else "a share is below 1, more come whole"
+        what = "Slurm allocates whole GPUs" if config.executor == "slurm" else "only values below 1 may be fractions"
         raise ConfigError(f"--gpus-per-job {config.gpus_per_job:g}: {what}")
     slurm_parameters(config)
 
 
 def slurm_parameters(config: RunConfig) -> dict[str, Any]:
-    """What ``--slurm KEY=VALUE`` says, by key."""
+    """The values of ``--slurm KEY=VALUE``, by key."""
     parameters = {}
     for text in config.slurm:
         key, equals, value = text.partition("=")

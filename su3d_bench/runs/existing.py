@@ -1,7 +1,8 @@
-"""What a folder holds already: the request of its run, whether that is the one asked for, and how two become one.
+"""The run that a folder already contains: its request, whether it equals the present one, and how two are merged.
 
-A run folder belongs to one request. The same one resumes; another one is refused with its first differences, unless it
-*extends* the run (the union of scenes, methods and protocols, all other values as they were) or *replaces* it.
+A run folder belongs to one request. The same request resumes it; a different one is rejected with its first
+differences, unless it *extends* the run (the union of scenes, methods and protocols, all other values unchanged) or
+*replaces* it.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from su3d_bench.runs.job import FIELDS_KNOWN_LATER, NOT_IN_KEY, REPLACE_HINT, Co
 from su3d_bench.store.records import RunRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
-Into = Literal["own", "extend", "replace"]  # what a request wants of a folder that holds a run
+Into = Literal["own", "extend", "replace"]  # what a request does with a folder that contains a run
 Start = Literal["begun", "kept", "replaced"]  # what a plan does with it, see ``Plan``
 JOINED = ("scenes", "methods", "protocols")
-CALL_SETTINGS = NEUTRAL_SETTINGS - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
+CALL_SETTINGS = NEUTRAL_SETTINGS - {"pictures", "accept_poses"}  # where scenes run: not inherited by an extension
 FINISHED = ("complete", "incomplete")
 MAX_NAMED = 3
 SEAL = "# whole: "
@@ -34,7 +35,7 @@ SEAL = "# whole: "
 
 @dataclass(frozen=True)
 class Request:
-    """What a run is asked for, resolved: names, and every value by its path in ``run.toml``."""
+    """The resolved request of a run: names, and every value by its path in ``run.toml``."""
 
     scenes: tuple[str, ...]
     methods: tuple[str, ...]
@@ -44,10 +45,10 @@ class Request:
 
 @dataclass(frozen=True)
 class ExistingRun:
-    """The run in a folder: what ``run.json`` says, None where it is not there, and the settings of its ``run.toml``.
+    """The run in a folder: its ``run.json`` (None if missing) and the settings of its ``run.toml``.
 
-    ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. The source of a setting is
-    where its value came from when the run was first asked for.
+    ``content`` is ``run.toml`` as it is on disk; ``is_known`` states whether it is complete. The source of a setting is
+    where its value came from when the run was first requested.
     """
 
     folder: Path
@@ -67,31 +68,31 @@ class ExistingRun:
 
     @property
     def requested(self) -> dict[KeyPath, Any]:
-        """The values that are no defaults."""
+        """The values that are not defaults."""
         return {entry.path: entry.value for entry in self.settings.entries if entry.source != DEFAULT_SOURCE}
 
     def asked(self, name: str) -> tuple[str, ...]:
-        """The list of texts that was asked for as ``name``, such as patterns of scenes."""
+        """The list of texts that was requested as ``name``, such as scene patterns."""
         value = self.values.get((name,))
         return tuple(map(str, value)) if isinstance(value, list | tuple) else ()
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """Those that scored it, or will."""
+        """The protocols that scored it, or will score it."""
         own = () if self.record is None else tuple(rules.name for rules in self.record.protocols)
         return own or self.asked("protocols")
 
 
 def with_end_marker(text: str) -> str:
-    """``run.toml`` with a last line that tells whether all of it is there, as after a power cut it may not be."""
+    """``run.toml`` with a last line that shows whether the file is complete, which it may not be after a power cut."""
     return f"{text}{SEAL}{digest_bytes(text.encode())}\n"
 
 
 def existing_run(folder: Path) -> ExistingRun | None:
-    """The run in ``folder``; None where there is none. Of a ``run.toml`` that is not whole nothing is believed."""
+    """The run in ``folder``; None if there is none. An incomplete ``run.toml`` is not read at all."""
     record = None
     if is_file(folder / "run.json"):
-        with suppress(StoreError):  # what stands in run.toml counts then
+        with suppress(StoreError):  # run.toml counts then
             record = read_record(RunRecord, folder / "run.json", shown(folder))
     if not is_file(folder / "run.toml"):
         return None if record is None else ExistingRun(folder, None, record)
@@ -105,16 +106,16 @@ def existing_run(folder: Path) -> ExistingRun | None:
 
 
 def _as_first_requested(entry: Setting, lines: Sequence[str]) -> Setting:
-    """``entry`` of a file with these ``lines``, its source that of the remark which stands behind it there."""
+    """``entry`` of a file with these ``lines``, its source taken from the comment at the end of its line."""
     _, mark, remark = lines[int(entry.source.rpartition(":")[2]) - 1].rpartition("  # ")
     return replace(entry, source=remark.strip()) if mark else entry
 
 
 def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
-    """What ``held`` was asked for and what is asked for now; ``where`` is the run's folder, or its URL."""
+    """The request of ``held`` merged with the present one; ``where`` is the run's folder or its URL."""
     if held is None or not held.is_known:
         raise ConfigError(
-            f"--extend: {printable(where, 300)} holds no run.toml of a run; leave --extend out to begin one"
+            f"--extend: {printable(where, 300)} contains no complete run.toml; omit --extend to start a run"
         )
     joined = []
     for name in JOINED:
@@ -132,7 +133,7 @@ def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
 def differences(held: ExistingRun, now: Request) -> tuple[list[str], list[str]]:
     """Clauses on the names and on the values in which the request of the run in a folder differs from ``now``.
 
-    None where the same command was given again; requests that differ in names alone may stand in one run.
+    Empty if the same command was given again; requests that differ only in names may be merged in one run.
     """
     names: list[str] = []
     if held.record is None and not held.is_known:
@@ -141,7 +142,7 @@ def differences(held: ExistingRun, now: Request) -> tuple[list[str], list[str]]:
         before = held.asked(name) if held.record is None else _names(held.record, name)
         after = getattr(now, name) if held.record is not None else tuple(map(str, now.values[(name,)]))
         if gone := [one for one in before if one not in after]:
-            names.append(f"{_some(noun, gone)} not asked for now")
+            names.append(f"{_some(noun, gone)} not requested now")
         if new := [one for one in after if one not in before]:
             names.append(f"{_some(noun, new)} new")
     return names, _changed_values(held, now) if held.is_known else []
@@ -158,7 +159,7 @@ def _some(noun: str, names: Sequence[str]) -> str:
 
 
 def _changed_values(held: ExistingRun, now: Request) -> list[str]:
-    """``seed was 0, now 1`` of every value that both requests have and that moves numbers."""
+    """``seed was 0, now 1`` for every value that differs and affects numbers."""
     old, new = held.values, now.values
     parts = {path[:2] for path in old if len(path) > 2} & {path[:2] for path in new if len(path) > 2}
     clauses = []
@@ -178,7 +179,7 @@ def _changed_values(held: ExistingRun, now: Request) -> list[str]:
 
 
 def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
-    """Whether what stands at ``path`` can move a number of the request that has these ``values``."""
+    """Whether the value at ``path`` can affect a number of the request with these ``values``."""
     if path[:2] == ("perception", "language"):
         return values.get(("solver",)) == "llm" and path[2:3] in [(name,) for name in ANSWER_SETTINGS]
     return not ".".join(path).startswith(NOT_IN_KEY)
@@ -187,7 +188,7 @@ def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
 def _is_same(path: KeyPath, before: Any, after: Any, held: ExistingRun) -> bool:
     if path == ("anytime",):
         return sorted(set(before or ())) == sorted(set(after or ()))
-    if path == ("profile",) and "auto" in (before, after):  # which came out as the one that is named
+    if path == ("profile",) and "auto" in (before, after):  # which resolved to the named one
         came_out = None if held.record is None else held.record.profile
         return before == after or came_out in (before, after)
     return bool(_plain(before) == _plain(after))
@@ -208,30 +209,30 @@ def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
 
 
 def check_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
-    """A ``StoreError`` that says how the run at ``where`` differs from ``now``, with the choices that there are."""
+    """A ``StoreError`` if the run at ``where`` differs from ``now``: it names the differences and the options."""
     names, values = differences(held, now)
-    if into == "extend":  # what is new is what it is for
+    if into == "extend":  # new names are the purpose of an extension
         names = [clause for clause in names if not clause.endswith(" new")]
     if into == "replace" or not (names or values):
         return
     what, name = some([*names, *values], MAX_NAMED), printable(where, 300)
     if into == "extend":
-        raise StoreError(f"{name}: cannot be extended by this ({what}); {REPLACE_HINT}")
-    join = "" if values else "--extend adds this one to it, "
-    raise StoreError(f"{name}: holds another run ({what}); {join}{REPLACE_HINT}")
+        raise StoreError(f"{name}: cannot be extended by this request ({what}); {REPLACE_HINT}")
+    join = "" if values else "--extend adds this request to it, "
+    raise StoreError(f"{name}: contains a different run ({what}); {join}{REPLACE_HINT}")
 
 
 def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
-    """The jobs in ``folder`` that go where ``jobs`` replace its run; ``StoreError`` where files of others would go."""
+    """The jobs in ``folder`` that are removed if ``jobs`` replace its run; ``StoreError`` if foreign files would be."""
     methods = ConfiguredMethods()
     keys = [(folder.job(job.scene, part.name), methods.of(job, part)[1]) for job in jobs for part in job.parts]
-    # As far as the request tells, these are the maps that the new run asks for.
+    # As far as the request shows, these are the maps that the new run needs.
     kept = {at.path for at, key in keys if at.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None}
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
     for stranger in folder.foreign_files():
         if any(f"{stranger}/".startswith(f"{name}/") or name.startswith(f"{stranger}/") for name in names):
             raise StoreError(
-                f"{shown(folder.path / stranger)}: is of no run and would go with what --replace removes; move it"
+                f"{shown(folder.path / stranger)}: does not belong to a run, but --replace would remove it; move it"
             )
     return going

@@ -1,4 +1,4 @@
-"""A run folder as whoever compares or explains it needs it: what was scored, on which data, by which rules."""
+"""A finished run as comparisons and explanations need it: what was scored, on which data, by which rules."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ MAX_NAMED = 8  # scenes or methods of a run in a message
 
 
 def external(formats: Sequence[str]) -> str:
-    """What stands beneath every table of predictions that were not made here."""
-    return f"predictions made elsewhere, read from files ({printable(', '.join(formats), 120)})"
+    """The note below every table of predictions that were not made here."""
+    return f"external predictions, read from files ({printable(', '.join(formats), 120)})"
 
 
 @dataclass(frozen=True)
 class RunData:
     """The data of a run, opened with the options that it had; ``digests`` are those of its scenes.
 
-    ``truth_files``: the folder of ground truth with which predictions made elsewhere were compared, not a dataset.
+    ``truth_files``: the folder of ground truth that external predictions were compared with, if not a dataset.
     """
 
     settings: Settings
@@ -77,24 +77,24 @@ class RunData:
         return datasets
 
     def dataset(self, scene: str) -> Any:
-        """The dataset of ``scene``; a ``DataError`` where it is not known, or its data are not those of the run."""
+        """The dataset of ``scene``; a ``DataError`` if it is unknown, or its data differ from those of the run."""
         name, _, of_dataset = scene.partition("/")
         if self.truth_files is not None:
             raise DataError(
                 f"{printable(scene, 100)}: was evaluated against the files in {printable(self.truth_files, 200)}, "
-                "which have no frames, colours and places; evaluate against the dataset itself with --dataset"
+                "which have no frames, colours or positions; evaluate against the dataset itself with --dataset"
             )
         if name not in self._datasets:
             raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
         dataset = self._datasets[name]
         if dataset.digest(of_dataset) != self.digests.get(scene):
-            raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
+            raise DataError(f"{printable(scene, 100)}: its data have changed since the run; run it again")
         return dataset
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The records of a run; ``protocols`` holds the rules that scored it, ``results`` are by method and protocol."""
+    """The records of a run; ``protocols`` are the rules that scored it, ``results`` are by method and protocol."""
 
     folder: RunFolder
     record: records.RunRecord
@@ -120,7 +120,7 @@ class FinishedRun:
         return {entry.path: entry.value for entry in self.data.settings.entries}
 
     def changed(self, method: str) -> tuple[str, ...]:
-        """The settings of ``method`` that are not its own, such as ``top_m = 3``; none of a method not known here."""
+        """The settings of ``method`` that are not its defaults, such as ``top_m = 3``; empty if it is unknown."""
         with suppress(ConfigError):
             own = dict(flatten(json.loads(part_of("method", method, Settings()).options)))
             given = {path[2:]: value for path, value in self.settings.items() if path[:2] == ("method", method)}
@@ -131,17 +131,17 @@ class FinishedRun:
         return ()
 
     def dataset(self, scene: str) -> Any:
-        """The dataset of ``scene``, whose data are those of the run; a ``DataError`` where they are others."""
+        """The dataset of ``scene``; a ``DataError`` if its data differ from those of the run."""
         return self.data.dataset(scene)
 
     def visible_truth(self, method: str) -> Part | None:
-        """The method with its settings where it is one of the program's own that is told the truth."""
+        """The method with its settings if it is a built-in one that uses ground truth, otherwise None."""
         is_own = method in registry.METHODS and method not in self.external
         is_told = is_own and hasattr(registry.load("method", method), "receive_ground_truth")
         return part_of("method", method, self.data.settings) if is_told else None
 
     def encoder(self, device: str = "cpu") -> Encoder:
-        """The text tower that the run's features go with; a ``PredictionError`` where it is another here."""
+        """The text encoder that matches the run's features; a ``PredictionError`` if a different one is used here."""
         return encoder_of(self.folder, device)
 
     @property
@@ -150,34 +150,34 @@ class FinishedRun:
 
     @cached_property
     def external(self) -> Mapping[str, records.PredictionsRecord]:
-        """The predictions that were made elsewhere, by the method that they are called."""
+        """The external predictions, by method name."""
         return {record.method: record for record in self.record.predictions}
 
     def elsewhere_lines(self) -> list[str]:
-        """A line a method whose predictions were made elsewhere."""
+        """One line per method with external predictions."""
         of_methods = self.external.items()
         return [f"{printable(method, 80)}: {external(record.formats)}" for method, record in of_methods]
 
     def labels(self, method: str, protocol: str, rules: ProtocolRules) -> str | None:
-        """How many labels of a mask or point a result is of, see ``labels_counted``; None where no label counts."""
+        """How many labels per mask or point a result counts, see ``labels_counted``; None if no label counts."""
         record = self.results.get((method, protocol))
         if record is None:
             return None
         return record.labels or labels_counted(rules, by_features=record.encoder is not None)
 
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
-        """The rules that scored the run: the program's own, else those that ``run.json`` keeps.
+        """The rules that scored the run: built-in ones, otherwise those stored in ``run.json``.
 
-        A ``ConfigError`` where they are not here or not in ``run.json``, or are those of another version;
-        ``to_the_letter``: or other ones under the same version.
+        A ``ConfigError`` if they are neither here nor in ``run.json``, or have a different version;
+        ``to_the_letter``: or differ under the same version.
         """
         recorded, shown = self.protocols.get(protocol), printable(protocol, 80)
         if recorded is None:
-            raise ConfigError(f"{self.name}: its scores name the protocol {shown}, which its run.json does not list")
+            raise ConfigError(f"{self.name}: run.json does not list the protocol {shown} of its scores")
         here = load_protocol(protocol) if protocol in protocol_names() else self._own_rules(recorded)
         if here.version != recorded.version:
             raise ConfigError(
-                f"{self.name}: was scored under {shown} version {recorded.version}, here is version {here.version}; "
+                f"{self.name}: was scored under {shown} version {recorded.version}, now it is version {here.version}; "
                 "score it again"
             )
         if here.digest != recorded.digest and (to_the_letter or recorded.rules is not None):
@@ -185,34 +185,34 @@ class FinishedRun:
         return here
 
     def _own_rules(self, recorded: records.ProtocolRecord) -> ProtocolRules:
-        """User-defined rules, which ``run.json`` keeps."""
+        """User-defined rules, stored in ``run.json``."""
         where = f"{self.name}: the rules of {printable(recorded.name, 80)}"
         own = None if recorded.rules is None else read_rules(recorded.rules, where)
         if own is None or own.name != recorded.name:
-            raise ConfigError(f"{where} are neither the program's nor in run.json; run its command again")
+            raise ConfigError(f"{where} are neither built-in nor in run.json; run its command again")
         return own
 
     def check_method(self, method: str) -> None:
-        """A ``ConfigError`` where the run holds no scores of ``method``."""
+        """A ``ConfigError`` if the run has no scores of ``method``."""
         if method not in self.methods and not self.has_scores(method):
             has_truth = CEILING_METHOD not in self.methods and self.has_scores(CEILING_METHOD)
             known = [*self.methods, *([CEILING_METHOD] if has_truth else [])]
             hint = suggest(method, known, "it has")
-            raise ConfigError(f"{self.name}: holds no scores of the method '{printable(method, 80)}'{hint}")
+            raise ConfigError(f"{self.name}: has no scores of the method '{printable(method, 80)}'{hint}")
 
     def check_protocol(self, protocol: str) -> None:
-        """A ``ConfigError`` where the run was not scored under ``protocol``."""
+        """A ``ConfigError`` if the run was not scored under ``protocol``."""
         if protocol not in self.protocols:
             hint = suggest(protocol, self.protocols, "it has")
             raise ConfigError(f"{self.name}: was not scored under '{printable(protocol, 80)}'{hint}")
 
     def has_scores(self, method: str) -> bool:
-        """Whether any scene was scored for ``method``; those of the ceiling stand in no table."""
+        """Whether any scene was scored for ``method``; the scores of the ceiling are in no table."""
         is_name = "/" not in method
         return is_name and any(is_file(self.folder.job(scene, method).counts) for scene in self.scenes)
 
     def scores(self, method: str) -> dict[str, dict[str, SceneScore]]:
-        """Protocol -> scene -> counts, of every scene that was scored."""
+        """Protocol -> scene -> counts, for every scene that was scored."""
         scores: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
         for scene in self.scenes:
             file = self.folder.job(scene, method).counts
@@ -228,29 +228,29 @@ class FinishedRun:
 
 
 def record_of_rules(rules: ProtocolRules) -> records.ProtocolRecord:
-    """What ``run.json`` says of the rules that scored a run."""
+    """The record in ``run.json`` of the rules that scored a run."""
     own = None if rules.name in protocol_names() else rules.as_json
     return records.ProtocolRecord(rules.name, rules.version, rules.digest, own)
 
 
 def read_run(path: Path) -> FinishedRun:
-    """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
+    """The run in the folder ``path``; a ``StoreError`` if there is none, or it is not finished."""
     shown = printable(str(path), 200)
     if not is_file(path / "run.json"):
         raise StoreError(f"{shown}: {_no_run_message(path)}")
     if not is_file(path / "metrics.json"):
-        raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
+        raise StoreError(f"{shown}: contains no metrics.json, so the run is not finished; run its command again")
     record = records.read_record(records.RunRecord, path / "run.json", shown)
     metrics = records.read_record(records.MetricsRecord, path / "metrics.json", shown)
     if not record.methods:
-        raise StoreError(f"{shown}: run.json: methods is not as a run writes it; run it again")
+        raise StoreError(f"{shown}: run.json: methods is empty; run it again")
     named = {
         "run.json: names the protocol": [rules.name for rules in record.protocols],
         "run.json: names the scene": record.scenes,
         "run.json: names the method": record.methods,
         "metrics.json: names the result": [f"{one.method} / {one.protocol}" for one in metrics.results],
     }
-    for what, names in named.items():  # of two that differ, one would be read and the other passed over
+    for what, names in named.items():  # of two different ones, one would be ignored
         if twice := [name for name, n in Counter(names).items() if n > 1]:
             raise StoreError(f"{shown}: {what} '{printable(twice[0], 100)}' twice; run its command again")
     protocols = {rules.name: rules for rules in record.protocols}
@@ -267,22 +267,22 @@ def read_run(path: Path) -> FinishedRun:
 
 
 def _no_run_message(path: Path) -> str:
-    """What is at ``path`` in place of a run, and what would be one."""
+    """What ``path`` contains instead of a run, and how to get a run."""
     if is_file(path) and is_scores_file(path):
         return (
-            "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out "
+            "contains numbers without the counts of scenes that are needed here; evaluate again with --out "
             "runs/mine, and name that folder"
         )
     with suppress(Su3dError, OSError):
         reader = recognise(path)
         if path.is_dir() and reader.scenes(path):
             made = f"su3d-bench evaluate {shlex.quote(str(path))} --out runs/mine"
-            return f"holds predictions ({reader.name}) and no run.json; make a run of them with: {made}"
-    return "holds no run.json; name the folder of a run, such as runs/my-run"
+            return f"contains predictions ({reader.name}) and no run.json; create a run from them with: {made}"
+    return "contains no run.json; name the folder of a run, such as runs/my-run"
 
 
 def is_scores_file(file: Path) -> bool:
-    """Whether ``file`` is what ``evaluate --json`` writes."""
+    """Whether ``file`` is an output of ``evaluate --json``."""
     try:
         value = read_json(file)
     except StoreError:
@@ -293,7 +293,7 @@ def is_scores_file(file: Path) -> bool:
 
 
 def map_of_scene(scene: str, method: str, run: Path | None) -> tuple[RunFolder, JobFolder, Prediction]:
-    """The map of ``scene`` by ``method`` in ``run``, or in the latest of ``runs/`` that has it, with its place."""
+    """The map of ``scene`` by ``method`` and its location, in ``run`` or in the latest run below ``runs/``."""
     folder = latest_run(scene, method) if run is None else RunFolder(run)
     job = folder.job(scene, method)
     if not job.prediction.is_file():
@@ -302,7 +302,7 @@ def map_of_scene(scene: str, method: str, run: Path | None) -> tuple[RunFolder, 
 
 
 def latest_run(scene: str, method: str) -> RunFolder:
-    """The run folder below ``runs/`` whose map of the scene is the youngest."""
+    """The run folder below ``runs/`` with the newest map of the scene."""
     runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
     made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
     if not made:
@@ -310,43 +310,43 @@ def latest_run(scene: str, method: str) -> RunFolder:
         hint = nearest_scene(scene, known)
         if not hint and looks_like_scene(scene):
             command = shlex.join(["su3d-bench", "run", scene, "--methods", method])
-            hint = f"; make one: {printable(command, 300)}"
-        raise StoreError(f"no run in runs/ holds {printable(scene, 120)} by {printable(method, 80)}{hint}")
+            hint = f"; create one: {printable(command, 300)}"
+        raise StoreError(f"no run in runs/ has {printable(scene, 120)} by {printable(method, 80)}{hint}")
     return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
 
 
 def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
-    """The error of a run without such a map: the names that it has instead. No command is named that would write into
-    the folder: it belongs to another request."""
+    """The error of a run without such a map, with the names that it has. It suggests no command that would write into
+    the folder, which belongs to another request."""
     record = _request_of(run)
     if not record.scenes:
-        return StoreError(f"{shown(run.path)}: holds no run; name the folder of one: su3d-bench runs list")
+        return StoreError(f"{shown(run.path)}: contains no run; name a run folder, see: su3d-bench runs list")
     if scene not in record.scenes:
         known = [printable(name, 80) for name in record.scenes]
         hint = nearest_scene(scene, record.scenes) or f"; the run has {some(known, MAX_NAMED)}"
     elif method not in record.methods:
         hint = suggest(method, record.methods, "the run has")
     else:
-        hint = ", for the run is not finished; give its command again"
-    return StoreError(f"{shown(run.path)}: holds no map of {printable(scene, 120)} by {printable(method, 80)}{hint}")
+        hint = ": the run is not finished; run its command again"
+    return StoreError(f"{shown(run.path)}: contains no map of {printable(scene, 120)} by {printable(method, 80)}{hint}")
 
 
 def _request_of(run: RunFolder) -> records.RunRecord:
-    """What the run was asked for; nothing where its record is missing or damaged."""
+    """The request of the run; empty if its record is missing or damaged."""
     with suppress(StoreError):
         return records.read_record(records.RunRecord, run.path / "run.json", shown(run.path))
     return records.RunRecord()
 
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
-    """The data from which ``map_file`` was made, a sealed map of ``scene`` in the folder ``run``, finished or not."""
+    """The data from which ``map_file``, a completed map of ``scene`` in the folder ``run``, was made."""
     mark_complete = JobFolder(map_file.parent).completion_records().get("predict")
     digests = {} if mark_complete is None else {scene: mark_complete.key.get("data", "")}
     return RunData(read_file(run / "run.toml"), digests, _request_of(RunFolder(run)).truth_files)
 
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
-    """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
+    """The text encoder that matches the run's features, on ``device``; a different one raises ``PredictionError``."""
     from su3d_bench.perception.cache import FrameCache
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import encoder_known_as
@@ -368,14 +368,14 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     if isinstance(encoder, FoundationEncoder | EmbeddedEncoder) and encoder.is_same_space(made_with):
         return encoder
     raise PredictionError(
-        f"{run.path}: its features were made by encoder {record.encoder} ({made_with[:12]}), here is "
+        f"{run.path}: its features were made by encoder {record.encoder} ({made_with[:12]}), not by "
         f"{encoder.name} ({encoder.digest[:12]}); "
-        + ("run it again" if record.ground_truth is None else "only texts of that one can be held against them")
+        + ("run it again" if record.ground_truth is None else "only texts encoded by it can be compared with them")
     )
 
 
 def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
-    """The updates of every scene that ``method`` finished; scenes where it looks at no frame are left out."""
+    """The updates of every scene that ``method`` finished, except scenes for which it uses no frames."""
     run.check_method(method)
     times = []
     for scene in run.scenes:

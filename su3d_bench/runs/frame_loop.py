@@ -1,4 +1,4 @@
-"""Feed a method frame by frame, write down its map, and note what each update and each map cost."""
+"""Feed a method frame by frame, write its map, and record the cost of each update and each map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from su3d_bench.store.records import updates_text
 
 @dataclass(frozen=True)
 class FirstFrames(Sequence[types.Frame]):
-    """The first ``n`` of ``frames``, read anew at every access."""
+    """The first ``n`` of ``frames``, read from disk at every access."""
 
     frames: Sequence[types.Frame]
     n: int
@@ -42,7 +42,7 @@ class FirstFrames(Sequence[types.Frame]):
 
 
 class TimedRegions:
-    """Perception on demand, its time told apart from that of the method that asks for it."""
+    """Perception on demand, timed separately from the method that calls it."""
 
     def __init__(self, regions: interfaces.RegionPerception, clock: MethodClock) -> None:
         self._regions = regions
@@ -62,7 +62,7 @@ class TimedRegions:
 
 
 def no_detections(frame: types.Frame, needs: types.PerceptionNeeds) -> types.Detections:
-    """What a method that needs no masks gets."""
+    """The detections for a method that needs no masks."""
     return _detections(frame, needs, n=0, dim=0)
 
 
@@ -83,7 +83,7 @@ def _detections(frame: types.Frame, needs: types.PerceptionNeeds, n: int, dim: i
 
 
 def warm_up(method: interfaces.Method) -> None:
-    """Feeds ``method``, which is thrown away, a made-up frame: no timed step then waits for a compiler or an import."""
+    """Feed a synthetic frame to the disposable ``method``, so that no timed step waits for a compiler or an import."""
     size = 32
     depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
     intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
@@ -98,9 +98,9 @@ def warm_up(method: interfaces.Method) -> None:
 
 
 def surface_of(dataset: interfaces.Dataset, scene: str) -> types.Surface:
-    """The mesh of a scene without labels; ``DataError`` where its dataset has none."""
+    """The mesh of a scene without labels; ``DataError`` if its dataset has none."""
     if not isinstance(dataset, interfaces.HasSurface):
-        raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh; this method works on one")
+        raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh, which this method needs")
     return dataset.surface(scene)
 
 
@@ -119,11 +119,11 @@ N_AHEAD = 2  # frames in memory besides the one in use
 
 
 class ReadAhead(Generic[Read]):
-    """The first ``n`` of ``frames`` one after another, at most ``n_ahead`` of them read before they are asked for.
+    """The first ``n`` of ``frames`` in order, at most ``n_ahead`` of them read before they are requested.
 
-    What reading a frame raises is raised when that frame is asked for, not before. The first frame is read alone: what
-    a dataset makes at its first use is made once. Leaving the block, at whatever frame, ends the threads; reads that
-    have begun are waited for. ``n_ahead`` 0: each frame is read when it is asked for.
+    An error of reading a frame is raised when that frame is requested, not before. The first frame is read alone, so
+    that a dataset initialises only once. Leaving the block, at any frame, ends the threads after waiting for reads in
+    progress. ``n_ahead`` 0: each frame is read when it is requested.
     """
 
     def __init__(self, frames: Sequence[Read], n: int, *, n_threads: int = N_THREADS, n_ahead: int = N_AHEAD) -> None:
@@ -144,7 +144,7 @@ class ReadAhead(Generic[Read]):
         self._reading.clear()
 
     def next_frame(self) -> Read:
-        """The frame after the one that was taken last."""
+        """The next frame."""
         self._begin_up_to(1)
         frame = self._reading.popleft().result()
         self._begin_up_to(self._n_ahead)
@@ -157,14 +157,14 @@ class ReadAhead(Generic[Read]):
 
 
 Row = dict[str, float | int]
-N_WARM_UP = 3  # sightings that an object must have by default to be in a map
-CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates
-# What a method may say of its size after an update.
+N_WARM_UP = 3  # by default an object must be seen this often to be in a map
+CALIBRATE_EVERY = 4  # about 5 ms each: one percent of the time of the updates
+# Sizes that a method may report after an update.
 SIZES = ("n_points", "n_instances", "map_bytes")
 
 
 class MethodFeed:
-    """One method on one scene: ``maps`` holds, for each map written, the updates before it and what it took."""
+    """One method on one scene; ``maps`` has, for each map written, the number of updates before it and its cost."""
 
     def __init__(
         self, scene: str, method: interfaces.Method, perception: Perception, report: Report, clock: MethodClock
@@ -181,13 +181,13 @@ class MethodFeed:
 
     @property
     def calibration_ms(self) -> float | None:
-        """The median time of the calibrating piece of work between the updates; None where there was none."""
+        """The median time of the calibration task between updates; None if it was not run."""
         return round(float(np.median(self._calibrations)), 4) if self._calibrations else None
 
     def feed_until(self, n_fed: int, frames: ReadAhead[types.Frame], n_frames: int) -> None:
-        """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come.
+        """Feed frames until ``n_fed`` are fed; ``n_frames`` is the total number that will be fed.
 
-        Stage ``decode`` is what an update waited for its frame.
+        Stage ``decode`` is the time that an update waited for its frame.
         """
         if not self._rows and n_frames:
             self._report(Event(self._scene, self._method.name, 0, n_frames))
@@ -207,7 +207,7 @@ class MethodFeed:
         with timer.stage("decode"):
             frame = frames.next_frame()
         if not (frame.depth_m > 0).any():
-            raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
+            raise DataError(f"{self._scene} frame {frame.index}: depth is empty (no pixel is above 0 m)")
         detections = (
             no_detections(frame, method.needs)
             if method.needs.masks == "none"
@@ -221,7 +221,7 @@ class MethodFeed:
         of_method |= told(method, "losses", {})
         of_method |= {"rss_bytes": memory_bytes()}
         of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
-        # What is measured here goes before what a method calls by the same name.
+        # Values measured here take precedence over values of the method with the same name.
         own |= {key: value for key, value in of_method.items() if key not in own}
         return own | {"method_ms": round(self._clock.take("update").method_ms, 3), "total_ms": round(total_ms, 3)}
 
@@ -241,7 +241,7 @@ class MethodFeed:
 
 
 class SceneLog(logging.Handler):
-    """Keeps what the library says while a scene runs: all ``lines`` for its log, ``warnings`` for the record too."""
+    """Collects log messages of a scene: all ``lines`` for its log, ``warnings`` also for the record."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -252,11 +252,11 @@ class SceneLog(logging.Handler):
         return plain_text("\n".join([*self.lines, *last])) + "\n"
 
     def remarks(self) -> dict[str, list[str]]:
-        """What a seal keeps of it, for a run that goes on from there."""
+        """The part stored in a completion record, for a run that is resumed from there."""
         return {"log": self.lines, "warnings": list(dict.fromkeys(self.warnings))}
 
     def recall(self, remarks: Mapping[str, Any]) -> None:
-        """Begin with what an earlier process said."""
+        """Prepend the messages of an earlier process."""
         self.lines[:0] = remarks.get("log", [])
         self.warnings[:0] = remarks.get("warnings", [])
 

@@ -1,4 +1,4 @@
-"""What a run asks of a worker and gets back: one scene's job, its outcomes, and the keys under which they are kept."""
+"""The input and output of a worker: one scene's job, its outcomes, and the keys under which they are cached."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def options_model(kind: str, target: str) -> Any:
 
 
 def part_of(kind: str, target: str, settings: Settings) -> Part:
-    """The dataset or method at ``target`` with what ``settings`` say of it."""
+    """The dataset or method at ``target`` with its ``settings``."""
     name = str(registry.load(kind, target).name)
     return Part(target, name, resolve(settings, (kind, name), options_model(kind, target)).model_dump_json())
 
@@ -63,11 +63,11 @@ def build_method(part: Part) -> Any:
 def as_configured(
     part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
 ) -> Prediction:
-    """``prediction``, a map of the method ``part``; that of a method that is told the truth is made anew where it must
-    be told another one under ``rules``.
+    """``prediction``, a map of the method ``part``; computed again for a method that uses ground truth if ``rules``
+    need a different one.
 
-    So it is where ``truth`` names its classes otherwise than the ``first`` truth of the dataset, from which the map
-    came, and where stuff counts that has no instances. Of OpenLex3D's labels it is told the first synonyms.
+    This is the case if ``truth`` names its classes differently from the ``first`` ground truth of the dataset, which
+    the map was made from, or if stuff without instances counts. Of OpenLex3D's labels it gets the first synonyms.
     """
     method = build_method(part)
     if isinstance(truth, OpenLexTruth):
@@ -82,19 +82,19 @@ def as_configured(
     return recomputed
 
 
-# Settings of perception that move no number, or whose part that does is in perception's digest.
+# Perception settings that do not affect numbers, or whose effect is already in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
-REPLACE_HINT = "--replace puts this one in its place, or choose another folder with --out"
+REPLACE_HINT = "--replace overwrites it, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
 
 @dataclass(frozen=True)
 class SceneJob:
-    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
+    """Everything that a worker needs to know about one scene; ``index`` counts the scenes of the run.
 
-    ``config`` is the run's and ``perception`` that of perception as JSON. ``replaces``: a map that was made from other
-    inputs is made anew instead of refused. ``doubts``: what must be said of its poses, None where whoever made the job
-    could not look at its data.
+    ``config`` is the run's, ``perception`` the perception settings as JSON. ``replaces``: a map made from different
+    inputs is computed again instead of rejected. ``doubts``: warnings about its poses, None if the process that created
+    the job could not read its data.
     """
 
     scene: str
@@ -113,20 +113,20 @@ class SceneJob:
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """All methods, that of the ceiling last."""
+        """All methods, the one of the ceiling last."""
         return self.methods if self.ceiling is None else (*self.methods, self.ceiling)
 
     @property
     def scene_name(self) -> str:
-        """The scene as its dataset calls it."""
+        """The name of the scene within its dataset."""
         return self.scene.removeprefix(f"{self.dataset.name}/")
 
 
 @dataclass(frozen=True)
 class MethodOutcome:
-    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason.
+    """The outcome of one scene under one method; ``error`` is one line, ``unscored`` pairs a protocol and a reason.
 
-    ``warnings`` are what the library said of the data on the way, ``doubts`` those that stand beside every number.
+    ``warnings`` are messages about the data, ``doubts`` those that are shown with every number.
     """
 
     scene: str
@@ -144,12 +144,12 @@ class MethodOutcome:
 
 
 def stride_of(job: SceneJob, part: Part) -> int:
-    """Frames between updates: the run's where it is set, else the method's own, else 1."""
+    """Frames between updates: the run's if set, otherwise the method's own, otherwise 1."""
     return job.config.stride or int(json.loads(part.options).get("stride", 1))
 
 
 def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
-    """What of a prediction's key is known before any data is read, the most telling fields first."""
+    """The part of a prediction's key that is known before any data is read, the most informative fields first."""
     key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.config.seed)}
     sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
     if method.needs.frames:
@@ -173,8 +173,8 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
 
 
 class ConfiguredMethods:
-    """Methods and what of the keys of their predictions is known before any data is read: the same for all scenes of a
-    dataset, made once."""
+    """Methods and the part of the keys of their predictions that is known before any data is read, computed once per
+    dataset."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
@@ -188,24 +188,24 @@ class ConfiguredMethods:
 
 
 def custom_code_key(target: str) -> str | None:
-    """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
+    """A key of the file of a user-defined dataset or method, which is not part of the program's code."""
     return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def check_same_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
-    """A ``StoreError`` where ``folder`` was sealed under another key; ``is_early``: what is known later aside."""
+    """A ``StoreError`` if ``folder`` was completed under another key; ``is_early`` ignores fields known only later."""
     if changed := folder.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER if is_early else ()):
-        raise StoreError(f"{folder.path}: holds another run ({changed}); {REPLACE_HINT}")
+        raise StoreError(f"{folder.path}: contains a different run ({changed}); {REPLACE_HINT}")
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 DEVICE, CPU = "perception.models.device", '"cpu"'
-TORCH_PACKAGES = ("torch", "transformers")  # what computes where not all is done by the packages of every key
+TORCH_PACKAGES = ("torch", "transformers")  # used in addition to the packages in every key
 
 
 @dataclass(frozen=True)
 class JobInputs:
-    """One scene under one method, with its data and perception known; ``config`` is what ``config_key`` gives."""
+    """One scene under one method, with its data and perception known; ``config`` is the result of ``config_key``."""
 
     job: SceneJob
     name: str
@@ -235,7 +235,7 @@ class JobInputs:
         return key | refined_digest(folder) if any(protocol.uses_names for protocol in rules.values()) else key
 
     def is_scored(self, folder: JobFolder, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``mark_complete`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
+        """Whether ``mark_complete`` records scores under ``key``; pictures that are not requested now do no harm."""
         if (
             mark_complete is not None
             and not self.job.config.pictures
@@ -245,7 +245,7 @@ class JobInputs:
         return folder.is_whole(mark_complete, key)
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
-        """The outcome once both steps are sealed; ``remarks`` stand beside the seal of the scores."""
+        """The outcome once both steps are complete; ``remarks`` are stored with the completion record of the scores."""
         return MethodOutcome(
             self.job.scene,
             self.name,
@@ -262,13 +262,13 @@ class JobInputs:
 
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
-    """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
+    """The note shown with every number: where the scenes, the masks, or the method's own proposals come from."""
     own = told(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
     is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
-    made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
+    made = f"generated rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -1,4 +1,4 @@
-"""From what was asked for to what will be done: one job a scene, everything resolved and checked before any work."""
+"""From the request to the plan: one job per scene, everything resolved and checked before any work."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
 def asked_settings(
     values: Mapping[str, Any], *, device: str | None, config: Path | None, source_of: Callable[[str], str]
 ) -> Settings:
-    """The settings of the file ``config``, then those of ``values``, which win; None stands for what was not asked.
+    """The settings of the file ``config``, overridden by ``values``; None means not requested.
 
-    ``values`` are by key of a run, ``source_of`` says of a key where it was asked, which begins an error's line.
+    ``values`` are by key of a run, ``source_of`` gives the source of a key, with which an error message begins.
     """
     settings = Settings() if config is None else read_file(config)
     given: list[tuple[KeyPath, Any]] = [((name,), value) for name, value in values.items()]
@@ -75,17 +75,17 @@ def asked_settings(
     )
 
 
-MAX_NAMED = 4  # scenes and methods whose maps go
-MAX_CHARACTERS = 120  # the name is a folder's name too
+MAX_NAMED = 4  # scenes and methods whose maps are removed
+MAX_CHARACTERS = 120  # the name is also a folder name
 COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 
 
 @dataclass(frozen=True)
 class NamedMethod:
-    """``target`` finds the class, ``base`` is the name that it bears, ``name`` the one with the variant.
+    """``target`` locates the class, ``base`` is its name, ``name`` the name with the variant.
 
-    A variant is ``METHOD@PRESET`` where the method's class has ``presets`` (``opensu3d@scheme4``), or
-    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a method of its own.
+    A variant is ``METHOD@PRESET`` if the method's class has ``presets`` (``opensu3d@scheme4``), or
+    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a separate method.
     """
 
     target: str
@@ -95,12 +95,12 @@ class NamedMethod:
 
     @property
     def essence(self) -> tuple[Any, ...]:
-        """What it is, however it was written."""
+        """Its identity, independent of how it was written."""
         return self.target, [(entry.path, entry.value) for entry in self.settings]
 
 
 def named_method(text: str) -> NamedMethod:
-    """What ``text`` asks for; ``ConfigError`` for an unknown method, preset or an unreadable variant."""
+    """The method named by ``text``; ``ConfigError`` for an unknown method or preset, or an unreadable variant."""
     start = text.rfind(".py:") + 1
     at = text.find("@", start)
     target, variant = (text, "") if at < 0 else (text[:at], text[at + 1 :])
@@ -129,18 +129,18 @@ def _assigned(text: str, variant: str) -> Mapping[str, Any]:
     for part in COMMA_OUTSIDE_BRACKETS.split(variant):
         key, equals, value = part.partition("=")
         if not equals or not key.strip():
-            raise ConfigError(f"--methods {text}: '{part}' is no KEY=VALUE")
+            raise ConfigError(f"--methods {text}: expected KEY=VALUE, not '{part}'")
         values[key.strip()] = parse_value(value)
     return values
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do: one job a scene; ``notes`` are remarks for whoever asked.
+    """What a run will do: one job per scene; ``notes`` are remarks for the user.
 
-    ``existing``: the run that the folder held when the plan was made. ``start`` says what becomes of it: it is none, or
-    unfinished, and the records *begin*; it is *kept* until new records take its place; or it is *replaced*, for which
-    the jobs in ``removes`` go.
+    ``existing``: the run in the folder when the plan was made. ``start`` is what happens to it: there is none, or an
+    unfinished one, and the records *begin*; it is *kept* until new records overwrite it; or it is *replaced*, and the
+    jobs in ``removes`` are removed.
     """
 
     config: RunConfig
@@ -160,7 +160,7 @@ class Plan:
 
     @property
     def is_distant(self) -> bool:
-        """Whether workers share no more than a disk or a store with this process."""
+        """Whether workers share at most a disk or a store with this process."""
         return self.config.executor in ELSEWHERE or self.place.url is not None or self.data is not None
 
     @property
@@ -177,7 +177,7 @@ class Plan:
 
     @property
     def rules(self) -> list[ProtocolRules]:
-        """The protocols that score some scene."""
+        """The protocols that score at least one scene."""
         return [load_protocol(name) for name in dict.fromkeys(name for job in self.jobs for name in job.protocols)]
 
     @property
@@ -198,15 +198,14 @@ class Plan:
 def make_plan(
     settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None, *, into: Into = "own"
 ) -> Plan:
-    """The plan of what was asked for; everything wrong with the request itself is found here, before any work.
+    """The plan of a request; every error in the request itself is found here, before any work.
 
-    ``assignments`` are ``KEY=VALUE`` texts as ``read_assignments`` takes them. ``out`` None: a folder below ``runs/``
-    named after datasets, profile and a key of the request, so that the same command resumes its own run; a text: the
-    URL of a store. A folder that holds a run of another request is refused, or extended or replaced where ``into`` says
-    so.
+    ``assignments`` are ``KEY=VALUE`` texts for ``read_assignments``. ``out`` None: a folder below ``runs/`` named after
+    datasets, profile and a key of the request, so that the same command resumes its own run; a text: the URL of a
+    store. A folder that contains a run of another request is rejected, or extended or replaced, depending on ``into``.
     """
     if into != "own" and out is None:
-        raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
+        raise ConfigError(f"--{into}: name the run with --out, such as --out runs/demo")
     place: RunPlace | None = LocalRun(RunFolder(out)) if isinstance(out, Path) else None
     if isinstance(out, str):
         place = StoredRun.opened(out, cache_root())
@@ -230,7 +229,7 @@ def make_plan(
     of_perception = resolve(settings, ("perception",), PerceptionConfig)
     check_models(config.profile, of_perception)
     if config.executor not in ELSEWHERE:
-        device_for(of_perception.models.device, 0)  # raises where there is no such GPU
+        device_for(of_perception.models.device, 0)  # raises if there is no such GPU
     perception = of_perception.model_dump_json()
     methods = tuple(method_part(method, settings) for method in named_methods)
     ceiling = None if CEILING_METHOD in named else part_of("method", CEILING_METHOD, settings)
@@ -238,7 +237,7 @@ def make_plan(
     protocols = protocols_of_run(config.protocols, list(datasets))
     if config.solver == "llm" and not any(map(asks_questions, protocols.values())):
         raise ConfigError(
-            "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
+            "--solver llm: only answers questions of reasoning protocols; add one, such as --protocols rooms-reasoning"
         )
     if place is None:
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
@@ -277,7 +276,7 @@ def make_plan(
 
 
 def _started(plan: Plan, into: Into) -> Plan:
-    """``plan`` with what becomes of the run in its folder; a ``StoreError`` where that is another one."""
+    """``plan`` with what happens to the run in its folder; a ``StoreError`` if that is a different one."""
     existing = plan.existing
     if existing is not None:
         check_request(existing, plan.request, into, plan.place.name)
@@ -292,7 +291,7 @@ def _started(plan: Plan, into: Into) -> Plan:
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
         if removes or (existing is not None and any(differences(existing, plan.request))):
             return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_removed_lines(plan, removes)))
-        # else the run that replaced another is resumed
+        # otherwise the run that replaced another is resumed
     return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")
 
 
@@ -303,25 +302,23 @@ def _removed_lines(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
     scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
     which = f"{some([scene_of_folder(name) for name in scenes], MAX_NAMED)} by {some(methods, MAX_NAMED)}"
     n_all = len(plan.folder.jobs())
-    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} go: {which}"]
+    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} will be removed: {which}"]
 
 
 def _check_unique_names(flag: str, named: Iterable[tuple[str, Any]]) -> None:
-    """A ``ConfigError`` where a name cannot be that of a folder, or two things that differ share one."""
+    """A ``ConfigError`` if a name is not valid as a folder name, or two different things share one."""
     found: dict[str, Any] = {}
     for name, value in named:
         check_folder_name(flag, name)
         if found.setdefault(name, value) != value:
-            raise ConfigError(f"{flag}: two different ones are called '{name}'; give one of them another name")
+            raise ConfigError(f"{flag}: two different ones are named '{name}'; rename one of them")
 
 
 def check_folder_name(flag: str, name: str) -> None:
-    """A ``ConfigError`` where ``name``, which ``flag`` gave, cannot be that of a folder."""
+    """A ``ConfigError`` if ``name``, given by ``flag``, is not valid as a folder name."""
     is_plain = name.isprintable() and "/" not in name and len(name) <= MAX_CHARACTERS
     if not name or name.startswith(".") or not is_plain:
-        raise ConfigError(
-            f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
-        )
+        raise ConfigError(f"{flag}: '{printable(name, 80)}' is not a valid folder name; use letters and digits")
 
 
 def method_part(method: NamedMethod, settings: Settings) -> Part:
@@ -337,9 +334,9 @@ def method_part(method: NamedMethod, settings: Settings) -> Part:
 
 
 def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], variants: Sequence[str] = ()) -> None:
-    """Sections of unknown names are refused; a shared file may configure parts unused here, but its keys must exist.
+    """Reject sections of unknown names; a shared file may configure parts unused here, but its keys must exist.
 
-    ``used``: name -> target; ``variants`` are full names that have sections of their own, checked with their part.
+    ``used``: name -> target; ``variants`` are full names with their own sections, checked with their part.
     """
     known = dict.fromkeys([*used, *registry.names(kind)])
     check_names(kind, settings, [*known, *variants])
@@ -358,14 +355,14 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
     targets = list(dict.fromkeys(named))
     for target in targets:
         if target not in registry.names("method") and looks_like_scene(target):
-            raise ConfigError(f"--methods {target}: is a scene; write it before the flags, or behind --scenes")
+            raise ConfigError(f"--methods {target}: is a scene; write it before the flags or after --scenes")
     if not targets:
-        raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
+        raise ConfigError("no method named; known: " + ", ".join(registry.names("method")))
     return targets
 
 
 def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
+    """Dataset target -> protocols that score it: the requested ones that fit it, or its own if none is requested."""
     if not wanted:
         return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
     wanted = list(dict.fromkeys(wanted))
@@ -385,7 +382,7 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
 
 
 def _usual_protocols(dataset: Any) -> tuple[str, ...]:
-    """The protocols of a dataset; of one that no protocol names those that its truth fits."""
+    """The protocols of a dataset; if no protocol names it, those that fit its ground truth."""
     if own := protocols_for(dataset.name):
         return tuple(own)
     truth = TruthFacts.of_dataset(dataset)
@@ -394,20 +391,20 @@ def _usual_protocols(dataset: Any) -> tuple[str, ...]:
 
 
 def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
-    """Which protocols score somebody's own datasets, that did not name any."""
+    """Notes on which protocols score user-defined datasets, if none was requested."""
     for target, names in protocols.items():
         dataset = registry.load("dataset", target)
         if wanted or not dataset.variants or protocols_for(dataset.name):
             continue
         if names:
-            yield f"{dataset.name}: scored under the protocols that its truth fits; --protocols chooses among them"
+            yield f"{dataset.name}: scored under all protocols that fit its ground truth; choose with --protocols"
             continue
         truth = f"ground truth {', '.join(dataset.variants)} with labels of '{dataset.label_space}'"
-        yield f"{dataset.name}: no protocol fits its {truth}; su3d-bench protocols new FILE writes one of your own"
+        yield f"{dataset.name}: no protocol fits its {truth}; create a custom one: su3d-bench protocols new FILE"
 
 
 def asks_questions(protocols: Sequence[str]) -> bool:
-    """Whether one of ``protocols`` puts questions to the map."""
+    """Whether one of ``protocols`` asks questions about the map."""
     return any(load_protocol(name).answers is not None for name in protocols)
 
 

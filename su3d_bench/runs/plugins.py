@@ -1,4 +1,4 @@
-"""User-defined datasets and methods, checked where they answer: what is wrong is told with file and line."""
+"""User-defined datasets and methods, checked at every return value: errors are reported with file and line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface
 from su3d_bench.store.predictions import array_fault, prediction_arrays, value_fault
 
-# The types in which arrays are kept. What is of the same kind is brought into them, what is of another is refused.
+# The types in which arrays are stored. Arrays of the same kind are converted, those of another kind are rejected.
 FORMS: dict[str, type] = {
     **dict.fromkeys(("points", "features", "boxes", "centroids", "vertices", "evaluation_points"), np.float32),
     **dict.fromkeys(("scores", "view_scores"), np.float64),
@@ -30,7 +30,7 @@ FORMS: dict[str, type] = {
     **dict.fromkeys(("indices", "views", "instance", "semantic", "every_semantic"), np.int32),
     **dict.fromkeys(("triangles", "instance_of_triangle", "segments"), np.int32),
 }
-# Arrays that a truth or mesh must have, and what a row of each is.
+# Arrays that a ground truth or mesh must have, and the shape of a row of each.
 ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
     GroundTruth: {"points": (3,), "semantic": (), "instance": ()},
     Surface: {"vertices": (3,), "triangles": (3,)},
@@ -42,7 +42,7 @@ ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
 
 
 def validation_error(found: Any) -> str | None:
-    """What is wrong with an answer of the right type; None where nothing is."""
+    """What is wrong with a returned value of the right type; None if it is valid."""
     match found:
         case SceneInfo():
             return _fault_of_choice("image_domain", found.image_domain, get_args(types.ImageDomain))
@@ -51,7 +51,7 @@ def validation_error(found: Any) -> str | None:
         case Frame():
             depth = found.depth_m
             is_metres = not depth.size or (depth.min() >= 0 and depth.max() < np.inf)  # NaN is neither
-            return None if is_metres else "depth is negative or not finite; expected metres, and 0 where there is none"
+            return None if is_metres else "depth is negative or not finite; expected metres, 0 for no depth"
         case GroundTruth():
             return _fault_of_arrays(found) or _fault_of_truth(found)
         case InstanceMesh() | Surface():
@@ -62,7 +62,7 @@ def validation_error(found: Any) -> str | None:
 
 
 def in_stored_form(found: Any) -> Any:
-    """``found`` with each array in the type in which it is kept, and lists of texts as tuples."""
+    """``found`` with each array in its stored type, and lists of texts as tuples."""
     if not isinstance(found, Instances | Partition | DenseFeatures | GroundTruth | InstanceMesh | Surface):
         return found
     changed: dict[str, Any] = {}
@@ -80,7 +80,7 @@ def in_stored_form(found: Any) -> Any:
 
 
 def _fault_of_choice(name: str, value: Any, known: Sequence[str]) -> str | None:
-    return None if value in known else f"{name} is {value!r}; {', '.join(map(repr, known))} are known"
+    return None if value in known else f"{name} is {value!r}; expected one of {', '.join(map(repr, known))}"
 
 
 def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
@@ -91,9 +91,9 @@ def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
         if value.dtype != form or value.shape != (len(value), *row):
             return f"{name} is {value.dtype} {value.shape}; expected {form} {('N', *row)}"
         if not np.isfinite(value).all():
-            return f"{name} holds values that are not finite"
+            return f"{name} has values that are not finite"
         if name.startswith("instance") and value.size and value.min() < 0:
-            return f"{name} holds {value.min()}; ids begin at 1, and 0 stands where there is none"
+            return f"{name} has {value.min()}; ids start at 1, and 0 means none"
     labels = getattr(found, "labels", None)
     if not isinstance(found, Surface) and not isinstance(labels, types.LabelSet):
         return f"labels is {_kind_of(labels)}; expected a LabelSet"
@@ -105,14 +105,14 @@ def _fault_of_truth(truth: GroundTruth) -> str | None:
         ids = getattr(truth, name)
         unknown = np.setdiff1d(() if ids is None else ids, (*no_class, *truth.labels.ids))
         if len(unknown):
-            return f"{name} holds the class id {unknown[0]:g}, which its labels do not have"
+            return f"{name} has the class id {unknown[0]:g}, which is not in its labels"
     return None
 
 
 def _fault_of_mesh(mesh: InstanceMesh | Surface) -> str | None:
     corners = mesh.triangles
     if corners.size and not 0 <= corners.min() <= corners.max() < len(mesh.vertices):
-        return f"triangles holds {corners.min()} to {corners.max()}, there are {len(mesh.vertices)} vertices"
+        return f"triangles has indices {corners.min()} to {corners.max()}, but there are {len(mesh.vertices)} vertices"
     if isinstance(mesh, Surface):
         return None
     if len(mesh.instance_of_triangle) != len(corners):
@@ -134,19 +134,18 @@ def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> s
         falls = (np.diff(prediction.owners) == 0) & (np.diff(prediction.indices.astype(np.int64)) <= 0)
         if falls.any():
             owner = prediction.owner_at(int(np.flatnonzero(falls)[0]))
-            return f"the mask of instance {owner} is not ascending, or holds a point twice"
+            return f"the mask of instance {owner} is not ascending, or has a point twice"
     return None
 
 
-# ---- where user-defined datasets and methods answer
+# ---- where user-defined datasets and methods return values
 
-NUMPY: dict[type, type] = {int: np.integer, bool: np.bool_}  # which will do in the place of Python's own
+NUMPY: dict[type, type] = {int: np.integer, bool: np.bool_}  # accepted in place of Python's own types
 
 
 @cache
 def _answers(kind: str) -> dict[str, Any]:
-    """What each function and property of a dataset or method gives, those that it may have too, as their annotations
-    say."""
+    """The annotated return type of each function and property of a dataset or method, optional ones included."""
     members = {name: member for each in (INTERFACES[kind], *ABILITIES[kind]) for name, member in vars(each).items()}
     functions = {name: getattr(member, "fget", member) for name, member in members.items() if name[0] != "_"}
     return {name: get_type_hints(one)["return"] for name, one in functions.items() if inspect.isfunction(one)}
@@ -157,7 +156,7 @@ def is_built_in(plug_in: type) -> bool:
 
 
 def settings_model(plug_in: type, name: str) -> type[BaseModel]:
-    """The model of settings that a class holds under ``name``."""
+    """The settings model that a class has under ``name``."""
     model: Any = getattr(plug_in, name)
     if not (isinstance(model, type) and issubclass(model, BaseModel)):
         raise PlugInError(f"{place_of(plug_in)}.{name} is {_kind_of(model)}; expected a pydantic.BaseModel")
@@ -165,7 +164,7 @@ def settings_model(plug_in: type, name: str) -> type[BaseModel]:
 
 
 def made(plug_in: type, *words: Any) -> Any:
-    """An object of the class; what its ``__init__`` does not take is told with its line."""
+    """An object of the class; an argument that its ``__init__`` rejects is reported with its line."""
     if is_built_in(plug_in):
         return plug_in(*words)
     function = plug_in.__init__  # type: ignore[misc]
@@ -173,12 +172,12 @@ def made(plug_in: type, *words: Any) -> Any:
 
 
 def checked_dataset(dataset: Any) -> Any:
-    """``dataset``; a user-defined one checks from now on what it gives."""
+    """``dataset``; the return values of a user-defined one are checked from now on."""
     return dataset if is_built_in(type(dataset)) else _watched(dataset, "dataset")
 
 
 def checked_method(method: Any) -> Any:
-    """``method``; a user-defined one checks from now on what it gives."""
+    """``method``; the return values of a user-defined one are checked from now on."""
     if is_built_in(type(method)):
         return method
     told(method, "needs")
@@ -186,7 +185,7 @@ def checked_method(method: Any) -> Any:
 
 
 def told(method: Any, name: str, without: Any = None) -> Any:
-    """The property ``name`` of a method; ``without`` where it has none."""
+    """The property ``name`` of a method; ``without`` if it has none."""
     value = getattr(method, name, without)
     if not is_built_in(type(method)) and hasattr(method, name):
         known = inspect.getattr_static(type(method), name, None)
@@ -196,7 +195,7 @@ def told(method: Any, name: str, without: Any = None) -> Any:
 
 
 def place_of(plug_in: type, name: str = "", function: Any = None) -> str:
-    """``my_method.py:12: MyMethod.name``: where a user-defined class, or ``function`` of it, is written."""
+    """``my_method.py:12: MyMethod.name``: where a user-defined class, or its ``function``, is defined."""
     code: CodeType | None = getattr(inspect.unwrap(function), "__code__", None) if callable(function) else None
     where = ""
     if code is not None:
@@ -209,10 +208,10 @@ def place_of(plug_in: type, name: str = "", function: Any = None) -> str:
 
 def _watched(plug_in: Any, kind: str) -> Any:
     for name, answer in _answers(kind).items():
-        if callable(getattr(type(plug_in), name, None)):  # no property, which may not have a value yet
+        if callable(getattr(type(plug_in), name, None)):  # not a property, which may not have a value yet
             function = getattr(plug_in, name)
             watching = wraps(function)(partial(_asked, plug_in, name, function, answer))
-            with suppress(AttributeError):  # of a class with slots, which then answers unwatched
+            with suppress(AttributeError):  # a class with slots is not checked
                 object.__setattr__(plug_in, name, watching)
     return plug_in
 
@@ -223,14 +222,14 @@ def _asked(plug_in: Any, name: str, function: Callable[..., Any], answer: Any, *
     if name == "frames":
         return _Frames(place, found)
     if name == "digest" and not found:
-        raise PlugInError(f"{place} gave an empty text; expected a key that is equal only where the data are")
+        raise PlugInError(f"{place} returned an empty text; expected a key that is equal only if the data are")
     for k, entry in enumerate(found if get_origin(answer) is Sequence else ()):
         _validated(f"{place}(...)[{k}]", entry, get_args(answer)[0])
     return found
 
 
 def _called(place: str, function: Callable[..., Any], words: Sequence[Any], named: Mapping[str, Any]) -> Any:
-    """What ``function`` gives. What it does not take, or what our own types refuse in it, is a ``PlugInError``."""
+    """The result of ``function``. Rejected arguments, or values rejected by our own types, raise ``PlugInError``."""
     try:
         return function(*words, **named)
     except TypeError as error:
@@ -245,7 +244,7 @@ def _called(place: str, function: Callable[..., Any], words: Sequence[Any], name
 
 
 def _validated(place: str, found: Any, answer: Any) -> Any:
-    """``found`` in its stored form; a ``PlugInError`` where it is no ``answer`` or holds what cannot be."""
+    """``found`` in its stored form; a ``PlugInError`` if it is not an ``answer`` or has invalid values."""
     if answer in (Any, NoneType):
         return found
     kinds = get_args(answer) if isinstance(answer, UnionType) else (get_origin(answer) or answer,)
@@ -253,7 +252,7 @@ def _validated(place: str, found: Any, answer: Any) -> Any:
     will_do = (*kinds, *(NUMPY[kind] for kind in kinds if kind in NUMPY))
     if not (is_listed if kinds == (Sequence,) else isinstance(found, will_do)):
         wanted = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
-        raise PlugInError(f"{place} gave {_kind_of(found)}; expected {wanted}")
+        raise PlugInError(f"{place} returned {_kind_of(found)}; expected {wanted}")
     found = in_stored_form(found)
     if (fault := validation_error(found)) is not None:
         raise PlugInError(f"{place}: {fault}")

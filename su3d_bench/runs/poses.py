@@ -1,7 +1,6 @@
-"""Whether a recording's poses are what its depth says, looked at on a few frames before a scene's work begins.
+"""Whether a recording's poses agree with its depth, checked on a few frames before a scene's work begins.
 
-What wrong poses and another axis that points up look like is known to ``datasets.recordings`` alone, which
-``datasets check`` asks too.
+How wrong poses and a different up axis are detected is in ``datasets.recordings``, which ``datasets check`` uses too.
 """
 
 from __future__ import annotations
@@ -20,20 +19,20 @@ from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.runs.job import SceneJob, build_dataset, build_method
 from su3d_bench.store.run_folder import RunFolder
 
-ACCEPT_POSES_HINT = "--accept-poses runs it all the same"
-REMARK = "doubts"  # beside the seal of a prediction
+ACCEPT_POSES_HINT = "--accept-poses runs it anyway"
+REMARK = "doubts"  # key in the completion record of a prediction
 
 
 class PosesContradicted(DataError):
-    """Another reading of poses or depth agrees clearly better than the one that a run would take."""
+    """Another interpretation of poses or depth agrees clearly better than the one that a run would use."""
 
 
-Remarks = tuple[tuple[str, ...], bool]  # what is to be said of a scene, and whether it must not be run
+Remarks = tuple[tuple[str, ...], bool]  # warnings about a scene, and whether it must not be run
 NOTHING: Remarks = ((), False)
 
 
 def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
-    """The jobs with what is to be said of their poses; ``PosesContradicted`` where one of them must not be run."""
+    """The jobs with the warnings about their poses; ``PosesContradicted`` if one of them must not be run."""
     with silent(), ThreadPoolExecutor(os.cpu_count()) as threads:
         remarks = list(threads.map(_remarks, jobs))
     pairs = list(zip(jobs, remarks, strict=True))
@@ -45,14 +44,14 @@ def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
 
 
 def judged_where_read_here(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
-    """The jobs, judged where the program itself reads the data: a user-defined reader may end the process that it runs
-    in, so that the scene's worker looks at these."""
+    """The jobs, judged here only for built-in datasets: a user-defined reader may crash its process, so that its scenes
+    are judged by their workers."""
     known = {job.scene: job for job in judged([job for job in jobs if job.dataset.target in DATASETS])}
     return tuple(known.get(job.scene, job) for job in jobs)
 
 
 def _remarks(job: SceneJob) -> Remarks:
-    """Of a scene whose frames are files and will be read; of one that was begun, what was said then."""
+    """The remarks on a scene whose frames are files and will be read; those recorded earlier if it was begun."""
     try:
         reading = [part for part in job.methods if build_method(part).needs.frames]
         for part in reading:
@@ -73,7 +72,7 @@ def _remarks(job: SceneJob) -> Remarks:
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """What is logged of a scene's data in the block is not shown: its own work says it."""
+    """Hide log messages about a scene's data in the block, because its own job repeats them."""
     package = logging.getLogger("su3d_bench")
     package.addHandler(handler := logging.NullHandler())
     try:

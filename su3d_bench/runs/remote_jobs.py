@@ -1,7 +1,7 @@
-"""One scene of a run whose worker, data or run folder is elsewhere: fetch, run as everywhere, send back.
+"""One scene of a run whose worker, data or run folder is on another machine: fetch, run as usual, send back.
 
-A store has no rename and no lock. So ``done.json``, which vouches for a job's other files by their SHA-256, is sent
-after them: a job that was sent in part has no seal, or one that its files do not match, and is run again.
+A store has no rename and no lock. So ``done.json``, which lists the SHA-256 of a job's other files, is sent after
+them: a job that was sent only in part has no completion record, or one that its files do not match, and is run again.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.runs.scenes import cache_root as own_cache_root
 from su3d_bench.store.run_folder import RunFolder
 
-REPLIES = "language"  # of language models, which the scenes of a run share
+REPLIES = "language"  # replies of language models, shared by the scenes of a run
 
 
 @dataclass(frozen=True)
 class DistantJob:
-    """A job for a worker that shares a disk or nothing with whoever asked; it runs in ``folder`` where that exists.
+    """A job for a worker that shares a disk or nothing with this process; it runs in the folder ``here`` if it exists.
 
-    ``store`` and ``data`` are URLs, None where the job's own folders are on a shared disk; ``files`` are those of the
+    ``store`` and ``data`` are URLs, None if the job's own folders are on a shared disk; ``files`` are those of the
     scene in ``data`` with their sizes; ``cache_root`` None: the worker's own.
     """
 
@@ -43,9 +43,9 @@ class DistantJob:
 
 
 def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcome, ...]:
-    """What ``run_scene`` gives, its files sent to the store."""
+    """The outcomes of ``run_scene``, with its files sent to the store."""
     if distant.here.is_dir():
-        os.chdir(distant.here)  # relative paths in the configuration are meant from there
+        os.chdir(distant.here)  # relative paths in the configuration start there
     cache_root = distant.cache_root or own_cache_root()
     with TemporaryFolder("su3d-scene-") as scratch:
         job = replace(distant.job, cache_root=cache_root)
@@ -62,7 +62,7 @@ def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcom
 
 @contextmanager
 def _stored(store: RemoteFolder, job: SceneJob) -> Iterator[None]:
-    """The files of a job, from the store at the start of the block and back to it at its end."""
+    """Fetch the files of a job from the store at the start of the block and send them back at its end."""
     make_folder(job.folder)
     store.fetch(store.files(_scene_folder(job)) | store.files(REPLIES), job.folder)
     before = _stamps(job.folder)
@@ -77,7 +77,7 @@ def _stored(store: RemoteFolder, job: SceneJob) -> Iterator[None]:
 
 
 def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
-    """Inode and time of every file, which a file that is written again does not keep."""
+    """Inode and modification time of every file, which change when a file is rewritten."""
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not is_unfinished(path.name)]
     stats = {path.relative_to(folder).as_posix(): path.stat() for path in paths}
     return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
@@ -88,7 +88,7 @@ def _scene_folder(job: SceneJob) -> str:
 
 
 def failed_distant(distant: DistantJob, reason: str) -> tuple[MethodOutcome, ...]:
-    """The outcome of a scene whose worker was lost; its logs say so, in the store too."""
+    """The outcome of a scene whose worker was lost; its logs report it, in the store too."""
     outcomes = failed_outcomes(distant.job, reason)
     if distant.store is not None:
         logs = [RunFolder(distant.job.folder).job(outcome.scene, outcome.method).log for outcome in outcomes]
@@ -98,7 +98,7 @@ def failed_distant(distant: DistantJob, reason: str) -> tuple[MethodOutcome, ...
 
 
 def distant_jobs(plan: Plan) -> list[DistantJob]:
-    """The jobs of a plan whose workers, data or run folder are elsewhere."""
+    """The jobs of a plan whose workers, data or run folder are on another machine."""
     has_own_cache = plan.config.executor in ELSEWHERE and "SU3D_CACHE" not in os.environ
     url, files = (None, {}) if plan.data is None else (plan.data.url, plan.data.files)
     return [

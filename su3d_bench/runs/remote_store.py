@@ -1,14 +1,14 @@
-"""Stores that fsspec reaches (``s3://bucket/runs/one``, ``gs://``, ``memory://``), and a data root in one.
+"""Stores that fsspec can access (``s3://bucket/runs/one``, ``gs://``, ``memory://``), and a data root in one.
 
-Names that a store lists are checked before they become paths here. What a driver of fsspec raises is its own; here it
-is a ``StoreError`` that names the store.
+Names listed by a store are checked before they become local paths. Any error of an fsspec driver is raised as a
+``StoreError`` that names the store.
 
-The folder of a run lies on a disk (``LocalRun``), or in a store whose small files are mirrored on this machine
-(``StoredRun``). A plan or a run works in ``folder`` and tells the place when its records change, when the results of
-jobs are wanted, and when jobs go.
+The folder of a run is on a disk (``LocalRun``), or in a store whose small files are mirrored on this machine
+(``StoredRun``). A plan or a run works in ``folder`` and notifies the place when its records change, when the results of
+jobs are needed, and when jobs are removed.
 
-Datasets look for scenes by the names of files. So a plan is made over an *outline* of a data root in a store: its tree
-as empty files. A job gets the real files of its scene alone.
+Datasets find scenes by file names. So a plan is made over an *outline* of a data root in a store: its tree as empty
+files. A job gets only the real files of its scene.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.store.run_folder import JOBS, RECORDS, JobFolder, RunFolder
 
-AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
-BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
+AT_ONCE = 256  # small files per request to the driver, which fetches them in parallel
+BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # no folders: creating one would create a bucket
 MAX_NAME_CHARACTERS = 1024  # the longest key of an S3 object
 
 
@@ -37,14 +37,14 @@ def is_url(text: str) -> bool:
 
 
 class RemoteFolder:
-    """The files below ``url``, by their names relative to it."""
+    """The files below ``url``, by name relative to it."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         try:
             import fsspec
         except ImportError as error:
-            raise ModelMissing(f"{url}: a store needs the stores extra: pip install 'su3d-bench[stores]'") from error
+            raise ModelMissing(f"{url}: needs the stores extra: pip install 'su3d-bench[stores]'") from error
         try:
             self._driver, root = fsspec.url_to_fs(self.url)
         except ImportError as error:
@@ -56,7 +56,7 @@ class RemoteFolder:
         self._has_buckets = self.url.partition(":")[0] in BUCKETS
 
     def files(self, below: str = "") -> dict[str, int]:
-        """Size in bytes of every file in the folder ``below``, by name; empty where there is none."""
+        """Size in bytes of every file in the folder ``below``, by name; empty if there is none."""
         start = f"{self._root}/{below}".rstrip("/")
         with self._with_context("cannot be listed"):
             self._driver.invalidate_cache()
@@ -72,14 +72,14 @@ class RemoteFolder:
         return sizes
 
     def _check(self, name: str) -> None:
-        """A name from a store may not lead out of the folder that it is copied to."""
+        """A ``StoreError`` if a name from a store would lead out of the folder that it is copied to."""
         parts = name.split("/")
         is_plain = name.isprintable() and "\\" not in name and not {"", ".", ".."} & set(parts)
         if not is_plain or len(name) > MAX_NAME_CHARACTERS:
-            raise StoreError(f"{self.url}: holds '{printable(name, 120)}', which is no name of a file; remove it")
+            raise StoreError(f"{self.url}: has '{printable(name, 120)}', which is not a valid file name; remove it")
 
     def fetch(self, sizes: Mapping[str, int], into: Path) -> None:
-        """Copy the files named in ``sizes`` below ``into``; one that came with another size is an error."""
+        """Copy the files named in ``sizes`` below ``into``; a file that arrives with another size is an error."""
         for name, size in sizes.items():
             target = into / name
             make_folder(target.parent)
@@ -87,11 +87,11 @@ class RemoteFolder:
                 self._driver.get_file(f"{self._root}/{name}", str(stream.name))
             if target.stat().st_size != size:
                 raise StoreError(
-                    f"{self.url}: {name} has {target.stat().st_size} bytes here and {size} there; try again"
+                    f"{self.url}: {name} has {target.stat().st_size} bytes here but {size} in the store; try again"
                 )
 
     def read(self, names: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Name and content of small files; one that is gone meanwhile is left out."""
+        """Name and content of small files, except those removed meanwhile."""
         wanted = list(names)
         for start in range(0, len(wanted), AT_ONCE):
             paths = {f"{self._root}/{name}": name for name in wanted[start : start + AT_ONCE]}
@@ -100,7 +100,7 @@ class RemoteFolder:
             yield from ((paths[path], content) for path, content in contents.items())
 
     def send(self, folder: Path, names: Sequence[str]) -> None:
-        """Copy the files ``names`` of ``folder`` here, one after the other, in this order."""
+        """Copy the files ``names`` of ``folder`` to the store, one after the other, in this order."""
         for name in names:
             with self._with_context(f"{name} cannot be written"):
                 path = f"{self._root}/{name}"
@@ -109,7 +109,7 @@ class RemoteFolder:
                 self._driver.put_file(str(folder / name), path)
 
     def remove(self, names: Iterable[str]) -> None:
-        """Remove the files ``names`` where they exist."""
+        """Remove those of the files ``names`` that exist."""
         for name in names:
             with self._with_context(f"{name} cannot be removed"):
                 if self._driver.exists(f"{self._root}/{name}"):
@@ -119,7 +119,7 @@ class RemoteFolder:
     def _with_context(self, what: str) -> Iterator[Any]:
         try:
             yield
-        except Exception as error:  # each driver has errors of its own (botocore's, gcsfs's), with no class in common
+        except Exception as error:  # each driver has its own errors (botocore's, gcsfs's), without a common class
             reason = printable(" ".join(str(error).split()) or type(error).__name__, 200)
             raise StoreError(f"{self.url}: {what}: {reason}") from error
 
@@ -129,7 +129,7 @@ MAX_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 M
 
 @dataclass(frozen=True)
 class RemoteData:
-    """The data root in a store, and by scene (``<dataset>/<scene>``) the files that a job needs, with their sizes."""
+    """The data root in a store, and per scene (``<dataset>/<scene>``) the files that a job needs, with their sizes."""
 
     url: str
     files: Mapping[str, Mapping[str, int]]
@@ -144,7 +144,7 @@ class DataPlace:
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     def needed(self, datasets: Iterable[Part]) -> RemoteData | None:
-        """What the scenes of ``datasets`` need; None where the data root is here."""
+        """The files that the scenes of ``datasets`` need; None if the data root is on this machine."""
         if self.url is None:
             return None
         files: dict[str, Mapping[str, int]] = {}
@@ -156,10 +156,10 @@ class DataPlace:
 
 @contextmanager
 def data_place(url: str) -> Iterator[DataPlace]:
-    """The outline of the store at ``url``, for the time of the block."""
+    """The outline of the store at ``url``, for the duration of the block."""
     sizes = RemoteFolder(url).files()
     if not sizes:
-        raise ConfigError(f"SU3D_DATA={url}: holds no file; name the folder that holds the datasets")
+        raise ConfigError(f"SU3D_DATA={url}: contains no file; set it to the folder that contains the datasets")
     with TemporaryFolder("su3d-outline-") as folder:
         for below in {str(Path(name).parent) for name in sizes}:
             make_folder(folder / below)
@@ -169,11 +169,11 @@ def data_place(url: str) -> Iterator[DataPlace]:
 
 
 def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str, dict[str, int]]:
-    """Files and sizes by scene of one dataset: those named after it or in a folder so named, and those of no scene.
+    """Files and sizes per scene of one dataset: files named after it or in a folder so named, and shared files.
 
-    A folder or file is named after a scene whatever stands around the name between separators and however the name
-    itself is separated: ``room0_mesh.ply`` and ``room_0/`` are of ``room0``. Files of no scene count where they are
-    beside scenes, in the same folder of the root, and are small.
+    A folder or file is named after a scene if it contains the scene's name between separators, however the name itself
+    is separated: ``room0_mesh.ply`` and ``room_0/`` belong to ``room0``. Files of no scene are shared if they are next
+    to scenes, in the same folder of the root, and are small.
     """
     of_key: dict[str, list[str]] = {}
     for scene in scenes:
@@ -187,7 +187,7 @@ def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str
     }
     files: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
     for name, owner in owners.items():
-        for scene in of_key.get(owner or "", ()):  # those whose names differ in separators alone get each other's too
+        for scene in of_key.get(owner or "", ()):  # names that differ only in separators share their files
             files[scene][name] = sizes[name]
     return files
 
@@ -205,7 +205,7 @@ def _owner(name: str, of_key: Mapping[str, Sequence[str]]) -> str | None:
 
 
 def _keys(part: str) -> Iterable[str]:
-    """What ``part`` may be named after, the longest first."""
+    """The scene keys that ``part`` may contain, the longest first."""
     words = [word for word in re.split(r"[._-]+", part) if word]
     for n in range(len(words), 0, -1):
         yield from ("".join(words[k : k + n]) for k in range(len(words) - n + 1))
@@ -215,30 +215,30 @@ def _key(scene: str) -> str:
     return "".join(re.split(r"[._-]+", scene))
 
 
-# ---- where the folder of a run lies
+# ---- where the folder of a run is
 
 
 SEAL = "done.json"
-LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
+LARGE = ("prediction.npz", ".features.npy", ".png")  # name endings of files that no table or comparison reads
 
 
 @dataclass(frozen=True)
 class LocalRun:
-    """A run whose folder is on a disk: all is where it is needed."""
+    """A run whose folder is on a disk: all files are where they are needed."""
 
     folder: RunFolder
     url: None = None
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return str(self.folder.path)
 
     def publish(self) -> None:
-        """Bring the run's records up to those of ``folder``."""
+        """Update the run's records to those of ``folder``."""
 
     def fetch_results(self) -> None:
-        """Bring every file of the run's jobs that aggregation, tables and comparisons read to ``folder``."""
+        """Copy every file of the run's jobs that aggregation, tables and comparisons read to ``folder``."""
 
     def remove(self, jobs: Sequence[JobFolder]) -> None:
         """Remove jobs with all their files."""
@@ -255,7 +255,7 @@ class StoredRun:
 
     @classmethod
     def opened(cls, url: str, cache_root: Path) -> StoredRun:
-        """The run at ``url``; the mirror then holds its records and seals, and no others."""
+        """The run at ``url``; the mirror then contains exactly its records and completion records."""
         place = cls(url, RunFolder(mirror_of(url, cache_root)))
         mirror, store = place.folder.path, RemoteFolder(url)
         mark_complete = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
@@ -281,7 +281,8 @@ class StoredRun:
         self._fetch(store, [name for name in store.files(JOBS) if not _is_large(name)])
 
     def remove(self, jobs: Sequence[JobFolder]) -> None:
-        """First their seals, without which their other files count for nothing; jobs without a seal go with them."""
+        """Remove their completion records first, because other files are ignored without them; jobs without a
+        completion record are removed too."""
         store, mirror = RemoteFolder(self.url), self.folder.path
         kept = {job.path for job in self.folder.jobs()} - {job.path for job in jobs}
         names = [name for name in store.files(JOBS) if mirror.joinpath(*Path(name).parts[:3]) not in kept]
@@ -299,7 +300,7 @@ RunPlace = LocalRun | StoredRun
 
 
 def mirror_of(url: str, cache_root: Path) -> Path:
-    """Where this machine keeps the small files of the run folder at ``url``."""
+    """The local mirror of the small files of the run folder at ``url``."""
     return cache_root / "runs" / f"{url.rstrip('/').rpartition('/')[2]}-{digest_bytes(url.rstrip('/').encode())[:8]}"
 
 

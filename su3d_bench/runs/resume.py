@@ -1,4 +1,4 @@
-"""Scenes of a run that need no worker any more: every step sealed under today's key, every sealed file whole."""
+"""Scenes of a run that need no worker any more: every step is complete under the current key, every file intact."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ SCENE_INDEPENDENT_PROFILES = ("embedded", "paper")  # profiles whose digest does
 
 
 class FinishedScenes:
-    """Tells the finished scenes of one run by the checks that a worker makes, each of which reads a file once.
+    """Finds the finished scenes of one run by the checks that a worker makes, each of which reads a file once.
 
-    What all scenes share (methods, datasets, perception, their keys) is made once. A scene whose perception has a
-    digest of its own (profiles ``stored`` and ``oracle``) is left to a worker; so is one that asks for a GPU, whose
-    properties only a process that occupies it can tell.
+    Whatever all scenes share (methods, datasets, perception, their keys) is created once. A scene whose perception has
+    its own digest (profiles ``stored`` and ``oracle``) is left to a worker; so is one that requests a GPU, whose
+    properties only a process that uses it can read.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class FinishedScenes:
         self._perceptions: dict[str, Perception | None] = {}  # by the domain of the images
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
-        """The outcomes of a scene, that of the ceiling last; None where a worker is needed, be it to say an error."""
+        """The outcomes of a scene, the one of the ceiling last; None if a worker is needed, even to report an error."""
         folders = [RunFolder(job.folder).job(job.scene, part.name) for part in job.parts]
         completion_records = [folder.completion_records() for folder in folders]
         if any("predict" not in mark_complete or "score" not in mark_complete for mark_complete in completion_records):
@@ -58,7 +58,7 @@ class FinishedScenes:
         return inputs.outcome(completion_records["score"].remarks, was_resumed=True)
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
-        """What decides the numbers of a job; None where only a worker can tell."""
+        """The inputs that determine the numbers of a job; None if only a worker can determine them."""
         method, config = self._methods.of(job, part)
         info = self._dataset(job.dataset, job.data_root).info(job.scene_name, stride_of(job, part))
         perception = self._perception(job, info)

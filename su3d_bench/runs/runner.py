@@ -1,11 +1,11 @@
 """Carry out a plan in five steps: prepare the folder, write the request, execute, collect and combine, write results.
 
-``metrics.json`` holds no time, date or path: two runs of one request give the same bytes, whatever the number of
+``metrics.json`` contains no time, date or path: two runs of one request give the same bytes, whatever the number of
 workers and however often a run was killed and resumed.
 
-A plan says what becomes of the run that its folder holds (``plan.start``): nothing finished is there and this run's
-records *begin*; a finished run of the same request, or of a part of it, is *kept* until records with more take its
-place; or it is *replaced* but for the maps that the new request has too.
+A plan states what happens to the run in its folder (``plan.start``): there is no finished run and this run's records
+*begin*; a finished run of the same request, or of a part of it, is *kept* until records with more overwrite it; or it
+is *replaced*, except for the maps that the new request has too.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ class RunResult:
 def run_plan(plan: Plan, report: Report) -> RunResult:
     """Do every job of ``plan`` that is not done yet and write the run's records.
 
-    Before anything is written: ``PosesContradicted`` where the depth of a recording contradicts its poses, and an
-    error where the executor does not answer.
+    Raises ``PosesContradicted`` if the depth of a recording contradicts its poses, and an error if the executor does
+    not answer, both before anything is written.
     """
-    if plan.data is None:  # else each worker looks at the data that it fetches
+    if plan.data is None:  # otherwise each worker checks the data that it fetches
         plan = replace(plan, jobs=judged_where_read_here(plan.jobs))
     with executor_for(plan.config, plan.n_workers, plan.folder.path, report) as run, _prepared(plan):
         if plan.start != "kept":
@@ -79,9 +79,9 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
 
 @contextmanager
 def _prepared(plan: Plan) -> Iterator[None]:
-    """The run folder, held against other runs, without what the plan replaces.
+    """The run folder, locked against other runs, without the files that the plan replaces.
 
-    Temporary folders go that a killed run has left, and those of workers that are killed in the block.
+    Temporary folders left by a killed run, or by workers killed in the block, are removed.
     """
     with plan.folder.locked():
         remove_abandoned()
@@ -96,16 +96,16 @@ def _prepared(plan: Plan) -> Iterator[None]:
 
 
 def _check_still_empty(plan: Plan) -> None:
-    """A ``StoreError`` where another command has written its request here since this one was planned."""
+    """A ``StoreError`` if another command has written its request here since this one was planned."""
     file = plan.folder.path / "run.toml"
     planned = None if plan.existing is None else plan.existing.content
     if is_file(file) and planned != file_bytes(file):
-        raise StoreError(f"{plan.place.name}: another run was begun here just now; give the command again")
+        raise StoreError(f"{plan.place.name}: another run just started in this folder; run the command again")
 
 
 def _remove_replaced(plan: Plan) -> None:
-    """What stands in the folder goes, but the maps that the new request asks for as they are. The records go last but
-    the request, so that a command that is killed here begins again where it was."""
+    """Remove the results of the run except the maps that the new request needs unchanged. The old request is kept, so
+    that a command killed here continues where it stopped."""
     for name in ("metrics.json", "ablation.json"):
         remove_file(plan.folder.path / name)
     plan.place.publish()
@@ -116,7 +116,7 @@ def _remove_replaced(plan: Plan) -> None:
 
 
 def _write_request(plan: Plan) -> None:
-    """The records of a run under way: its request, and no metrics."""
+    """Write the records of a run in progress: its request, and no metrics."""
     remove_file(plan.folder.path / "metrics.json")
     _write_request_records(plan)
     plan.place.publish()
@@ -128,7 +128,7 @@ def _write_request_records(plan: Plan) -> None:
 
 
 def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
-    """Every value of the run with where it came from, parts in the order of the run."""
+    """Every value of the run with its source, parts in the order of the run."""
     return [(path, value, plan.settings.source(path)) for path, value in plan.values]
 
 
@@ -136,9 +136,9 @@ def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
 
 
 def _execute(plan: Plan, report: Report, run: RunUnits) -> tuple[MethodOutcome, ...]:
-    """The outcomes of all scenes, in the order of the plan; ``run``: what the executor is.
+    """The outcomes of all scenes, in the order of the plan; ``run`` is the executor.
 
-    What ends it is recorded, so that whoever looks at the folder knows that the run can be resumed.
+    An error or interrupt is recorded in the folder, so that it shows that the run can be resumed.
     """
     by_scene = {}
     try:
@@ -148,7 +148,7 @@ def _execute(plan: Plan, report: Report, run: RunUnits) -> tuple[MethodOutcome, 
     except BaseException:
         if plan.start != "kept":
             write_json(plan.folder.path / "run.json", plain(record(plan, (), "interrupted")))
-            with suppress(StoreError):  # what ended the run says more
+            with suppress(StoreError):  # the error that ended the run is more informative
                 plan.place.publish()
         raise
     plan.place.fetch_results()
@@ -156,7 +156,7 @@ def _execute(plan: Plan, report: Report, run: RunUnits) -> tuple[MethodOutcome, 
 
 
 def _finished_scenes(plan: Plan, run: RunUnits) -> Iterator[tuple[MethodOutcome, ...]]:
-    """The outcomes of each scene as it is finished, here or elsewhere; first those that need no worker."""
+    """The outcomes of each scene as it finishes, here or on another machine; first those that need no worker."""
     if plan.is_distant:
         yield from run(run_distant_scene, distant_jobs(plan), lost=failed_distant)
         return
@@ -174,7 +174,7 @@ def _finished_scenes(plan: Plan, run: RunUnits) -> Iterator[tuple[MethodOutcome,
 
 
 def _failures(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[tuple[str, str, str], ...]:
-    """(scene, method, line) of what failed, the ceiling aside."""
+    """(scene, method, line) of every failure, except those of the ceiling."""
     failed = [(outcome.scene, outcome.method, outcome.error) for outcome in outcomes if outcome.error is not None]
     return tuple(each for each in failed if each[1] in plan.methods)
 
@@ -189,8 +189,8 @@ def _write_results(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mappi
 
 
 def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mapping[str, Any]) -> bool:
-    """Whether all was done before, so that the records that stand there, with what they say of the machine that did
-    the work, are those of this command too."""
+    """Whether all was done before, so that the existing records, including the machine that did the work, hold for
+    this command too."""
     existing = plan.existing
     if plan.start != "kept" or existing is None or existing.record is None or existing.record.status != "complete":
         return False
@@ -204,7 +204,7 @@ def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mappin
 
 
 def _without_order(value: Any) -> Any:
-    """A value of JSON with the items of its lists sorted: the order in which scenes were named is no difference."""
+    """A JSON value with the items of its lists sorted, because the order in which scenes were named does not matter."""
     if isinstance(value, Mapping):
         return {key: _without_order(item) for key, item in value.items()}
     return sorted(map(_without_order, value), key=repr) if isinstance(value, list | tuple) else value

@@ -1,7 +1,7 @@
 """One scene under all methods of a run: predict, score, draw; the unit of work that executors run.
 
-The ground truth stays here: methods get frames and detections alone, except a method that asks for the truth by
-having ``receive_ground_truth`` (the oracle, from which ceilings come).
+The ground truth stays here: methods only get frames and detections, except a method that requests the ground truth by
+having ``receive_ground_truth`` (the oracle, from which ceilings are computed).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 
 
 def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, ...]:
-    """Outcomes of all methods on one scene, that of the ceiling last; a method that fails leaves the others alone."""
+    """Outcomes of all methods on one scene, the one of the ceiling last; a failing method does not affect others."""
     if job.doubts is None:
         try:
             (job,) = judged([job])
@@ -60,14 +60,14 @@ def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, .
 
 @cache
 def _warm_up(part: jobs.Part) -> None:
-    """Once a process for each method and its settings, where it asks for it."""
+    """Warm up a method that requests it, once per process for each method and its settings."""
     scratch: interfaces.Method = jobs.build_method(part)
     if getattr(scratch, "warms_up", False):
         frame_loop.warm_up(scratch)
 
 
 def failed_outcomes(job: jobs.SceneJob, reason: str) -> tuple[jobs.MethodOutcome, ...]:
-    """The outcome of a scene whose worker died; what its methods finished before stays and is resumed next time."""
+    """The outcome of a scene whose worker died; methods that finished before are kept and resumed next time."""
     line = f"{job.scene}: {reason}"
     for part in job.methods:
         folder = RunFolder(job.folder).job(job.scene, part.name)
@@ -78,14 +78,14 @@ def failed_outcomes(job: jobs.SceneJob, reason: str) -> tuple[jobs.MethodOutcome
 
 
 def scores_again(job: jobs.SceneJob, part: jobs.Part, encoder: interfaces.Encoder) -> dict[str, SceneScore]:
-    """What the map that ``job.folder`` holds of ``part`` scores, by protocol; nothing is written."""
+    """The scores of the map of ``part`` in ``job.folder``, by protocol; nothing is written."""
     folder = RunFolder(job.folder).job(job.scene, part.name)
     scores, _ = _Scene(job, lambda event: None).scores(part, encoder, read_prediction(folder.prediction), folder)
     return scores
 
 
 def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
-    """The one place where a scene's failure, of whatever kind, becomes a record instead of the end of the sweep."""
+    """The one place where a scene's failure, of any kind, is recorded instead of ending the run."""
     job = scene.job
     folder = RunFolder(job.folder).job(job.scene, part.name)
     folder.prepare()
@@ -110,7 +110,7 @@ def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
 
 
 def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any] = lambda: None) -> Perception:
-    """What sees the frames of a scene; ``marked`` gives what perfect masks are made from."""
+    """The perception of the frames of a scene; ``marked`` returns the source of ground-truth masks."""
     config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
     profile = resolve_profile(job.config.profile, info.image_domain, config)
     return build_perception(
@@ -126,7 +126,7 @@ def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any]
 
 
 class _Scene:
-    """One scene with what its methods share: the dataset, the truth."""
+    """One scene with everything its methods share: the dataset, the ground truth."""
 
     def __init__(self, job: jobs.SceneJob, report: Report) -> None:
         self.job = job
@@ -144,7 +144,7 @@ class _Scene:
 
     @cached_property
     def marked(self) -> InstanceMesh | ObjectBoxes:
-        """What perfect masks are made from: the annotated mesh, or else the boxes of objects."""
+        """The source of ground-truth masks: the annotated mesh, otherwise the boxes of objects."""
         try:
             mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
             return mesh
@@ -155,7 +155,7 @@ class _Scene:
             raise
 
     def report_activity(self, part: jobs.Part, activity: str) -> None:
-        """What is done now, where no frame is fed."""
+        """Report the current activity while no frame is fed."""
         self.report(Event(self.job.scene, part.name, activity=activity))
 
     @cached_property
@@ -164,8 +164,8 @@ class _Scene:
 
     @property
     def opening(self) -> str:
-        """What the first look at the scene is."""
-        return "making the scene" if self.is_rendered else "reading the scene"
+        """The description of opening the scene."""
+        return "generating the scene" if self.is_rendered else "reading the scene"
 
     def truth(self, variant: str) -> GroundTruth:
         if variant not in self._truths:
@@ -174,7 +174,7 @@ class _Scene:
 
     @cached_property
     def first_truth(self) -> GroundTruth:
-        """The first variant that is here, which methods that take the truth are told."""
+        """The first available variant, which methods that use ground truth receive."""
         missing = list[GroundTruthMissing]()
         for variant in self.dataset.variants:
             try:
@@ -185,7 +185,7 @@ class _Scene:
 
     @cached_property
     def solver(self) -> MapSolver | None:
-        """Who answers questions about maps; None: the built-in solver."""
+        """The solver that answers questions about maps; None: the built-in solver."""
         if self.job.config.solver == "built-in":
             return None
         config = PerceptionConfig.model_validate_json(self.job.perception).language
@@ -193,7 +193,7 @@ class _Scene:
         return by_language_model(client, config)
 
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
-        """Predict and score one method, each step only where its seal is missing or broken."""
+        """Predict and score one method, each step only if its completion record is missing or does not match."""
         self.report_activity(part, self.opening)
         method = jobs.build_method(part)
         info = self.dataset.info(self.job.scene_name, jobs.stride_of(self.job, part))
@@ -220,7 +220,7 @@ class _Scene:
     def _predict(
         self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
-        """Feed a method that is made anew, so that what it does when it is made is timed too, and seal its map."""
+        """Feed a newly created method, so that its construction is timed too, and record its map as complete."""
         clock = MethodClock()
         with clock.running("start"):
             method: interfaces.Method = jobs.build_method(part)
@@ -288,7 +288,7 @@ class _Scene:
     def _score(
         self, part: jobs.Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
-        """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
+        """Score under every protocol with ground truth here, draw the map, and record both as complete."""
         prediction = read_prediction(folder.prediction)
         scores, unscored = self.scores(part, perception.encoder, prediction, folder)
         files = [folder.counts]
@@ -315,7 +315,9 @@ class _Scene:
         unscored: dict[str, str] = {}
         for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
             if rules.ground_truth not in self._truths:
-                self.report_activity(part, "making the truth" if self.is_rendered else "reading the truth")
+                self.report_activity(
+                    part, "computing the ground truth" if self.is_rendered else "reading the ground truth"
+                )
             try:
                 truth = self.truth(rules.ground_truth)
             except GroundTruthMissing as error:

@@ -1,4 +1,4 @@
-"""The scenes that were asked for: addresses and patterns, the datasets that they speak of, and where data lie."""
+"""The requested scenes: addresses and patterns, the datasets that they name, and where data are stored."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ CACHE_ROOT = "~/.cache/su3d-bench/cache"
 
 
 def data_root() -> Path:
-    """Where datasets are: ``$SU3D_DATA``, else the user's cache."""
+    """Where datasets are: ``$SU3D_DATA``, otherwise the user's cache."""
     named = os.environ.get("SU3D_DATA") or DATA_ROOT
     if is_url(named):
-        raise ConfigError(f"SU3D_DATA={named}: only su3d-bench run and ablate read a store; name a folder")
+        raise ConfigError(f"SU3D_DATA={named}: only su3d-bench run and ablate can read a store; name a folder")
     return Path(named).expanduser()
 
 
 def cache_root() -> Path:
-    """Where per-frame perception is kept: ``$SU3D_CACHE``, else the user's cache."""
+    """Where per-frame perception is cached: ``$SU3D_CACHE``, otherwise the user's cache."""
     return Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
 
 
@@ -45,15 +45,15 @@ def split_address(address: str) -> tuple[str, str]:
 
 
 def looks_like_scene(text: str) -> bool:
-    """Whether ``text`` has the form of a scene's address, ``<dataset>/<scene>``, whatever is there."""
+    """Whether ``text`` has the form of a scene's address, ``<dataset>/<scene>``, whether or not it exists."""
     target, scene = split_address(text)
     return bool(scene) and (target in registry.names("dataset") or ".py:" in target)
 
 
 def nearest_scene(text: str, known: Iterable[str]) -> str:
-    """A clause for the address among ``known`` whose scene is called like ``text``, with or without its dataset.
+    """A clause suggesting the address in ``known`` whose scene name is most similar to ``text``.
 
-    Nothing where none is near; the name of the dataset, which many share, makes none near.
+    Empty if none is similar; a matching dataset name, which many scenes share, is not enough.
 
     >>> nearest_scene("living0", ["rooms/living0"]), nearest_scene("rooms/livng0", ["rooms/living0"])
     ("; did you mean 'rooms/living0'?", "; did you mean 'rooms/living0'?")
@@ -73,7 +73,7 @@ def nearest_scene(text: str, known: Iterable[str]) -> str:
 
 
 def dataset_targets(addresses: Sequence[str]) -> list[str]:
-    """The datasets that ``addresses`` speak of, in order; addresses that are mere files are passed over."""
+    """The datasets named in ``addresses``, in order; addresses that are plain files are ignored."""
     targets: dict[str, None] = {}
     for address in addresses:
         target, _ = split_address(address)
@@ -82,7 +82,7 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
         elif not os.path.exists(address):
             raise ConfigError(f"no scene matches '{address}'{_nearest_address(address)}")
     if not targets:
-        hint = next(filter(None, map(_with_dataset, addresses)), "; such as: rooms/living0 or 'rooms/*'")
+        hint = next(filter(None, map(_with_dataset, addresses)), "; expected such as rooms/living0 or 'rooms/*'")
         raise ConfigError(f"no scene among {', '.join(addresses) or 'no --scenes'}{hint}")
     return list(targets)
 
@@ -90,10 +90,10 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
 def expand_scenes(
     addresses: Sequence[str], datasets: Mapping[str, Part], root: Path | None = None
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
-    """(dataset target, scene) of every address or pattern, each once, in the order asked; and notes.
+    """(dataset target, scene) of every address or pattern, each once, in the given order; and notes.
 
-    Files among the addresses, which a shell put there by expanding ``dataset/*``, are left out with a note when
-    other addresses match. ``root`` None: ``data_root()``.
+    Files among the addresses, which a shell adds when it expands ``dataset/*``, are ignored with a note if other
+    addresses match. ``root`` None: ``data_root()``.
     """
     root = data_root() if root is None else root
     chosen: dict[tuple[str, str], None] = {}
@@ -112,8 +112,8 @@ def expand_scenes(
             raise ConfigError(f"no scene matches '{address}'{suggest(address, known)}")
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
-        raise ConfigError(f"no scene matches {', '.join(addresses)}; such as: rooms/living0 or 'rooms/*'")
-    notes = (f"not scenes, left out: {' '.join(foreign_files)}",) if foreign_files else ()
+        raise ConfigError(f"no scene matches {', '.join(addresses)}; expected such as rooms/living0 or 'rooms/*'")
+    notes = (f"ignored, not scenes: {' '.join(foreign_files)}",) if foreign_files else ()
     return list(chosen), notes
 
 
@@ -125,7 +125,7 @@ def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
         return [pattern]
     if pattern in _groups(dataset):
         return _whole_group(dataset, pattern, set(scenes))
-    try:  # a scene that is made on demand stands in no list
+    try:  # a scene that is generated on demand is in no list
         dataset.info(pattern, 1)
     except DataError:
         return []
@@ -133,24 +133,24 @@ def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
 
 
 def _groups(dataset: Any) -> Mapping[str, Sequence[str]]:
-    """Names that stand for several scenes, such as official splits; a dataset that has some has ``groups``."""
+    """Names for groups of scenes, such as official splits; a dataset with such names has ``groups``."""
     return dataset.groups() if isinstance(dataset, HasGroups) else {}
 
 
 def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:
-    """The scenes of a group, in its order, all of which must be here: a number over fewer is not the group's."""
+    """The scenes of a group, in its order, all of which must be available: a number over fewer is not the group's."""
     group = _groups(dataset)[name]
     missing = [scene for scene in group if scene not in here]
     if missing:
         raise ConfigError(
-            f"{dataset.name}/{name}: {len(missing)} of its {len(group)} scenes are not here (the first: {missing[0]}); "
-            "get them or name the scenes that are"
+            f"{dataset.name}/{name}: {len(missing)} of its {len(group)} scenes are missing (the first: {missing[0]}); "
+            "download them or name the available scenes"
         )
     return list(group)
 
 
 def _with_dataset(name: str) -> str:
-    """A clause for the address of a scene, group or pattern that was named without its built-in dataset."""
+    """A clause suggesting the address of a scene, group or pattern that was named without its built-in dataset."""
     if "/" in name or is_url(os.environ.get("SU3D_DATA") or ""):
         return ""
     known: list[str] = []

@@ -1,7 +1,7 @@
-"""What a run came to: its numbers, its record, what must be said of it, and what maps hold that nothing scores.
+"""The summary of a run: its numbers, its record, remarks on it, and the contents of maps that no protocol scores.
 
-A summary holds no time, date or path: two runs of one request give the same bytes, whatever the number of workers and
-however often a run was killed and resumed.
+A summary contains no time, date or path: two runs of one request give the same bytes, whatever the number of workers
+and however often a run was killed and resumed.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ COMPUTED_BY_METHOD = "computed by the method"
 
 
 def summarise(plan: Plan, outcomes: Outcomes) -> records.MetricsRecord:
-    """One result a method and protocol, with ceiling and the scenes that are missing.
+    """One result per method and protocol, with the ceiling and the scenes that are missing.
 
-    The counts of one method and of the ceiling are in memory at a time.
+    Only the counts of one method and of the ceiling are in memory at a time.
     """
     by_method: dict[str, list[MethodOutcome]] = {}
     for outcome in outcomes:
@@ -90,7 +90,7 @@ def _read_scores(plan: Plan, outcomes: Outcomes, file_of: Callable[[JobFolder], 
 
 
 def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -> Any:
-    """The metrics over ``scenes``; None where there is none, or one has no score."""
+    """The metrics over ``scenes``; None if there are no scenes, or one has no score."""
     of_scenes = {scene: scores[rules.name, scene] for scene in scenes if (rules.name, scene) in scores}
     return plain_json(combined_metrics(rules, of_scenes)) if of_scenes and len(of_scenes) == len(scenes) else None
 
@@ -98,7 +98,7 @@ def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -
 def _result(
     plan: Plan, method: str, rules: ProtocolRules, outcomes: Outcomes, scores: Scores, early: Mapping[float, Scores]
 ) -> records.ResultRecord:
-    """The result without its ceiling; the maps midway count where all scenes of the final one are scored."""
+    """The result without its ceiling; intermediate maps count if all scenes of the final one are scored."""
     planned = dict.fromkeys(
         job.scene for job in plan.jobs if any(load_protocol(name).name == rules.name for name in job.protocols)
     )
@@ -134,7 +134,7 @@ def _result(
 
 
 def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str | None:
-    """What ranks the predictions of an average precision; None where the protocol forms none."""
+    """What ranks the predictions for average precision; None if the protocol does not compute it."""
     if rules.confidence is None:
         return None
     if rules.confidence != "prediction":
@@ -146,7 +146,7 @@ def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str 
 
 
 def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
-    """Each text once; None where there is none."""
+    """Each text once, joined; None if there is none."""
     return separator.join(dict.fromkeys(text for text in texts if text)) or None
 
 
@@ -161,7 +161,7 @@ def _model_files(plan: Plan, outcomes: Outcomes) -> dict[str, dict[str, str]]:
 
 
 def record(plan: Plan, outcomes: Outcomes, status: str) -> records.RunRecord:
-    """Where the numbers come from."""
+    """The record of where the numbers come from."""
     git = git_state()
     return records.RunRecord(
         status=status,
@@ -193,16 +193,16 @@ def _unscored(outcomes: Outcomes) -> tuple[records.UnscoredRecord, ...]:
     return tuple(records.UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored)
 
 
-# ---- what must be said
+# ---- remarks
 
 
 def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str, str]]) -> tuple[str, ...]:
-    """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
+    """Remarks on scenes that did not fail: warnings, protocols that could not score them, missing ceilings."""
     failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
     lines = [line for outcome in outcomes for line in outcome.warnings]
     unscored = _unscored(outcomes)
     lines += not_scored_lines(unscored)
-    # A table says the caveat beneath it; what no protocol scores has no table.
+    # A table shows its caveat below it; scenes that no protocol scores have no table.
     has_table = {(one.method, one.caveat) for one in outcomes if (one.scene, one.method) not in without_score}
     caveats: dict[str, dict[str, None]] = {}
     for outcome in outcomes:
@@ -212,12 +212,12 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
     reported = {(one.scene, one.reason) for one in unscored}
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
-            lines.append(f"{outcome.scene}: no score of the truth: {outcome.error}")
+            lines.append(f"{outcome.scene}: no ground-truth ceiling: {outcome.error}")
     return tuple(dict.fromkeys(lines))
 
 
 def outcomes_without_score(plan: Plan, outcomes: Outcomes) -> list[tuple[str, str]]:
-    """(scene, method) of what did not fail and that no protocol scored."""
+    """(scene, method) of every job that did not fail but that no protocol scored."""
     n_protocols = {job.scene: len(job.protocols) for job in plan.jobs}
     return [
         (outcome.scene, outcome.method)
@@ -228,14 +228,14 @@ def outcomes_without_score(plan: Plan, outcomes: Outcomes) -> list[tuple[str, st
     ]
 
 
-# ---- maps that nothing scores
+# ---- maps that no protocol scores
 
 
 MAX_NAME_CHARACTERS = 60  # characters
 
 
 def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Found]:
-    """What each of ``jobs`` (scene, method) found, of those whose map is here."""
+    """The contents of the maps of ``jobs`` (scene, method), of those whose map is here."""
     for scene, method in jobs:
         job = folder.job(scene, method)
         if is_file(job.prediction):
@@ -258,7 +258,7 @@ def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Fou
 
 
 def without_score(run: FinishedRun) -> list[tuple[str, str]]:
-    """(scene, method) of what no protocol scored and did not fail."""
+    """(scene, method) of every job that did not fail but that no protocol scored."""
     told = {(failure.scene, failure.method) for failure in run.record.failed}
     for (method, _), result in run.results.items():
         told |= {(scene, method) for scene in (result.result.scenes if result.result is not None else ())}

@@ -1,4 +1,4 @@
-"""A user-defined method tried on two frames of a built-in room, a user-defined dataset asked for everything once."""
+"""Trial of a user-defined method on two frames of a built-in room, or of every function of a user-defined dataset."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ N_FRAMES = 2
 
 @dataclass(frozen=True)
 class Trial:
-    """What a method made of the two frames; ``n_instances`` None where its map has none."""
+    """The map of a method after two frames; ``n_instances`` is None if its map has no instances."""
 
     method: str
     scene: str
@@ -47,7 +47,7 @@ class Trial:
 
 
 def try_method(target: str) -> Trial:
-    """What the method at ``target`` makes of two frames; a ``ConfigError`` with what went wrong where it fails."""
+    """The map of the method at ``target`` after two frames; a ``ConfigError`` with the reason if it fails."""
     asked = {**ASKED, ("methods",): [target]}
     settings = Settings(tuple(Setting(path, value, "the trial") for path, value in asked.items()))
     with tempfile.TemporaryDirectory(prefix="su3d-trial-") as folder:
@@ -65,10 +65,10 @@ def try_method(target: str) -> Trial:
 
 
 def try_dataset(dataset: Any, scene: str) -> None:
-    """Ask somebody's own ``dataset`` for everything of ``scene`` once, and for two frames.
+    """Call every function of a user-defined ``dataset`` for ``scene`` once, and read two frames.
 
-    A ``PlugInError`` at the first answer that is not as it must be, and whatever its own code raises; what merely is
-    not there, such as a file or a truth, is left to whoever checks the whole scene.
+    A ``PlugInError`` at the first invalid return value, and whatever its own code raises; missing data, such as a file
+    or the ground truth, are left to the check of the whole scene.
     """
     if is_built_in(type(dataset)):
         return
@@ -83,7 +83,7 @@ def _try_truth(dataset: Any, variant: str, scene: str) -> None:
     space = dataset.ground_truth(scene, variant).labels.space
     if space != dataset.label_space:
         raise PlugInError(
-            f"{_place(dataset, 'ground_truth')}: its labels are of '{space}', and the class says label_space = "
+            f"{_place(dataset, 'ground_truth')}: its labels are of '{space}', but the class has label_space = "
             f"'{dataset.label_space}'"
         )
 
@@ -93,16 +93,16 @@ def _try_frames(dataset: Any, scene: str) -> None:
         info, frames = dataset.info(scene, stride), dataset.frames(scene, stride)
         if len(frames) != info.n_frames:
             raise PlugInError(
-                f"{_place(dataset, 'frames')} gave {len(frames)} frames at stride {stride}, its info counts "
-                f"{info.n_frames}"
+                f"{_place(dataset, 'frames')} returned {len(frames)} frames at stride {stride}, but its info has "
+                f"n_frames {info.n_frames}"
             )
         if stride == 1:
             n_frames = len(frames)
             facts = [facts_of(frames[k]) for k in range(min(N_FRAMES, n_frames))]
         elif len(frames) != -(-n_frames // stride):
             raise PlugInError(
-                f"{_place(dataset, 'frames')} gave {len(frames)} frames at stride {stride} and {n_frames} at stride 1; "
-                "every stride-th from the first on is expected"
+                f"{_place(dataset, 'frames')} returned {len(frames)} frames at stride {stride}, but {n_frames} at 1; "
+                "expected every stride-th frame, starting with the first"
             )
     for finding in check_frames(facts):
         if finding.severity == "error" and finding.check in ("pose", "intrinsics", "size"):

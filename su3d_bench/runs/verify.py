@@ -1,4 +1,4 @@
-"""Whether the numbers of a run follow from its own counts, and its files are those that it vouches for."""
+"""Whether the numbers of a run follow from its own counts, and its files match their recorded digests."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
 from su3d_bench.store.run_folder import JobFolder
 
-# What metrics.json says that must follow from the counts; how intervals are formed may change without a new version.
+# Values in metrics.json that must follow from the counts; how intervals are formed may change without a new version.
 CHECKED_FIELDS = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
 
 
 def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
-    """The rules that scored ``run``, to the digest; a ``ConfigError`` where there are none."""
+    """The rules that scored ``run``, with the same digest; a ``ConfigError`` if there are none."""
     if protocol not in run.protocols:
-        raise ConfigError("its protocol is none of those that run.json names")
+        raise ConfigError("its protocol is not in run.json")
     return run.rules(protocol, to_the_letter=True)
 
 
 def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
-    """The first thing that ``said`` has otherwise than the counts give, or lacks of it; None where it follows."""
+    """The first value of ``said`` that differs from the counts or is missing; None if all follow from the counts."""
     if set(said.scenes) != set(counted.scenes):
         return f"it has {len(said.scenes)} scenes, the counts {len(counted.scenes)}"
     record, numbers = plain(said), counted.to_json()
@@ -56,7 +56,7 @@ def _shown(value: float | None) -> str:
 
 
 def count_mismatch(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
-    """Why the numbers of a method under a protocol do not follow from ``scores``, its counts; None where they do."""
+    """Why the numbers of a method under a protocol do not follow from ``scores``, its counts; None if they do."""
     record = run.results.get((method, protocol))
     if record is None or record.result is None:
         return "was not scored"
@@ -71,7 +71,7 @@ def count_mismatch(run: FinishedRun, method: str, protocol: str, scores: Mapping
 
 
 def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
-    """Where and what, of every scene and method whose map, counts or times are not those that the run sealed."""
+    """Location and fault of every scene and method whose map, counts or times differ from those that the run wrote."""
     for scene in run.scenes:
         for method in run.methods:
             fault = _damage(run.folder.job(scene, method))
@@ -86,7 +86,7 @@ def _damage(job: JobFolder) -> str | None:
     for file in (job.prediction, features_beside(job.prediction), job.updates, job.counts):
         if file.name not in completed:
             if file != features_beside(job.prediction):
-                return f"done.json does not vouch for {file.name}"
+                return f"done.json does not list {file.name}"
         elif not is_file(file):
             return f"{file.name} is missing"
         elif digest_file(file) != completed[file.name]:
@@ -94,12 +94,12 @@ def _damage(job: JobFolder) -> str | None:
     try:
         read_stored(job.prediction)
     except Su3dError as error:
-        return f"holds no map: {error}"
+        return f"contains no map: {error}"
     return None
 
 
 def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
-    """Where and what: files that are not those of the run, numbers that do not follow from its counts."""
+    """Location and fault: files that are not those of the run, numbers that do not follow from its counts."""
     yield from damaged_files(run)
     for method in dict.fromkeys(method for method, _ in run.results):
         try:

@@ -185,8 +185,8 @@ REFUSED = [
     (("a", "other-encoder"), "cannot be compared: encoder is words (words-1) and words (words-2)"),
     (("a", "a"), "a: both sides are the same; name two runs, or two methods of one run as a:METHOD"),
     (("a:oracle", "a:oracle"), "a:oracle: both sides are the same"),
-    (("a", "b:colector"), "b: holds no scores of the method 'colector'; did you mean 'collector'?"),
-    (("a", "b:../../b/scenes/painted.a/collector"), "b: holds no scores of the method '../../b/scenes"),
+    (("a", "b:colector"), "b: has no scores of the method 'colector'; did you mean 'collector'?"),
+    (("a", "b:../../b/scenes/painted.a/collector"), "b: has no scores of the method '../../b/scenes"),
     (("a", "nowhere"), "nowhere: no such folder; give the folder of a run, such as runs/my-run"),
 ]
 

@@ -78,7 +78,7 @@ REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {
         "per_scene.painted/a has no mAcc",
     ),
     "a partial run": ("run.json", lambda r: r.update(is_partial=True), "is partial"),
-    "no record": ("run.json", lambda r: r.clear(), "is not as a run writes it"),
+    "no record": ("run.json", lambda r: r.clear(), "methods is empty"),
 }
 
 

@@ -160,7 +160,7 @@ def test_a_run_that_is_evaluated_has_the_numbers_of_the_evaluation(here: Path) -
     assert type(scores) is su3d.Scores and isinstance(run, su3d.Run)
     assert scores.metrics.drop(columns="method").equals(run.metrics.drop(columns="method"))
     assert any("format: " in line for line in scores.remarks)
-    assert any(line.startswith("again: predictions made elsewhere") for line in run.remarks)
+    assert any(line.startswith("again: external predictions") for line in run.remarks)
     found = run.instances
     assert found[["kind", "error", "is_hit_50"]].values.tolist() == [
         ["predicted", "", True], ["true", "", True], ["true", "missed", False]
@@ -228,11 +228,11 @@ def test_scenes_that_fail_are_an_error_and_the_others_are_there(
         (lambda: su3d.run("rooms/living0", into="other"), "is none of own, extend, replace"),  # type: ignore[arg-type]
         (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions were named"),
         (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),  # type: ignore[call-overload]
-        (lambda: su3d.load_run("nowhere"), "nowhere: holds no run.json"),
+        (lambda: su3d.load_run("nowhere"), "nowhere: contains no run.json"),
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
-        (lambda: su3d.load_run("runs/demo").prediction("rooms/x", "oracle"), "holds no map of rooms/x"),
-        (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "holds no scores of the method 'sam3d'"),
+        (lambda: su3d.load_run("runs/demo").prediction("rooms/x", "oracle"), "contains no map of rooms/x"),
+        (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "has no scores of the method 'sam3d'"),
     ],
 )
 def test_what_a_user_can_cause_is_an_error_of_one_line(call: Any, line: str, here: Path) -> None:

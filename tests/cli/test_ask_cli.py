@@ -130,7 +130,7 @@ def test_dry_run_reports_the_cost_and_sends_no_request(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
-    assert "1 requests, 0 of them answered before; 1 to send to gpt-4-1106-preview: about " in capsys.readouterr().out
+    assert "1 requests, 0 of them already answered; 1 to send to gpt-4-1106-preview: about " in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run"]) == 0
@@ -143,7 +143,7 @@ def test_dry_run_reports_the_cost_and_sends_no_request(
     ("words", "line"),
     [
         (f"query ask {SCENE} ' '", "the question is empty"),
-        ("query ask rooms/none x", "no run in runs/ holds rooms/none by opensu3d"),
+        ("query ask rooms/none x", "no run in runs/ has rooms/none by opensu3d"),
         (f"query text {SCENE} x --run runs/made --method opensud", "by opensud; did you mean 'opensu3d'?"),
         (f"query ask {SCENE} x --names refined", "no labels n'; create them with su3d-bench runs refine"),
         (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers (metres)"),

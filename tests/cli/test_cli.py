@@ -94,17 +94,17 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
         ("report tables r --table VI", "report tables: unknown --table 'VI'; did you mean 'V'? known: I, "),
         (
             f"query text {PAINTED}/a x",
-            f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
+            f"no run in runs/ has {PAINTED}/a by opensu3d; create one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
         ("query text rooms/living0 '  '", "the text is empty; use for example"),
-        ("query text rooms/living0 x --run r", "r: holds no run; name the folder of one: su3d-bench runs list"),
+        ("query text rooms/living0 x --run r", "r: contains no run; name a run folder, see: su3d-bench runs list"),
         ("query text 'a plant' rooms/living0", "'a plant' is not a scene; give the scene first, then the text:"),
         ("run living0", "no scene matches 'living0'; did you mean 'rooms/living0'?"),
         ("run rooms", "'rooms' is a dataset; name its scenes, such as 'rooms/*'"),
         ("run --methods oracle rooms/living0", "--methods rooms/living0: is a scene; write it before the"),
-        ("run --extend", "--extend: say which run with --out, such as --out runs/demo"),
-        ("run --replace", "--replace: say which run with --out, such as --out runs/demo"),
-        (f"{TYPED} --extend --out none", "--extend: none holds no run.toml of a run; leave --extend out to begin"),
+        ("run --extend", "--extend: name the run with --out, such as --out runs/demo"),
+        ("run --replace", "--replace: name the run with --out, such as --out runs/demo"),
+        (f"{TYPED} --extend --out none", "--extend: none contains no complete run.toml; omit --extend to start"),
     ],
 )
 def test_invalid_input_is_a_one_line_error_with_exit_code_2(
@@ -148,7 +148,7 @@ def test_scenes_may_be_expanded_by_the_shell(tmp_path: Path, capsys: pytest.Capt
     assert main([*RUN, *words, "--dry-run", "--json"]) == 0
     answer = capsys.readouterr()
     assert [one["scene"] for one in json.loads(answer.out)["jobs"]] == ["painted/a", "painted/b"]
-    assert answer.err == "not scenes, left out: cam_params.json\n"
+    assert answer.err == "ignored, not scenes: cam_params.json\n"
 
 
 def test_dry_run_shows_the_plan_and_does_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,9 +51,9 @@ METHODS = {
     "unknown masks": (
         'masks="grounded"',
         'masks="boxes"',
-        "needs: masks is 'boxes'; 'grounded', 'class-agnostic', 'none'",
+        "needs: masks is 'boxes'; expected one of 'grounded', 'class-agnostic', 'none'",
     ),
-    "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; expected Instances or Partition"),
+    "no map": ("return Instances.of", "Instances.of", "MyMethod.finish returned None; expected Instances or Partition"),
     "undefined scores": (
         "np.ones(len(kept))",
         "np.full(len(kept), np.nan)",
@@ -72,11 +72,11 @@ def test_mistake_in_a_method_is_a_one_line_error(mistake: str, capsys: pytest.Ca
 
 
 DATASETS = {
-    "no info": ("return SceneInfo(", "SceneInfo(", "MyDataset.info gave None; expected SceneInfo"),
+    "no info": ("return SceneInfo(", "SceneInfo(", "MyDataset.info returned None; expected SceneInfo"),
     "a stride that counts for nothing": (
         "for index in range(0, self._options.n_frames, stride)]",
         "for index in range(0, self._options.n_frames)]",
-        "MyDataset.frames gave 80 frames at stride 2, its info counts 40",
+        "MyDataset.frames returned 80 frames at stride 2, but its info has n_frames 40",
     ),
     "millimetres": (
         "rgb, depth_m, camera",
@@ -87,17 +87,17 @@ DATASETS = {
     "unknown classes": (
         "[0, *LABELS.ids]",
         "[0, 7, 8, 9]",
-        "ground_truth: semantic holds the class id 7, which its labels",
+        "ground_truth: semantic has the class id 7, which is not in its labels",
     ),
     "another space": (
         'label_space = "replica"',
         'label_space = "mine"',
-        "its labels are of 'replica', and the class says",
+        "its labels are of 'replica', but the class has",
     ),
     "a corner beyond": (
         "np.arange(3 * len(points)",
         "1 + np.arange(3 * len(points)",
-        "instance_mesh: triangles holds 1 to",
+        "instance_mesh: triangles has indices 1 to",
     ),
     "an exception": ("points, instance = self._surface(scene)", "points = {}[scene]", "KeyError: 'near'"),
 }
@@ -150,14 +150,14 @@ def test_run_of_a_changed_file_is_not_resumed(capsys: pytest.CaptureFixture[str]
     Path("my_method.py").write_text(
         text.replace("least_points: int = 20", "least_points: int = 21").replace("< 0.5", "< 0.6")
     )
-    assert "holds another run" in told(words, capsys)
+    assert "contains a different run" in told(words, capsys)
 
 
 def test_custom_dataset_is_scored_under_all_fitting_protocols(capsys: pytest.CaptureFixture[str]) -> None:
     written("dataset", "", "")
     words = ["run", "--scenes", DATASET, "--methods", "oracle", "--limit", "1", "--jobs", "1", "--no-pictures"]
     assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
-    assert "my-dataset: scored under the protocols that its truth fits; --protocols chooses" in capsys.readouterr().err
+    assert "my-dataset: scored under all protocols that fit its ground truth; choose with" in capsys.readouterr().err
     found = json.loads(Path("out/metrics.json").read_text())["results"]
     assert {"rooms-instance", "rooms-semantic", "replica-openmask3d"} <= {one["protocol"] for one in found}
     assert all(one["result"]["metrics"][one["headline"][0]] == 1 for one in found)
@@ -168,7 +168,7 @@ def test_ground_truth_without_a_fitting_protocol_is_reported(capsys: pytest.Capt
     Path("my_dataset.py").write_text(text.replace('"replica"', '"mine"'))
     words = ["run", "--scenes", DATASET, "--methods", "opensu3d", "--limit", "1", "--jobs", "1", "--no-pictures"]
     assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
-    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; su3d-bench protocols new"
+    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; create a custom one"
     assert said in capsys.readouterr().err
 
 

@@ -21,14 +21,14 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 WHAT = f"--methods {COLLECTOR} --protocols rooms-semantic rooms-instance --no-pictures"
 INTO = "--out runs/demo"
 SAME = f"run {PAINTED}/[ab] {WHAT} {INTO}"
-OTHER = "su3d-bench: runs/demo: holds another run ("
+OTHER = "su3d-bench: runs/demo: contains a different run ("
 
 # The command, its exit code, and the start of its last line.
 SLIPS: dict[str, tuple[str, int, str]] = {
-    "one scene of two": (f"run --scenes {PAINTED}/a {WHAT} {INTO}", 2, f"{OTHER}scene painted/b is not asked"),
+    "one scene of two": (f"run --scenes {PAINTED}/a {WHAT} {INTO}", 2, f"{OTHER}scene painted/b is not requested"),
     "more scenes": (f"run {PAINTED}/* {WHAT} {INTO}", 2, f"{OTHER}scenes painted/c, painted/d are new); --extend"),
     "the defaults": (f"run {INTO}", 2, OTHER),
-    "another method": (f"{SAME} --methods oracle", 2, f"{OTHER}method collector is not asked for now, method oracle"),
+    "another method": (f"{SAME} --methods oracle", 2, f"{OTHER}method collector is not requested now, method oracle"),
     "another seed": (f"{SAME} --seed 1", 2, f"{OTHER}seed was 0, now 1); --replace"),
     "the same with fewer processes": (f"{SAME} --jobs 1", 0, "run folder: runs/demo"),
     "the same in another order": (f"run {PAINTED}/b {PAINTED}/a {WHAT} {INTO}", 0, "run folder: runs/demo"),
@@ -43,7 +43,7 @@ SLIPS: dict[str, tuple[str, int, str]] = {
     "a sweep": (
         f"ablate {PAINTED}/[ab] --method {COLLECTOR} --vary drop=0,1 {INTO} --protocols rooms-semantic",
         2,
-        f"{OTHER}method collector@drop=1 is new, protocol rooms-instance is not asked for now)",
+        f"{OTHER}method collector@drop=1 is new, protocol rooms-instance is not requested now)",
     ),
     "removed without a word": ("runs remove runs/demo", 2, "su3d-bench: runs remove: no terminal to ask for"),
     "removed through a link": ("runs remove link --yes", 2, "su3d-bench: link: is a link; name the folder"),

@@ -87,7 +87,7 @@ def test_map_is_not_labelled_with_changed_data(run_folder: str, capsys: pytest.C
     record["steps"]["predict"]["key"]["data"] = "another"
     mark_complete.write_text(json.dumps(record))
     words = ("--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle")
-    assert "painted/b: its data are not those of the run; run it again" in error_of(capsys, run_folder, *words)
+    assert "painted/b: its data have changed since the run; run it again" in error_of(capsys, run_folder, *words)
 
 
 def test_only_method_of_a_limited_run_is_exported_with_a_partial_warning(

@@ -124,10 +124,10 @@ def test_query_uses_the_encoder_of_the_run(found: Path, home: Path) -> None:
     assert encoder.encode_texts(["chair"]).shape == (1, CLIP_DIM)
 
 
-def test_query_on_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
-    with pytest.raises(PredictionError, match=r"made by encoder ViT-B-32/openai \(000000000000\), here is ViT-B-32/op"):
+def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
+    with pytest.raises(PredictionError, match=r"made by encoder ViT-B-32/openai \(000000000000\), not by ViT-B-32/op"):
         encoder_of(_finished_run(home / "run", "ViT-B-32/openai", "0" * 64))
-    with pytest.raises(PredictionError, match="here is su3d-embedded"):
+    with pytest.raises(PredictionError, match="not by su3d-embedded"):
         encoder_of(_finished_run(home / "run", "su3d-embedded", "0" * 64))
     with pytest.raises(ModelMissing, match="model 'clip-vit-l-14': not found"):
         encoder_of(_finished_run(home / "run", "ViT-L-14/openai", "0" * 64))

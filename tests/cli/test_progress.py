@@ -45,10 +45,10 @@ def test_bar_and_activity_are_visible_on_80_columns(scene: str, monkeypatch: pyt
     with bars_on(80, monkeypatch) as bars:
         board = _Board(bars, 4, "")
         assert "starting" in plain_lines(bars)[0]
-        board.report(Event(scene, "opensu3d", activity="making the scene"))
-        assert "making the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
+        board.report(Event(scene, "opensu3d", activity="generating the scene"))
+        assert "generating the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
         board.report(Event(scene, "opensu3d", 0, 160))
-        assert "making the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
+        assert "generating the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
         board.report(Event(scene, "opensu3d", 160, 160, 12))
         first, second = plain_lines(bars)
         assert "12 instances" in second and "making" not in second and "starting" not in first

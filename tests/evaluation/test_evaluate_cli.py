@@ -56,7 +56,7 @@ def test_the_json_file_has_the_promised_form(capsys: pytest.CaptureFixture[str])
 
 WRONG = {
     "": "evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS",
-    "pred --out runs/mine --name ../up --ground-truth gt": "--name: '../up' cannot be the name of a folder",
+    "pred --out runs/mine --name ../up --ground-truth gt": "--name: '../up' is not a valid folder name",
     "prde --ground-truth gt": "prde: no such file or folder; give the folder of the predictions",
     "pred": "evaluate: no ground truth given; name it with --dataset scannet or --ground-truth DIR",
     "pred --ground-truth .": ".: has no .txt file; expected <scene>.txt, one value per point",

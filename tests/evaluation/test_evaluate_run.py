@@ -24,8 +24,8 @@ from su3d_bench.runs.finished import read_run
 PAINTED = f"{SCENES}/painted.py:Painted"
 NAMES = ("chair", "sofa", "table")
 IDS = [20, 76, 80]
-MINE = "predictions made elsewhere, read from files (openmask3d)"
-THEIRS = "predictions made elsewhere, read from files (scannet-text)"
+MINE = "external predictions, read from files (openmask3d)"
+THEIRS = "external predictions, read from files (scannet-text)"
 
 
 @cache
@@ -103,7 +103,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
         assert explained["protocols"][0]["values"]["AP"] == ap[method]
         assert f"{method}: {line}" in explained["remarks"]
     latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--ceiling", "--intervals")
-    assert f"value={ap['mine']!r}" in latex and "predictions made elsewhere" in latex
+    assert f"value={ap['mine']!r}" in latex and "external predictions" in latex
     Path("paper.tex").write_text(latex)
     assert " 0 differ" in answered(capsys, "report", "verify", "paper.tex")
     answered(capsys, "report", "html", RUN, "--out", "page.html", "--no-errors")
@@ -223,16 +223,16 @@ def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: 
     explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
     told = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
-    assert "made by encoder theirs/v1" in told and "only texts of that one can be held against them" in told
+    assert "made by encoder theirs/v1" in told and "only texts encoded by it can be compared with them" in told
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
     assert "texts.npz: is not the text features file used to score runs/mine" in answered(
         capsys, "report", "attribution", "runs/mine", code=2
     )
 
 
-NUMBERS_ALONE = "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out"
+NUMBERS_ALONE = "contains numbers without the counts of scenes that are needed here; evaluate again with --out"
 PREDICTIONS = (
-    "pred: holds predictions (scannet-text) and no run.json; make a run of them with: su3d-bench evaluate pred"
+    "pred: contains predictions (scannet-text) and no run.json; create a run from them with: su3d-bench evaluate pred"
 )
 NO_RUNS = {
     "compare numbers.json runs/mine": f"numbers.json: {NUMBERS_ALONE}",

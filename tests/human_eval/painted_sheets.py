@@ -1,4 +1,4 @@
-"""Fixtures of tests of sheets: a finished run of a painted scene, and what sheets are made of from it."""
+"""Fixtures of sheet tests: a finished run of a painted scene, and the source of sheets from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def painted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a finished run in ``run`` and a file of queries."""
+    """A folder with a finished run in ``run`` and a query file."""
     path = tmp_path_factory.mktemp("sheets")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(path / "data"))
@@ -33,7 +33,7 @@ def painted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def painted_source(painted_folder: Path, monkeypatch: pytest.MonkeyPatch) -> RunSource:
-    """The run, judged by rules of the built-in rooms, whose label space the painted scenes have."""
+    """The run, judged by the rules of the built-in rooms, whose label space the painted scenes use."""
     from su3d_bench.human_eval.sources import RunSource
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.runs.finished import read_run

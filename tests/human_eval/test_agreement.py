@@ -1,4 +1,4 @@
-"""Coefficients of agreement against the examples of the publications that define them, and by hand."""
+"""Agreement coefficients compared with the examples of their publications and with hand-computed values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def counts_of(*observers: str) -> Int64Array:
 
 
 def repeated(table: list[list[int]]) -> tuple[list[str], list[str]]:
-    """The answers of two people whose cross table this is."""
+    """The answers of two annotators with this cross table."""
     left, right = [], []
     for i, row in enumerate(table):
         for j, n in enumerate(row):
@@ -35,22 +35,22 @@ def repeated(table: list[list[int]]) -> tuple[list[str], list[str]]:
     return left, right
 
 
-def test_the_examples_in_the_docstrings_run() -> None:
+def test_docstring_examples_run() -> None:
     assert doctest.testmod(module).failed == 0
 
 
-def test_fleiss_kappa_is_that_of_his_own_example() -> None:
+def test_fleiss_kappa_matches_the_published_example() -> None:
     table = np.array([[int(one) for one in row] for row in FLEISS.split()])
     assert table.shape == (30, 5)
     assert fleiss_kappa(table) == pytest.approx(0.430, abs=5e-4)
 
 
 @pytest.mark.parametrize(("observers", "alpha"), [(BINARY, 0.095), (NOMINAL, 0.692), (WITH_GAPS, 0.743)])
-def test_krippendorffs_alpha_is_that_of_his_own_examples(observers: tuple[str, ...], alpha: float) -> None:
+def test_krippendorffs_alpha_matches_the_published_examples(observers: tuple[str, ...], alpha: float) -> None:
     assert krippendorff_alpha(counts_of(*observers)) == pytest.approx(alpha, abs=5e-4)
 
 
-def test_cohens_kappa_is_that_of_his_own_example() -> None:
+def test_cohens_kappa_matches_the_published_example() -> None:
     # Cohen 1960, Educational and Psychological Measurement 20, table 1, as counts of 100: (.29 - .35) / .65 = -.092
     left, right = repeated([[25, 13, 12], [12, 2, 16], [3, 15, 2]])
     assert cohen_kappa(left, right) == pytest.approx((0.29 - 0.35) / 0.65)

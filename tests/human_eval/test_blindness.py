@@ -1,4 +1,4 @@
-"""Pictures of annotation sheets tell no method: outside of the answer they are those of a room without any map."""
+"""Pictures of annotation sheets do not reveal the method: outside the answer they show the room without any map."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from su3d_bench.reports.pictures.items import ItemParts, compose, png_bytes
 from su3d_bench.reports.pictures.maps import pale
 from su3d_bench.runs.finished import read_run
 
-METHODS = ("openmask3d", "sam3d", "conceptfusion")  # the last makes features without instances
+METHODS = ("openmask3d", "sam3d", "conceptfusion")  # the last computes features without instances
 SCENE = "rooms/bathroom0"
 KINDS: tuple[SheetKind, ...] = ("retrieval", "annotation", "reasoning")
 RUN = (
@@ -38,7 +38,7 @@ RUN = (
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A finished run of methods of three sorts on a small room."""
+    """A finished run of three kinds of methods on a small room."""
     path = tmp_path_factory.mktemp("blind")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(path / "data"))
@@ -54,7 +54,7 @@ def source(run: Path) -> RunSource:
 
 
 def drafts_of(source: RunSource, kind: SheetKind) -> Sequence[drafts.Draft]:
-    """Items of every method that sheets of a kind can judge."""
+    """Items of every method that a kind of sheet can judge."""
     is_able = source.has_features if kind == "retrieval" else source.has_instances
     source = source.of_methods([method for method in source.methods if is_able(SCENE, method)])
     encoder = source.run.encoder("cpu")
@@ -67,7 +67,7 @@ def drafts_of(source: RunSource, kind: SheetKind) -> Sequence[drafts.Draft]:
 
 
 def n_astray(artist: Artist, draft: drafts.Draft) -> int:
-    """How many pixels of an item's views differ from those of the room alone where no point of the answer is."""
+    """Number of pixels of an item's views, outside the answer, that differ from those of the room alone."""
     parts, room = artist.parts(draft), artist.room(draft.scene)
     photo = parts.photo
     assert photo is None or any(np.array_equal(photo.picture, frame.rgb) for frame in room.frames)
@@ -85,7 +85,7 @@ def n_astray(artist: Artist, draft: drafts.Draft) -> int:
 
 
 def differs(picture: UInt8Array, other: UInt8Array) -> Any:
-    """Where (h, w) any channel of a picture is another."""
+    """Where (h, w) any channel of two pictures differs."""
     return (picture != other).any(axis=2)
 
 
@@ -96,7 +96,7 @@ def test_views_outside_the_answer_show_only_the_room(source: RunSource) -> None:
     assert {draft.kind for draft in every} == set(KINDS)
     assert len({(draft.kind, method) for draft in every for method in draft.methods}) >= 5
     assert {n_astray(artist, draft) for draft in every} == {0}
-    # and so do files: a pixel of one depends on nothing but the same pixel of the picture
+    # and so do files: a pixel of a file only depends on the same pixel of the picture
     picture = compose(artist.parts(every[0]))
     changed = picture.copy()
     changed[100:200, 100:200] = (255, 0, 0)
@@ -106,7 +106,7 @@ def test_views_outside_the_answer_show_only_the_room(source: RunSource) -> None:
 
 
 class OwnMap(Artist):
-    """Draws the whole map of the method that is judged into the room, as pictures once did."""
+    """Draws the complete map of the judged method into the room, as pictures once did."""
 
     def parts(self, draft: drafts.Draft) -> ItemParts:
         parts, room = super().parts(draft), self.room(draft.scene)
@@ -131,7 +131,7 @@ def test_picture_is_independent_of_map_density_and_completeness(source: RunSourc
     row = int(np.argsort(whole.sizes)[len(whole) // 2])
     mask, random = whole.mask(row), np.random.default_rng(0)
     own = whole.points[mask]
-    near = random.normal(0, 0.04, own.shape).astype(np.float32) + own  # what another map has beside it
+    near = random.normal(0, 0.04, own.shape).astype(np.float32) + own  # as in a noisier map
     alone = Instances.of(own[random.permutation(len(own))], [np.ones(len(own), bool)], names=("x",), ids=[9])
     twice = np.concatenate([own, near, own])
     members = np.zeros((2, len(twice)), bool)

@@ -1,4 +1,4 @@
-"""Sheets on which people judge questions that the ground truth made: made, pictured, scored, and left out again."""
+"""Sheets on which annotators judge questions from ground truth: created, drawn, scored, and excluded afterwards."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def painted_objects() -> Any:
     return scene_objects(dataset, "a", fullest_truth(dataset, "a"), 100)
 
 
-# Made
+# Creating
 
 
 def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource) -> None:
@@ -84,7 +84,7 @@ def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource)
     assert not any(one.automatic for one in drafts)
 
 
-def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--annotators", "2", "--overlap", "1", "--out", "out", "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)["sets"]
@@ -101,7 +101,7 @@ def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> 
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
 
 
-# Scored
+# Scoring
 
 
 def question_set(kinds: Sequence[str]) -> tuple[Sheet, Key]:
@@ -143,7 +143,7 @@ def test_question_score_is_the_worst_of_its_parts() -> None:
     assert whole == [RIGHT, ARGUABLE, WRONG, WRONG]
 
 
-def test_shares_of_right_are_counted_by_kind_of_question() -> None:
+def test_shares_of_right_are_counted_per_kind_of_question() -> None:
     _, _, found = scored()
     shares = {(cell.method, cell.metric): cell.value for cell in found.cells}
     assert {cell.judge for cell in found.cells} == {"people"} and found.tests == () == found.confusions

@@ -1,4 +1,4 @@
-"""The answers of annotators, their files and keys: what is read, and what is refused with which words."""
+"""The answers of annotators, their files and keys: reading them, and errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def small() -> tuple[Sheet, Key]:
     return retrieval_set(8, ("ann", "bob"))
 
 
-# What is refused
+# Errors
 
 
 def test_duplicate_answer_error_names_both_rows(small: tuple[Sheet, Key]) -> None:
@@ -30,7 +30,7 @@ def test_duplicate_answer_error_names_both_rows(small: tuple[Sheet, Key]) -> Non
 
 
 @pytest.mark.parametrize("change", [{"sheet_id": "retrieval-other"}, {"kind": "annotation"}, {"items": ()}])
-def test_a_key_of_another_set_is_refused(small: tuple[Sheet, Key], change: dict[str, object]) -> None:
+def test_key_of_another_set_is_rejected(small: tuple[Sheet, Key], change: dict[str, object]) -> None:
     with pytest.raises(DataError, match=r"^key: "):
         check_key(small[0], replace(small[1], **change))  # type: ignore[arg-type]
 
@@ -49,7 +49,7 @@ def test_csv_from_pages_and_spreadsheets_is_read(
     assert found[0].at == f"{file}: row 2"
 
 
-def test_a_workbook_gives_the_same_rows_as_a_csv(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+def test_workbook_gives_the_same_rows_as_a_csv(small: tuple[Sheet, Key], tmp_path: Path) -> None:
     file = tmp_path / "ann.xlsx"
     file.write_bytes(workbook(both(small), header_at=5))
     found = read_answers(file)
@@ -69,7 +69,7 @@ def test_a_workbook_gives_the_same_rows_as_a_csv(small: tuple[Sheet, Key], tmp_p
         {"sheet_id": "retrieval-other"},
     ],
 )
-def test_each_fault_names_its_file_and_row(small: tuple[Sheet, Key], change: dict[str, str]) -> None:
+def test_each_error_names_its_file_and_row(small: tuple[Sheet, Key], change: dict[str, str]) -> None:
     rows = both(small)
     rows[1] = replace(rows[1], **change)
     faults = check_answers(small[0], rows).faults
@@ -87,14 +87,14 @@ def test_invalid_csv_fails(content: bytes, tmp_path: Path) -> None:
         read_answers(tmp_path / "a.csv")
 
 
-# Workbooks that are made to harm who scores them
+# Malicious workbooks
 
 PAGE = "xl/worksheets/sheet1.xml"
 ENTITY = b'<?xml version="1.0"?><!DOCTYPE worksheet [<!ENTITY a "right">]><worksheet>&a;</worksheet>'
 
 
 def with_page(content: bytes, page: bytes) -> bytes:
-    """A workbook with other bytes in the place of its first worksheet."""
+    """A workbook with other bytes instead of its first worksheet."""
     stream = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
         for name in old.namelist():

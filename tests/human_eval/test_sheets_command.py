@@ -1,4 +1,4 @@
-"""``su3d-bench sheets make`` over several kinds, over maps without features, and with a language model that answers."""
+"""``su3d-bench sheets make`` for several kinds, for maps without features, and with a language model that answers."""
 
 from __future__ import annotations
 

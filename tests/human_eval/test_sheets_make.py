@@ -1,4 +1,4 @@
-"""Sheets as they are made: order, splits, files and their checks, what is asked about, and the command."""
+"""Creating sheets: order, splits, files and their checks, items, and the command."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_answers_contain_no_map_ids(text: str, told: str) -> None:
     assert found == told and names[26] == "sofa"
 
 
-def test_sheets_are_made_from_the_command_line(
+def test_sheets_are_created_from_the_command_line(
     painted_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(painted_folder)

@@ -35,7 +35,7 @@ def browser(profile: Path) -> Iterator[Chromium]:
 
 
 def answers(browser: Chromium, folder: Path) -> list[dict[str, str]]:
-    """What the page exports."""
+    """The export of the page."""
     folder.mkdir(exist_ok=True)
     browser.downloads_to(folder)
     browser.run("document.getElementById('export').click()")
@@ -48,7 +48,7 @@ def shown(browser: Chromium) -> str:
     return text
 
 
-def test_the_page_says_what_may_run_and_load(tmp_path: Path) -> None:
+def test_page_declares_what_may_run_and_load(tmp_path: Path) -> None:
     _, page = written(tmp_path, "retrieval", TEXTS)
     text = page.read_text()
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', text)

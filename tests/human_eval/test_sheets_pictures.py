@@ -1,4 +1,4 @@
-"""Pictures of sheets: what an item shows and hides, the frame it is seen in, figures with words as text."""
+"""Pictures of sheets: what an item shows and hides, the choice of its frame, figures with words as text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TEXTS = tuple(f"thing {k}" for k in range(12))
 
 
 @pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning", "questions"])
-def test_the_picture_of_an_item_is_small_and_shows_the_object(painted_source: RunSource, kind: Any) -> None:
+def test_picture_of_an_item_is_small_and_shows_the_object(painted_source: RunSource, kind: Any) -> None:
     draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
     if kind in ("reasoning", "questions"):
         draft = replace(draft, names=("chair", "sofa", "", ""), others=(0,))
@@ -49,7 +49,7 @@ def frame_of(depth_m: np.ndarray, x_m: float = 0.0) -> Frame:
     return Frame(0, 0.0, np.zeros((30, 40, 3), np.uint8), depth_m, pose, camera)
 
 
-def test_the_best_view_shows_the_object_and_hides_it_behind_nothing() -> None:
+def test_best_view_shows_the_object_without_occlusion() -> None:
     wall, near = np.full((30, 40), 2.0, np.float32), np.full((30, 40), 0.5, np.float32)
     points = np.array([[x, y, 2.0] for x in np.linspace(-0.2, 0.2, 9) for y in np.linspace(-0.2, 0.2, 9)], np.float32)
     frames = [frame_of(near), frame_of(wall, x_m=2.1), frame_of(wall)]
@@ -72,7 +72,7 @@ def test_frame_mask_contains_pixels_nearest_to_the_instance() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["pdf", "svg"])
-def test_a_figure_has_its_words_as_text(
+def test_figure_contains_its_words_as_text(
     painted_folder: Path, suffix: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(painted_folder)
@@ -96,7 +96,7 @@ def test_a_figure_has_its_words_as_text(
         assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2
 
 
-def test_scenes_drawn_in_processes_give_the_pictures_in_order(painted_source: RunSource, painted_folder: Path) -> None:
+def test_scenes_drawn_in_parallel_give_the_pictures_in_order(painted_source: RunSource, painted_folder: Path) -> None:
     drafts = [
         replace(one, scene="painted/a", methods=("collector",), rows=(k,))
         for k, one in enumerate(drafts_of("retrieval", TEXTS[:3]))

@@ -1,4 +1,4 @@
-"""Sheets as they are made, filled by people of known error rates as table and as workbook, and scored."""
+"""Sheets as created, filled by simulated annotators with known error rates as table and workbook, and scored."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 
 
 def drafts(kind: SheetKind, n: int) -> list[Draft]:
-    """``n`` things to judge, of which the truth says by turns all that it can say."""
+    """``n`` items to judge, for which the ground truth has all possible judgements in turn."""
     found = []
     for k in range(n):
         right, other = ("right", "wrong") if k % 3 else ("wrong", "right")
@@ -43,7 +43,7 @@ def drafts(kind: SheetKind, n: int) -> list[Draft]:
 
 
 def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, as_workbook: bool) -> Path:
-    """The file of an annotator with every answer in it."""
+    """The file of an annotator with all answers."""
     rng = random.Random(name)
     truth = {one.id: one.automatic for one in key.items}
 
@@ -68,7 +68,7 @@ def fill(sheet: Sheet, key: Key, folder: Path, name: str, error_rate: float, *, 
     for cells in table[1:]:
         cells[table[0].index("answer")] = answer(cells[1], cells[3])
     with path.open("w", encoding="utf-8-sig", newline="") as stream:
-        csv.writer(stream, delimiter=";").writerows(table)  # as a spreadsheet of another country saves it
+        csv.writer(stream, delimiter=";").writerows(table)  # as saved by a spreadsheet with another locale
     return path
 
 
@@ -91,7 +91,7 @@ def test_annotator_answers_are_scored_end_to_end(kind: Any, tmp_path: Path, caps
     assert "no answers from annotator-3" in told.err and found["silent"] == ["annotator-3"]
     values = {(one["judge"], one["metric"]): (one["value"], one["n_items"]) for one in found["cells"]}
     metrics = {metric for _, metric in values}
-    assert found["n_judged"] == 24  # the 12 that all share, and 6 of one's own of each of two
+    assert found["n_judged"] == 24  # the 12 shared by all, and 6 of each of two annotators
     assert {metric: values["people", metric] for metric in metrics} == {m: values["automatic", m] for m in metrics}
     assert all(
         one["agreement"]["alpha"] == 1.0 and one["agreement"]["n_items"] % 12 == 0 for one in found["agreements"]

@@ -1,4 +1,4 @@
-"""From the judgements of annotators to accuracies: what is counted, what simulated people give, what is shown."""
+"""From the judgements of annotators to accuracies: counting, simulated annotators, and output."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def small() -> tuple[Sheet, Key]:
     return retrieval_set(8, ("ann", "bob"))
 
 
-# What simulated people give
+# Simulated annotators
 
 
 def test_error_free_annotators_reproduce_the_key() -> None:
@@ -54,7 +54,7 @@ def test_known_error_rates_give_the_known_accuracies_and_agreement() -> None:
     found = scored(sheet, key, answered(sheet, key, {"ann": first, "bob": second}, seed=3))
     people = cells_of(found)
     for scheme, rate in RATES.items():
-        # an error turns a right into a wrong and the reverse; the mean of two people of n items each
+        # an error turns right into wrong and vice versa; the mean of two annotators with n items each
         expected = sum(rate * (1 - e) + (1 - rate) * e for e in (first, second)) / 2
         variance = sum(e * (1 - e) for e in (first, second)) / 4 / 800
         assert people[scheme, "all"].value == pytest.approx(expected, abs=4 * variance**0.5)
@@ -87,16 +87,16 @@ def test_paired_test_matches_exact_sign_flip_test() -> None:
         assert paired_p(changes)[0] == pytest.approx(general(changes), rel=1e-12)
     # 5 to 20 of 25 that differ: 2 x sum of C(25, k) for k = 0..5, over 2^25
     assert paired_p(np.repeat([1.0, -1.0, 0.0], [20, 5, 9]))[0] == pytest.approx(2 * 68406 / 2**25)
-    # with halves, of two annotators, the signed sums of .5 .5 1: only +++ and --- are as far as 2
+    # with halves, from two annotators, the signed sums of .5 .5 1: only +++ and --- reach 2
     assert paired_p(np.array([0.5, 0.5, 1.0])) == (0.25, 0.25, True)
     thirds = rng.integers(-3, 4, 25) / 3
     assert paired_p(thirds)[0] == pytest.approx(general(thirds), rel=1e-9)
-    # many judges: no small step, so the general test
+    # many judges: no small step, so the general test is used
     odd = rng.random(12) - 0.3
     assert paired_p(odd)[0] == general(odd)
 
 
-def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> None:
+def test_paper_labels_and_merging_come_from_the_blinded_questions() -> None:
     truths = [
         ("right", "right", "well-merged"),
         ("wrong", "right", "well-merged"),
@@ -117,7 +117,7 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
     assert (test.left, test.right) == ("opensu3d label n", "opensu3d label n'")
     assert (test.n_items, test.n_differ, test.p) == (5, 3, 1.0)  # two better, one worse
     assert test.difference == pytest.approx(1 / 5)
-    # labels 1 and 2 are one question: 8 labels of 5 instances, of which two have the same label twice
+    # labels 1 and 2 are one question: 8 labels of 5 instances, two of which have the same label twice
     assert [one.ask for one in found.agreements] == ["label", "merging"]
     assert {one.ask: (one.n, one.n_equal, one.choices[0]) for one in found.confusions} == {
         "label": (8, 8, "right"),
@@ -125,7 +125,7 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
     }
 
 
-# What is shown
+# Output
 
 
 HOSTILE = '<script>alert(1)</script>=HYPERLINK("x") \\input{x} \u202ecba \U0001f600' + "x" * 10_000

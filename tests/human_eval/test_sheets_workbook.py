@@ -35,7 +35,7 @@ def test_workbook_cells_are_text_except_one_formula(hostile: tuple[GeneratedShee
     assert texts.count(b"<f>") == 1 and b"<script>" not in texts and b"<hyperlink" not in texts
 
 
-def test_answers_are_chosen_from_lists_and_all_else_is_locked(hostile: tuple[GeneratedSheets, bytes]) -> None:
+def test_answers_are_chosen_from_lists_and_other_cells_are_locked(hostile: tuple[GeneratedSheets, bytes]) -> None:
     page = openpyxl.load_workbook(io.BytesIO(hostile[1]))["answers"]
     letter = "ABCDEFGHI"[COLUMNS.index("answer")]
     lists = {

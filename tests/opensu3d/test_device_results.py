@@ -1,4 +1,4 @@
-"""What a run computes on a torch device, beside the CPU: labels and cosines, the embedded encoder."""
+"""Results on a torch device compared with the CPU: labels and cosines, the embedded encoder."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from su3d_bench.cli.main import main
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
-TORCH_ON_CPU = "cpu:0"  # torch's name of the CPU that is not "cpu", for which the package does without torch
+TORCH_ON_CPU = "cpu:0"  # torch's other name of the CPU; for "cpu" the package does not use torch
 on_each_device = pytest.mark.parametrize("device", [TORCH_ON_CPU, pytest.param("cuda:0", marks=pytest.mark.gpu)])
 
 
 @on_each_device
-def test_a_device_chooses_the_labels_of_the_cpu_where_classes_are_equally_near_too(device: str) -> None:
+def test_device_labels_match_the_cpu_also_for_ties(device: str) -> None:
     rng = np.random.default_rng(0)
     text = rng.normal(size=(40, 96)).astype(np.float32)
-    text[7] = text[3]  # two classes of one feature: the first wins
+    text[7] = text[3]  # two classes with the same feature: the first wins
     features = rng.normal(size=(20_000, 96)).astype(np.float32)
     features[:50] = text[7] + rng.normal(0, 1e-8, (50, 96))
     features[9000:9100], features[9100] = 0, np.nan
@@ -31,7 +31,7 @@ def test_a_device_chooses_the_labels_of_the_cpu_where_classes_are_equally_near_t
 
 
 @on_each_device
-def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
+def test_device_cosines_match_the_cpu(device: str) -> None:
     rng = np.random.default_rng(1)
     features, text = rng.normal(size=(300, 512)).astype(np.float16), rng.normal(size=(70, 512))
     features[5], features[6, 3] = 0, np.inf
@@ -41,17 +41,17 @@ def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
 
 
 @on_each_device
-def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: str) -> None:
+def test_embedded_encoder_features_on_a_device_match_the_cpu(device: str) -> None:
     rng = np.random.default_rng(2)
     images = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((12, 40), (64, 64), (200, 90))] * 13
     texts = ["chair", "a plant on the shelf", "the", ""]
     here, there = EmbeddedEncoder(), EmbeddedEncoder(device=device)
-    tolerance = 1e-5 if device == TORCH_ON_CPU else 1e-4  # a GPU's convolutions are by other algorithms
+    tolerance = 1e-5 if device == TORCH_ON_CPU else 1e-4  # a GPU uses other convolution algorithms
     np.testing.assert_allclose(there.encode_images(images), here.encode_images(images), rtol=0, atol=tolerance)
     np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=tolerance)
 
 
-def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
+def test_run_on_a_missing_gpu_fails_early_with_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch

@@ -1,4 +1,4 @@
-"""The reference pipeline beside the paper's text written as a program: one map, on random problems and on rooms."""
+"""The reference pipeline compared with a literal program of the paper's text, on random problems and on rooms."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ OF_ONE_TEST = 60
 SCENE = SceneInfo("made", "random", 5, 7, "rendered-rooms")
 
 
-SAME_POINT_M = 1e-5  # maps are given in float32
+SAME_POINT_M = 1e-5  # maps are stored in float32
 
 
 def differences(found: Instances, program: PaperProgram) -> list[str]:
-    """A line for each difference between a method's map and the paper's; empty where they are one.
+    """One line per difference between a method's map and the paper's; empty if they are equal.
 
     Two maps are one where they hold the same points, and the same sets of them with the same views, name, caption,
     feature, box, centroid and score. Which numbers the ids are is free, but each is one instance's.
@@ -55,7 +55,7 @@ def differences(found: Instances, program: PaperProgram) -> list[str]:
 
 
 def matched(points: Array, others: Array) -> Array | None:
-    """The row of ``points`` that each of ``others`` is, or None where they are not the same points."""
+    """The row of ``points`` that equals each of ``others``, or None if the points differ."""
     if len(points) != len(others):
         return None
     if not len(points):
@@ -66,7 +66,7 @@ def matched(points: Array, others: Array) -> Array | None:
 
 
 def unlike(found: Instances, k: int, thing: Thing) -> Iterator[str]:
-    """What instance ``k`` has otherwise than ``thing``, its points aside."""
+    """The differences of instance ``k`` from ``thing``, except for its points."""
     views = [tuple(view) for view in found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist()]
     assert found.features is not None
     if views != thing.views:
@@ -92,7 +92,7 @@ def both(problem: Problem) -> tuple[OpenSU3D, PaperProgram]:
 
 
 @pytest.mark.parametrize("first", [0, *(pytest.param(n, marks=pytest.mark.proof) for n in (60, 120, 180, 240))])
-def test_the_pipeline_gives_the_map_of_the_papers_text_on_random_problems(first: int) -> None:
+def test_pipeline_matches_the_papers_text_on_random_problems(first: int) -> None:
     for seed in range(first, first + OF_ONE_TEST):
         problem = random_problem(seed)
         method, program = both(problem)
@@ -119,7 +119,7 @@ FAULTS: dict[str, Callable[[Instances], Instances]] = {
 }
 
 
-def test_a_map_that_is_not_the_papers_is_noticed() -> None:
+def test_map_that_differs_from_the_papers_is_detected() -> None:
     problem = random_problem(0)
     method, program = both(problem)
     for frame, detections in problem.images:
@@ -141,13 +141,13 @@ OF_THE_PAPER = {
 }  # fmt: skip
 
 
-def test_the_defaults_are_the_papers() -> None:
+def test_defaults_are_those_of_the_paper() -> None:
     effective = OpenSU3DConfig().effective()
     assert {name: effective[name] for name in OF_THE_PAPER} == OF_THE_PAPER
 
 
 class SideBySide(OpenSU3D):
-    """OpenSU3D beside ``PaperProgram``, frame by frame; it refuses to give a map that the paper's text does not."""
+    """OpenSU3D next to ``PaperProgram``, frame by frame; it fails if its map differs from that of the paper's text."""
 
     name = "side-by-side"
     warms_up = False
@@ -169,7 +169,7 @@ class SideBySide(OpenSU3D):
 
 
 def run_side_by_side(out: Path, profile: str, *words: str) -> None:
-    """A run with each fusion scheme, which fails where its map is not the paper's."""
+    """A run with each fusion scheme, which fails if its map is not the paper's."""
     methods = [f"{__file__}:SideBySide@{scheme}" for scheme in SCHEMES]
     options = ["--protocols", "rooms-instance", "--profile", profile, "--jobs", "1", "--no-pictures", "--quiet"]
     assert main(["run", "--methods", *methods, *options, "--out", str(out), *words]) == 0
@@ -178,7 +178,7 @@ def run_side_by_side(out: Path, profile: str, *words: str) -> None:
 
 @pytest.mark.proof
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])
-def test_a_room_is_what_the_papers_text_makes_of_it(
+def test_room_map_matches_the_papers_text(
     profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
@@ -189,7 +189,7 @@ def test_a_room_is_what_the_papers_text_makes_of_it(
 @pytest.mark.proof
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])
 @pytest.mark.parametrize("room", ROOMS)
-def test_a_whole_room_is_what_the_papers_text_makes_of_it(
+def test_complete_room_map_matches_the_papers_text(
     room: str, profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))

@@ -1,4 +1,4 @@
-"""The whole pipeline on small scenes of rectangles before a wall: tracking, splitting, provenance, anytime maps."""
+"""The pipeline on small scenes of rectangles in front of a wall: tracking, splitting, provenance, anytime maps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONFIG = OpenSU3DConfig(border_px=1, border_reference_width=0)
 
 @dataclass(frozen=True)
 class Plate:
-    """A rectangle facing the camera: its lower and upper x and y and its depth, metres."""
+    """A rectangle facing the camera: its lower and upper x and y and its depth in metres."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -36,7 +36,7 @@ def look(
     names: Mapping[int, str] | None = None,
     scores: Mapping[int, float] | None = None,
 ) -> tuple[Frame, Detections]:
-    """A frame of plates before a wall at 3 m; detections in ascending key."""
+    """A frame of plates in front of a wall at 3 m; detections in ascending key."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth, owner = np.full((HEIGHT, WIDTH), 3.0), np.zeros((HEIGHT, WIDTH), np.int64)
     for key, plate in plates.items():
@@ -76,7 +76,7 @@ def run(views: list[tuple[Frame, Detections]], config: OpenSU3DConfig = CONFIG) 
 TWINS = {1: Plate((-0.6, -0.1), (-0.3, 0.3)), 2: Plate((0.1, 0.6), (-0.3, 0.3))}
 
 
-def test_two_objects_of_one_class_are_never_swapped() -> None:
+def test_two_objects_of_the_same_class_are_never_swapped() -> None:
     names = {1: "chair", 2: "chair"}
     cameras = [0.0, 0.5, -0.5, 0.9, -0.9, 0.2]
     found = run([look(TWINS, i, x, names=names) for i, x in enumerate(cameras)]).finish()
@@ -98,9 +98,9 @@ def test_name_and_score_come_from_the_views() -> None:
         for i, (name, score) in enumerate([("stool", 0.25), ("chair", 0.75), ("bench", 0.75)])
     ]
     found = run(views).finish()
-    assert found.names == ("chair",)  # the highest score, of equal ones the earliest image
+    assert found.names == ("chair",)  # the highest score; ties: the earliest image
     assert found.scores.tolist() == [1.0]  # the paper gives instances no score
-    # of the last, three views of the five that the top m could hold
+    # for the last rule: three views, while the top m could have five
     for rule, expected in (("mean", 1.75 / 3), ("max", 0.75), ("top-m-sum", 1.75 / 5)):
         scored = run(views, CONFIG.model_copy(update={"instance_score": rule})).finish()
         assert scored.scores.tolist() == [pytest.approx(expected)]
@@ -108,7 +108,7 @@ def test_name_and_score_come_from_the_views() -> None:
     assert OpenSU3D().caveat is None
 
 
-def test_an_over_split_mask_heals_into_the_instance_it_belongs_to() -> None:
+def test_over_split_mask_is_merged_into_its_instance() -> None:
     whole = {1: Plate((-0.5, 0.5), (-0.3, 0.3))}
     halves = {1: Plate((-0.5, 0.0), (-0.3, 0.3)), 2: Plate((0.0, 0.5), (-0.3, 0.3))}
     found = run([look(whole, 0), look(halves, 1)]).finish()
@@ -116,7 +116,7 @@ def test_an_over_split_mask_heals_into_the_instance_it_belongs_to() -> None:
     assert found.views.tolist() == [[0, 0], [1, 0], [1, 1]]
 
 
-def test_clusters_near_the_largest_split_off_with_the_views_that_hit_them_and_the_rest_is_noise() -> None:
+def test_large_clusters_become_instances_with_their_views_and_the_rest_is_noise() -> None:
     """One mask over three separate plates: 0.30 m2, 0.27 m2 (90 %) and 0.06 m2 (20 %)."""
     parts = [Plate((-0.9, -0.4), (-0.3, 0.3)), Plate((-0.2, 0.25), (-0.3, 0.3)), Plate((0.5, 0.6), (-0.3, 0.3))]
     frame, detections = look(dict(enumerate(parts, start=1)), 0)
@@ -144,7 +144,7 @@ def test_clusters_near_the_largest_split_off_with_the_views_that_hit_them_and_th
     assert len(run([(frame, together)], CONFIG.model_copy(update={"split_fraction": 0.95})).finish()) == 1
 
 
-def test_finishing_midway_changes_nothing() -> None:
+def test_intermediate_finish_changes_nothing() -> None:
     views = [look(TWINS, i, x) for i, x in enumerate([0.0, 0.3, -0.3])]
     undisturbed = contents(run(views).finish())
     method = OpenSU3D(CONFIG)
@@ -159,8 +159,8 @@ def test_finishing_midway_changes_nothing() -> None:
     assert midway[0] == contents(run(views[:1]).finish())
 
 
-def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: pytest.LogCaptureFixture) -> None:
-    """A strip of 4 px lies in the ring of a smaller plate; the wall at 3 m lies beyond 2.5 m."""
+def test_detections_lost_in_rings_and_too_far_pixels_are_counted_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """A strip of 4 px is in the ring of a smaller plate; the wall at 3 m is beyond 2.5 m."""
     plates = {1: Plate((-0.6, 0.6), (-0.045, 0.02)), 2: Plate((-0.05, 0.05), (0.03, 0.1))}
     frame, detections = look({**plates, 3: Plate((-0.9, -0.7), (-0.5, 0.5))}, 0)
     wide = replace(detections, masks=detections.masks.copy())
@@ -179,7 +179,7 @@ def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: 
     assert method.losses == {} and len(caplog.records) == 2
 
 
-def test_points_of_no_instance_are_in_the_map_and_in_no_mask() -> None:
+def test_points_without_an_instance_are_in_the_map_but_in_no_mask() -> None:
     found = run([look(TWINS, 0)]).finish()
     on_wall = found.points[:, 2] > 2.5
     assert on_wall.any()
@@ -190,8 +190,8 @@ def test_points_of_no_instance_are_in_the_map_and_in_no_mask() -> None:
     assert not (dropped.points[:, 2] > 2.5).any()
 
 
-def test_a_ring_keeps_out_of_the_matching_and_falls_to_its_owner_to_no_instance_or_nowhere() -> None:
-    """A small plate lies on a large one, 1 mm before it; the ring around it is 10 px, 17 cm there."""
+def test_ring_pixels_are_not_matched_and_go_to_owner_background_or_nowhere() -> None:
+    """A small plate is 1 mm in front of a large one; the ring around it is 10 px, which is 17 cm there."""
     plates = {1: Plate((-0.8, 0.8), (-0.6, 0.6)), 2: Plate((-0.1, 0.1), (-0.1, 0.1), 1.999)}
     n_points = {}
     for choice in ("owner", "background", "drop"):

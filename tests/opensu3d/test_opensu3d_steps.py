@@ -1,4 +1,4 @@
-"""The steps of OpenSU3D by hand: back-projection, the image of ids, association, fusion, clusters."""
+"""The steps of OpenSU3D on hand-computed values: back-projection, the ID image, association, fusion, clusters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def random_depth() -> Float32Array:
     return np.random.default_rng(0).uniform(0.5, 4, (24, 32)).astype(np.float32)
 
 
-def test_back_projection_is_the_equation_pixel_by_pixel_in_row_major_order() -> None:
+def test_back_projection_follows_the_equation_in_row_major_order() -> None:
     depth_m, pixels = random_depth(), np.random.default_rng(1).random((24, 32)) < 0.3
     expected = []
     for v, u in zip(*np.nonzero(pixels), strict=True):
@@ -58,7 +58,7 @@ def rectangle(rows: slice, columns: slice, height: int = 40, width: int = 60) ->
     return mask
 
 
-def test_a_smaller_mask_shows_over_a_larger_one_whatever_their_order() -> None:
+def test_smaller_mask_is_visible_over_a_larger_one_in_any_order() -> None:
     large, small = rectangle(slice(5, 35), slice(5, 55)), rectangle(slice(10, 20), slice(10, 20))
     for masks, of_large, of_small in (([large, small], 0, 1), ([small, large], 1, 0)):
         image = paint(np.stack(masks), 0, "disc").ids
@@ -67,7 +67,7 @@ def test_a_smaller_mask_shows_over_a_larger_one_whatever_their_order() -> None:
         assert (image[~large] == NO_DETECTION).all()
 
 
-def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pixel() -> None:
+def test_ring_of_a_small_mask_erases_only_the_large_mask_around_it() -> None:
     large, small = rectangle(slice(0, 40), slice(0, 60)), rectangle(slice(20, 21), slice(30, 31))
     image = paint(np.stack([large, small]), 3, "disc")
     rows, columns = np.mgrid[:40, :60]
@@ -80,7 +80,7 @@ def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pi
 
 
 @pytest.mark.parametrize(("width", "reference", "expected"), [(1200, 1200, 20), (640, 1200, 11), (640, 0, 20)])
-def test_the_border_takes_the_same_share_of_every_image(width: int, reference: int, expected: int) -> None:
+def test_border_is_the_same_fraction_of_every_image(width: int, reference: int, expected: int) -> None:
     assert OpenSU3DConfig(border_reference_width=reference).border_in(width) == expected
 
 
@@ -88,7 +88,7 @@ def overlaps_of(best: list[int], shared: list[int], n_frame: list[int]) -> Overl
     return Overlaps(np.arange(len(best), dtype=np.int32), np.array(n_frame), np.array(best, np.int32), np.array(shared))
 
 
-def test_the_best_scene_segment_is_the_one_with_most_matched_pairs() -> None:
+def test_best_scene_segment_has_the_most_matched_pairs() -> None:
     segment = np.array([2, 2, 2, 2, 2, 5, 5, 9], np.int32)
     matched_id = np.array([7, 7, 3, 0, 7, 3, 3, 0], np.int32)
     overlaps = count_overlaps(segment, matched_id)
@@ -98,7 +98,7 @@ def test_the_best_scene_segment_is_the_one_with_most_matched_pairs() -> None:
     assert overlaps.shared.tolist() == [3, 2, 0]
 
 
-def test_of_scene_segments_with_equally_many_pairs_the_lower_id_is_best() -> None:
+def test_scene_segments_with_equally_many_pairs_prefer_the_lower_id() -> None:
     overlaps = count_overlaps(np.zeros(5, np.int32), np.array([8, 4, 8, 4, 11], np.int32))
     assert (overlaps.best.tolist(), overlaps.shared.tolist()) == ([4], [2])
 
@@ -111,12 +111,12 @@ def test_of_scene_segments_with_equally_many_pairs_the_lower_id_is_best() -> Non
         ("as-printed", [1.0, 1.0, 0.0]),  # max(c) / min(c_f, max(c)), with c_f never below the matched pairs
     ],
 )
-def test_each_rule_gives_its_ratio(rule: OverlapRule, expected: list[float]) -> None:
+def test_each_overlap_rule_gives_its_ratio(rule: OverlapRule, expected: list[float]) -> None:
     overlaps = overlaps_of([4, 6, 0], [30, 30, 0], [100, 60, 50])
     np.testing.assert_allclose(overlap_ratios(overlaps, np.array([40, 500, 0]), rule), expected)
 
 
-def test_a_ratio_of_exactly_the_threshold_joins_and_one_below_does_not() -> None:
+def test_ratio_equal_to_the_threshold_joins_and_one_below_does_not() -> None:
     overlaps = overlaps_of([4, 6, 0], [3, 3, 0], [10, 11, 5])
     ratios = overlap_ratios(overlaps, np.array([10, 11, 0]), "smaller-segment")
     ids, next_id = assign_ids(overlaps, ratios, 0.3, 20)
@@ -124,7 +124,7 @@ def test_a_ratio_of_exactly_the_threshold_joins_and_one_below_does_not() -> None
     assert next_id == 22
 
 
-def test_two_frame_segments_may_take_one_scene_segment() -> None:
+def test_two_frame_segments_may_join_one_scene_segment() -> None:
     ids, next_id = assign_ids(overlaps_of([4, 4], [9, 8], [10, 10]), np.array([0.9, 0.8]), 0.3, 5)
     assert (ids.tolist(), next_id) == ([4, 4], 5)
 
@@ -132,7 +132,7 @@ def test_two_frame_segments_may_take_one_scene_segment() -> None:
 CROPS = np.array([[[0.6, 0.8], [1.0, 0.0], [0.0, 1.0]]])  # one region, crops at ratios 0.8, 1.0, 1.2
 
 
-def test_weighted_multi_scale_fusion_weighs_by_the_cosine_with_the_crop_at_ratio_one() -> None:
+def test_weighted_multi_scale_fusion_uses_the_cosine_with_the_crop_at_ratio_one() -> None:
     # cosines with (1, 0): 0.6, 1, 0
     expected = [[(0.6 * 0.6 + 1.0) / 3, 0.6 * 0.8 / 3]]
     np.testing.assert_allclose(fuse_scales(CROPS, (0.8, 1.0, 1.2), "weighted"), expected)
@@ -155,7 +155,7 @@ def test_global_multi_view_fusion_adds_the_weighted_global_feature_inside_the_me
         ("scheme4-narrow", Fusion("weighted", "global", (0.8, 1.0, 1.2))),
     ],
 )
-def test_the_schemes_are_the_papers(scheme: Scheme, expected: Fusion) -> None:
+def test_schemes_are_those_of_the_paper(scheme: Scheme, expected: Fusion) -> None:
     config = OpenSU3DConfig(scheme=scheme)
     assert config.fusion == expected
     assert config.needs.crop_ratios == expected.crop_ratios
@@ -167,19 +167,19 @@ def assert_same_labels(points: Float64Array, eps: float, min_points: int) -> Non
     np.testing.assert_array_equal(cluster(points, config), expected)
 
 
-# Steps of a quarter of eps put many points at exactly eps from each other; binary fractions, of which none is rounded.
+# Steps of a quarter of eps put many points at exactly eps from each other; binary fractions are not rounded.
 lattice = st.lists(st.tuples(*[st.integers(-12, 12)] * 3), min_size=1, max_size=120)
 
 
 @settings(max_examples=60, deadline=None)
 @given(lattice, st.sampled_from([0.0, -3.75, 1e4]), st.sampled_from([0.125, 0.25]), st.integers(1, 12))
-def test_labels_are_those_of_scikit_learn_on_lattices(
+def test_cluster_labels_match_scikit_learn_on_lattices(
     points: list[tuple[int, ...]], offset: float, eps: float, min_points: int
 ) -> None:
     assert_same_labels(np.array(points, np.float64) * eps / 4 + offset, eps, min_points)
 
 
-def test_a_border_point_between_two_clusters_belongs_to_the_first() -> None:
+def test_border_point_between_two_clusters_belongs_to_the_first() -> None:
     row = np.column_stack([np.arange(5) * 0.02, np.zeros((5, 2))])
     other = row + np.array([0.26, 0, 0])
     between = np.array([[0.17, 0, 0]])  # 0.09 from the nearest of either

@@ -1,4 +1,4 @@
-"""The voxel map: the pairs of a KD-tree, constant density, and no step that looks at the whole map."""
+"""The voxel map: equal to a KD-tree, constant density, and no step that scans the whole map."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def map_of(points: Float64Array, eps: float = EPS, ids: Int64Array | None = None
 
 
 def kd_tree_pairs(points: Float64Array, queries: Float64Array, eps: float = EPS) -> Int64Array:
-    """A KD-tree's answer, of equally near points the lowest index."""
+    """The result of a KD-tree; ties: the lowest index."""
     tree = cKDTree(points)
     distance, index = tree.query(queries, distance_upper_bound=eps)
     found = np.where(np.isfinite(distance), index, -1)
@@ -36,7 +36,7 @@ def kd_tree_pairs(points: Float64Array, queries: Float64Array, eps: float = EPS)
 
 
 @pytest.mark.parametrize("offset", [0.0, -3.7, 12345.678, -250000.0])
-def test_matching_gives_the_pairs_of_a_kd_tree_on_random_surfaces(offset: float) -> None:
+def test_matching_equals_a_kd_tree_on_random_surfaces(offset: float) -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.5, 0.5, (3000, 3)) * [1, 1, 0.05] + offset
     queries = rng.uniform(-0.6, 0.6, (2000, 3)) * [1, 1, 0.06] + offset
@@ -51,7 +51,7 @@ lattice = st.lists(st.tuples(*[st.integers(-9, 9)] * 3), min_size=1, max_size=60
 
 @settings(max_examples=150, deadline=None)
 @given(lattice, lattice, st.sampled_from([0.0, -1.28, 0.32, 1e4, -0.02]), st.sampled_from([0.25, 0.02, 0.1]))
-def test_matching_gives_the_pairs_of_a_kd_tree_on_lattices(
+def test_matching_equals_a_kd_tree_on_lattices(
     points: list[tuple[int, ...]], queries: list[tuple[int, ...]], offset: float, eps: float
 ) -> None:
     placed = np.array(points, np.float64) * eps / 2 + offset
@@ -60,7 +60,7 @@ def test_matching_gives_the_pairs_of_a_kd_tree_on_lattices(
 
 
 @pytest.mark.parametrize("n_threads", [2, 3, 64])
-def test_matching_is_the_same_on_any_number_of_threads(n_threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matching_is_independent_of_the_number_of_threads(n_threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(6)
     filled = map_of(rng.uniform(0, 2, (50_000, 3)) * [1, 1, 0.01])
     queries = rng.uniform(0, 2, (4 * ROWS_PER_THREAD + 1, 3)) * [1, 1, 0.01]
@@ -77,7 +77,7 @@ def test_matching_is_the_same_on_any_number_of_threads(n_threads: int, monkeypat
     ("density", "placed", "ids"),
     [("scene", [0, 0, 1, 2], [2, 3, 4]), ("frame", [0, -1, 1, 2], [1, 3, 4]), ("all", [0, 1, 2, 3], [1, 2, 3, 4])],
 )
-def test_of_two_points_in_one_voxel_the_first_the_second_or_neither_goes(
+def test_density_decides_which_of_two_points_in_a_voxel_is_dropped(
     density: Density, placed: list[int], ids: list[int]
 ) -> None:
     filled = VoxelMap(EPS, density)
@@ -88,7 +88,7 @@ def test_of_two_points_in_one_voxel_the_first_the_second_or_neither_goes(
 
 
 @pytest.mark.parametrize("density", ["scene", "frame"])
-def test_density_stays_constant_and_memory_bounded_however_often_a_surface_is_seen(density: Density) -> None:
+def test_density_is_constant_and_memory_bounded_for_repeated_views(density: Density) -> None:
     rng = np.random.default_rng(0)
     filled = VoxelMap(EPS, density)
     n_bytes = []
@@ -106,9 +106,7 @@ seen = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=12)  #
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(seen, max_size=5), st.sampled_from(["scene", "frame", "all"]))
-def test_the_map_is_the_list_of_points_from_which_those_that_go_are_deleted(
-    views: list[list[tuple[int, int]]], density: Density
-) -> None:
+def test_map_equals_a_point_list_with_deletions(views: list[list[tuple[int, int]]], density: Density) -> None:
     filled, expected = VoxelMap(EPS, density), list[tuple[float, int]]()
     for view in views:
         x = np.array([(voxel + 0.1 + 0.05 * k) * EPS for k, (voxel, _) in enumerate(view)])
@@ -122,10 +120,10 @@ def test_the_map_is_the_list_of_points_from_which_those_that_go_are_deleted(
     assert found == expected
 
 
-def test_of_equally_near_points_the_one_that_came_first_matches_wherever_it_is_kept() -> None:
+def test_oldest_of_equally_near_points_matches_wherever_it_is_stored() -> None:
     filled = VoxelMap(EPS)
     filled.insert(np.array([[0.012, 0, 0], [-0.01, 0, 0]]), np.array([1, 2], np.int32))
-    filled.insert(np.array([[0.01, 0, 0]]), np.array([3], np.int32))  # takes the place of the first of all
+    filled.insert(np.array([[0.01, 0, 0]]), np.array([3], np.int32))  # replaces the very first point
     assert filled.ids.tolist() == [3, 2]
     assert filled.by_age.tolist() == [1, 0]
     assert filled.nearest(np.zeros((1, 3))).tolist() == [1]
@@ -137,7 +135,7 @@ def test_of_equally_near_points_the_one_that_came_first_matches_wherever_it_is_k
     st.tuples(*[st.integers(-40, 40)] * 3),
     st.tuples(*[st.integers(0, 60)] * 3),
 )
-def test_points_inside_a_box_are_counted_by_id_with_its_borders(
+def test_points_inside_a_closed_box_are_counted_by_id(
     lattice_points: list[tuple[int, ...]], corner: tuple[int, ...], size: tuple[int, ...]
 ) -> None:
     points = np.array(lattice_points, np.float64) * 0.016
@@ -150,8 +148,8 @@ def test_points_inside_a_box_are_counted_by_id_with_its_borders(
     assert counts.tolist() == [np.count_nonzero(inside & (ids == one)) for one in wanted]
 
 
-def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() -> None:
-    """Voxels and blocks that are looked into, counted: the same with 40 times the points elsewhere."""
+def test_matching_and_counting_cost_is_independent_of_map_size() -> None:
+    """The number of visited voxels and blocks is the same with 40 times the points elsewhere."""
     rng = np.random.default_rng(1)
     room = rng.uniform(0, 2, (5_000, 3)) * [1, 1, 0.01]
     building = rng.uniform(-60, 60, (200_000, 3)) * [1, 1, 0.01] + [0, 0, 9.0]
@@ -167,7 +165,7 @@ def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() 
     assert max(visits[0][1], visits[1][1]) <= 13 * 13 * 1
 
 
-def test_a_point_that_is_not_finite_or_far_out_is_refused() -> None:
+def test_non_finite_or_too_distant_point_is_rejected() -> None:
     for bad in (np.nan, np.inf, -1e9):
         points = np.array([[0.0, 0, 0], [0.0, bad, 0]])
         with pytest.raises(DataError, match="in metres"):

@@ -1,4 +1,4 @@
-"""Ids of a map that is asked for while it grows: one that was shown never names another object."""
+"""Ids of a map that is requested while it grows: an id never moves to another object."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Marks = frozenset[tuple[int, ...]]
 
 
 def sequence(seed: int) -> Problem:
-    """A random problem in which objects fall into parts that are objects of their own."""
+    """A random problem in which objects split into parts that are separate objects."""
     problem = random_problem(seed)
     parts = {"density": "scene", "eps": EPS, "dbscan_eps": 0.1, "dbscan_min_points": 3, "split_fraction": 0.2}
     return Problem(problem.settings.model_copy(update=parts), problem.images)
 
 
 def maps(problem: Problem, asked_after: Iterable[int]) -> list[Instances]:
-    """The maps of one method, asked for after those images, the last for the final map."""
+    """The maps of one method, requested after those images, the last one being the final map."""
     method = OpenSU3D(problem.settings)
     method.start(SCENE)
     answers = []
@@ -45,7 +45,7 @@ def maps(problem: Problem, asked_after: Iterable[int]) -> list[Instances]:
 
 
 def marks_of(found: Instances) -> dict[int, tuple[Marks, Marks]]:
-    """Of each id the voxels that its object has points in, and the views that show it."""
+    """For each id the voxels with points of its object, and the views that show it."""
     voxels = np.floor(found.points.astype(float) / EPS).astype(int)
     marks = {}
     for k in range(len(found)):
@@ -59,7 +59,7 @@ def marks_in(rows: NDArray[Any]) -> Marks:
 
 
 def foreign_files(answers: Sequence[Instances]) -> list[int]:
-    """The ids that name, in two of ``answers``, things that share no place, or no view: a view is of one segment."""
+    """The ids that name, in two of ``answers``, objects without a common voxel, or view: a view is of one segment."""
     shown: dict[int, list[tuple[Marks, Marks]]] = {}
     for found in answers:
         for one, marks in marks_of(found).items():
@@ -75,7 +75,7 @@ FIRST = [0, *(pytest.param(n, marks=pytest.mark.proof) for n in (40, 80, 120, 16
 
 
 @pytest.mark.parametrize("first", FIRST)
-def test_no_id_names_two_objects_however_often_the_map_is_asked_for(first: int) -> None:
+def test_no_id_names_two_objects_however_often_the_map_is_requested(first: int) -> None:
     n_parts = 0
     for seed in range(first, first + OF_ONE_TEST):
         problem = sequence(seed)
@@ -84,11 +84,11 @@ def test_no_id_names_two_objects_however_often_the_map_is_asked_for(first: int) 
         assert (seed, foreign_files(answers)) == (seed, [])
         n_parts += sum(len(found.views) - len(marks_in(found.views)) for found in answers[:-1])
         assert contents(answers[-1]) == contents(answers[-2])
-    assert n_parts > OF_ONE_TEST  # views that several parts of an object share
+    assert n_parts > OF_ONE_TEST  # views shared by several parts of an object
 
 
 @pytest.mark.parametrize("first", FIRST)
-def test_asking_midway_changes_no_byte_of_the_final_map(first: int) -> None:
+def test_intermediate_maps_do_not_change_the_final_map(first: int) -> None:
     for seed in range(first, first + OF_ONE_TEST):
         problem = sequence(seed)
         undisturbed = maps(problem, ())[-1]

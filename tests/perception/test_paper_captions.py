@@ -1,4 +1,4 @@
-"""A run of the profile ``paper`` whose captions come from a vision model on loopback that fails in every way."""
+"""A run of the profile ``paper`` with captions from a local vision model that fails in every way."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import DESCRIBE
 from su3d_bench.store.predictions import read_prediction
 
-TIMEOUT_S = 1.5  # after it a hung connection is given up; long enough for good answers on a busy machine
+TIMEOUT_S = 1.5  # a hung connection is closed after this; long enough for good answers on a busy machine
 N_TRIES = 2
 
 
 class FailingModel:
-    """Answers each picture in its own way, in turn: well, with a refusal, in broken JSON, ...; counts the pictures."""
+    """Answers images in turn in different ways: well, with a refusal, in broken JSON, ...; counts the images."""
 
     KINDS = ("good", "refusal", "malformed", "429", "500", "hung", "good")
 
@@ -53,12 +53,12 @@ class FailingModel:
         return answers[kind]
 
     def n_sent(self, kind: str) -> set[int]:
-        """How often pictures of ``kind`` were sent."""
+        """How often images of ``kind`` were sent."""
         return {self.asked[url] for url, one in self.kinds.items() if one == kind}
 
 
 class Finished:
-    """A run that was made, and the server that it asked."""
+    """A finished run, and the server that it used."""
 
     def __init__(self, root: Path, models: Path, server: ChatServer) -> None:
         self.root, self.server, self.model = root, server, FailingModel()

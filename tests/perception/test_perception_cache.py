@@ -1,4 +1,4 @@
-"""The per-frame cache: what is stored, what is made anew, and that it never changes an answer."""
+"""The per-frame cache: what is stored, what is recomputed, and that it never changes a result."""
 
 from __future__ import annotations
 

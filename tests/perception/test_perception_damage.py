@@ -1,4 +1,4 @@
-"""Files of others that perception reads, damaged: read, or refused in one line that names the file."""
+"""Damaged external files are read by perception, or rejected in one line that names the file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PREPROCESSOR = {
 
 
 def encoder_spec(path: Path) -> object:
-    """The spec of a folder whose other file of settings is whole."""
+    """The spec of a folder whose other settings file is valid."""
     for name, content in (("config.json", CONFIG), ("preprocessor_config.json", PREPROCESSOR)):
         if name != path.name:
             (path.parent / name).write_text(json.dumps(content))
@@ -65,14 +65,14 @@ def encoder_spec(path: Path) -> object:
     ],
     ids=["encoder", "segmenter", "config", "preprocessor", "names", "words"],
 )
-def test_damaged_texts_are_read_or_refused(
+def test_damaged_texts_are_read_or_rejected(
     tmp_path: Path, name: str, content: str, read: Callable[[Path], object]
 ) -> None:
     path = tmp_path / name
     check(path, content.encode(), lambda: read(path))
 
 
-def test_damaged_arrays_and_images_are_read_or_refused(tmp_path: Path) -> None:
+def test_damaged_arrays_and_images_are_read_or_rejected(tmp_path: Path) -> None:
     stored = written(tmp_path, with_features=False)
     check(stored, stored.read_bytes(), lambda: read_stored(stored, still_life(40), CountingEncoder()), named="frame 40")
     image = write_image(tmp_path / "labels")

@@ -1,4 +1,4 @@
-"""ConceptGraphs' detections as perception: files written as its script writes them, and files that are damaged."""
+"""ConceptGraphs' detections as perception: files as written by its script, and damaged files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def masks() -> np.ndarray:
 
 
 def detections(**changes: Any) -> dict[str, Any]:
-    """What the script writes for three regions."""
+    """The output of the script for three regions."""
     features = np.zeros((3, 8), np.float32)
     features[[0, 1, 2], [1, 3, 5]] = 1
     return {
@@ -66,7 +66,7 @@ def test_regions_match_file_and_image_crops_are_ignored(tmp_path: Path) -> None:
 
 
 def test_one_pixel_wide_mask_is_valid_and_inverted_box_is_dropped(tmp_path: Path) -> None:
-    # SAM's box of a column of pixels, first to last, has no width; the original's filter_gobs looks at the mask's area.
+    # SAM's box of a column of pixels, first to last, has no width; the original's filter_gobs uses the mask's area.
     thin = np.zeros((2, *FRAME.depth_m.shape), bool)
     thin[0, 10:70, 33] = thin[1, 5:9, 5:9] = True
     features = np.eye(8, dtype=np.float32)[:2]
@@ -78,7 +78,7 @@ def test_one_pixel_wide_mask_is_valid_and_inverted_box_is_dropped(tmp_path: Path
     assert (crop_window(found.regions.boxes[0], 1.0, 160, 120) == [33, 10, 34, 69]).all(), "and can be cut out"
 
 
-def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:
+def test_frame_without_detections_has_no_regions(tmp_path: Path) -> None:
     empty = {key: np.zeros(0) for key in ("xyxy", "confidence", "class_id", "mask")}
     write(tmp_path, detections(**empty, image_crops=[], image_feats=[], text_feats=[]))
     found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

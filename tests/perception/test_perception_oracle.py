@@ -1,4 +1,4 @@
-"""Oracle masks, exact on meshes made by hand; their noise; the oracle method."""
+"""Oracle masks, exact on hand-made meshes; their noise; the oracle method."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WALL = (-3.0, 3.0, -3.0, 3.0, 2.0)
 
 
 def quad_mesh(*quads: tuple[float, float, float, float, float], instance: Sequence[int]) -> InstanceMesh:
-    """Rectangles (x0, x1, y0, y1, z) that face the camera, two triangles each, as instances of ascending class."""
+    """Rectangles (x0, x1, y0, y1, z) facing the camera, two triangles each, as instances of ascending class."""
     corners = [[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)] for x0, x1, y0, y1, z in quads]
     triangles = np.arange(0, 4 * len(quads), 4)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     known = sorted({i for i in instance if i})
@@ -51,12 +51,12 @@ def expected_square() -> Int32Array:
     return image
 
 
-def test_a_square_before_a_wall_is_projected_to_the_pixel() -> None:
+def test_square_in_front_of_a_wall_is_projected_exactly() -> None:
     projector = MeshProjector(quad_mesh(SQUARE, WALL, instance=[1, 2]), OracleConfig())
     assert np.array_equal(projector.instance_image(square_frame()), expected_square())
 
 
-def test_the_pose_moves_the_masks() -> None:
+def test_pose_moves_the_masks() -> None:
     frame = square_frame()
     frame.camera_to_world[0, 3] = 0.1  # ten pixels at 1 m
     frame.depth_m[:] = 2.0
@@ -79,7 +79,7 @@ def test_mesh_holes_are_filled_from_near_pixels_of_similar_depth() -> None:
     assert (MeshProjector(mesh, OracleConfig(fill_px=3)).instance_image(frame)[:, slit] == 0).all()
 
 
-def test_small_and_unannotated_surfaces_are_left_out() -> None:
+def test_small_and_unannotated_surfaces_are_dropped() -> None:
     small = (0.5, 0.55, 0.0, 0.05, 1.0)  # 5x5 pixels
     mesh = quad_mesh(SQUARE, WALL, small, instance=[1, 0, 3])
     frame = square_frame()
@@ -90,7 +90,7 @@ def test_small_and_unannotated_surfaces_are_left_out() -> None:
     assert regions.boxes.tolist() == [[30, 20, 70, 50]]
 
 
-def test_features_are_those_of_the_class_names_at_every_ratio(tmp_path: Path) -> None:
+def test_features_of_class_names_are_equal_at_every_ratio(tmp_path: Path) -> None:
     encoder = CountingEncoder()
     perception = build_perception(
         "oracle",

@@ -1,4 +1,4 @@
-"""Which profile a name stands for, names and captions, what is background, and crops around detections."""
+"""Profile selection, names and captions, background names, and crops around detections."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def scene(domain: ImageDomain) -> SceneInfo:
     return SceneInfo("any", "scene0", n_frames=1, stride=1, image_domain=domain)
 
 
-def test_an_unknown_profile_is_refused_with_the_nearest_name() -> None:
+def test_unknown_profile_error_suggests_the_nearest_name() -> None:
     with pytest.raises(ConfigError, match=r"unknown profile 'orcale'; did you mean 'oracle'\?"):
         resolve_profile("orcale", "camera")
     with pytest.raises(ConfigError, match="known: auto, embedded, paper, oracle, stored"):
         resolve_profile("foundation", "camera")
 
 
-def test_the_digest_moves_with_parameters_and_not_with_the_cache(tmp_path: Path) -> None:
+def test_digest_depends_on_parameters_but_not_on_the_cache(tmp_path: Path) -> None:
     def digest(**values: object) -> str:
         config = PerceptionConfig.model_validate(values)
         return build_perception(
@@ -61,7 +61,7 @@ def test_embedded_detections_are_named_captioned_and_scored(tmp_path: Path) -> N
     assert np.allclose(np.linalg.norm(found.crop_features, axis=2), 1, atol=1e-5)
 
 
-def test_regions_of_background_names_and_of_too_large_boxes_are_left_out() -> None:
+def test_background_regions_and_too_large_boxes_are_dropped() -> None:
     boxes = np.array([[0, 0, 10, 10], [0, 0, 100, 50], [0, 0, 100, 48]], np.float32)
     needs = PerceptionNeeds(background_names=("Wall",), max_box_fraction=0.96)
     assert regions_to_keep(["wall", "cup", "cup"], boxes, (50, 100), needs).tolist() == [2]
@@ -71,14 +71,14 @@ def test_regions_of_background_names_and_of_too_large_boxes_are_left_out() -> No
     assert regions_to_keep(["brick wall", "cup", "cup"], boxes, (50, 100), by_head).tolist() == [2]
 
 
-def test_colour_words_are_those_of_the_pixels_under_the_mask() -> None:
+def test_colour_words_match_the_pixels_under_the_mask() -> None:
     frame = still_life()
     assert colour_word(frame.rgb, frame.depth_m == 2.0) == "red"
     assert colour_word(frame.rgb, frame.depth_m == 2.5) == "green"
     assert colour_word(frame.rgb, np.zeros(frame.depth_m.shape, bool)) is None
 
 
-def test_a_feature_is_named_after_the_nearest_text_with_its_softmax_share() -> None:
+def test_feature_gets_the_nearest_name_and_its_softmax_confidence() -> None:
     encoder = CountingEncoder()
     words = ("cup", "chair", "indoor-plant")
     namer = Namer(NamingConfig(temperature=0.1), encoder, words)
@@ -101,7 +101,7 @@ NAMES = OpenSU3DConfig().background_names
         "wall and floor", "floor, wall", "wall (white)", "wall 2", "floor near the door",
     ],
 )  # fmt: skip
-def test_names_of_walls_floors_and_ceilings_are_background(name: str) -> None:
+def test_walls_floors_and_ceilings_are_background(name: str) -> None:
     assert is_background(name, NAMES)
 
 
@@ -117,7 +117,7 @@ def test_objects_on_walls_and_floors_are_not_background(name: str) -> None:
     assert not is_background(name, NAMES)
 
 
-def test_a_name_of_several_words_is_matched_as_a_whole() -> None:
+def test_multi_word_names_are_matched_as_a_whole() -> None:
     assert is_background("white base cabinets", ("base-cabinet",))
     assert not is_background("cabinet", ("base-cabinet",))
     assert not is_background("wall", ("",))
@@ -137,13 +137,13 @@ def test_a_name_of_several_words_is_matched_as_a_whole() -> None:
         ((0, 0, 100, 50), 4.0, (0, 0, 100, 50)),
     ],
 )
-def test_a_crop_is_the_box_scaled_about_its_centre_clipped_and_rounded(
+def test_crop_is_the_scaled_clipped_and_rounded_box(
     box: tuple[float, ...], ratio: float, expected: tuple[int, ...]
 ) -> None:
     assert tuple(crop_window(box, ratio, width=100, height=50)) == expected
 
 
-def test_a_crop_holds_the_pixels_of_its_window() -> None:
+def test_crop_contains_the_pixels_of_its_window() -> None:
     rgb = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
     (crop,) = crop_images(rgb, np.array([[2, 1, 6, 5]], np.float32), 0.5)
     assert np.array_equal(crop, rgb[2:4, 3:5])

@@ -1,4 +1,4 @@
-"""Detections made elsewhere: read as they were written, refused with a line that says what is wrong."""
+"""Stored detections: read as they were written, or rejected in one line with the reason."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def perception(folder: Path, encoder: CountingEncoder, tmp_path: Path) -> Percep
     return build_perception("stored", config, scene=SCENE, cache_root=tmp_path, mesh=None, encoder=encoder)
 
 
-def test_detections_come_back_as_they_were_written(tmp_path: Path) -> None:
+def test_detections_round_trip(tmp_path: Path) -> None:
     written(tmp_path, with_features=True)
     encoder = CountingEncoder()
     needs = PerceptionNeeds(crop_ratios=(1.5, 1.0))
@@ -73,7 +73,7 @@ def test_missing_features_and_ratios_are_computed(tmp_path: Path) -> None:
     assert encoder.n_images == 2
 
 
-def test_captions_default_to_the_template_and_background_is_left_out(tmp_path: Path) -> None:
+def test_captions_default_to_the_template_and_background_is_dropped(tmp_path: Path) -> None:
     path = written(tmp_path, with_features=False)
     arrays = dict(np.load(path))
     del arrays["captions"]
@@ -85,14 +85,14 @@ def test_captions_default_to_the_template_and_background_is_left_out(tmp_path: P
 
 
 BAD: list[tuple[dict[str, Any], str]] = [
-    ({"scores": None}, r"holds image_size, masks, boxes, names, captions; expected image_size, masks"),
+    ({"scores": None}, r"has image_size, masks, boxes, names, captions; expected image_size, masks"),
     ({"extra": np.zeros(1)}, r"captions, extra; expected image_size, masks"),
     ({"scores": np.array([0.9, 1.5])}, r"frame 40, region 1: score 1.5 is not in 0..1"),
     ({"scores": np.array([0.9])}, r"'masks' has shape \(2, 2400\); expected 2 axes and 1 rows"),
     ({"boxes": np.array([[0, 0, 9, 9], [100, 50, 321, 90]])}, r"region 1: box .* outside the 160x120 image"),
     ({"image_size": np.array([680, 1200])}, r"image_size is \[680, 1200\], the frame has height 120 and width 160"),
     ({"masks": np.zeros((2, 2400), np.uint8)}, r"region 0: the mask is empty"),
-    ({"names": np.array(["chair", " "])}, r"region 1: 'names' holds an empty text"),
+    ({"names": np.array(["chair", " "])}, r"region 1: 'names' is an empty text"),
     ({"encoder": np.array("x")}, r"all or none of crop_ratios, crop_features, global_feature, encoder"),
 ]
 
@@ -107,7 +107,7 @@ def test_file_errors_name_frame_and_region(tmp_path: Path, change: dict[str, Any
     assert "frame 40" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_features_of_another_encoder_or_length_are_refused(tmp_path: Path) -> None:
+def test_features_of_another_encoder_or_length_are_rejected(tmp_path: Path) -> None:
     path = written(tmp_path, with_features=True)
     arrays = dict(np.load(path))
     np.savez(path, allow_pickle=False, **{**arrays, "encoder": np.array("other-2")})
@@ -123,7 +123,7 @@ def test_features_of_another_encoder_or_length_are_refused(tmp_path: Path) -> No
         read_stored(path, still_life(40), CountingEncoder())
 
 
-def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+def test_pickled_objects_are_rejected(tmp_path: Path) -> None:
     path = written(tmp_path, with_features=False)
     arrays = dict(np.load(path))
     np.savez(path, **{**arrays, "names": np.array(["chair", None], object)})

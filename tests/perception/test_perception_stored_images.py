@@ -1,4 +1,4 @@
-"""Regions from label images: each value one region, names from a table or the encoder, faults with file and value."""
+"""Regions from label images: one region per value, names from a table or the encoder, errors with file and value."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def perception(folder: Path, cache: Path, names: str | None = None) -> Perceptio
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_each_value_above_zero_is_one_region_by_ascending_value(tmp_path: Path, dtype: Any) -> None:
+def test_each_value_above_zero_is_one_region_in_ascending_order(tmp_path: Path, dtype: Any) -> None:
     write_image(tmp_path, labels(dtype))
     found = images(tmp_path).frame(still_life(40)).regions
     assert found.names == ("", "")
@@ -57,9 +57,7 @@ def test_each_value_above_zero_is_one_region_by_ascending_value(tmp_path: Path, 
 
 
 @pytest.mark.parametrize(("file", "text"), [("names.toml", '132 = "box"\n'), ("names.json", '{"132": "box"}')])
-def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others(
-    tmp_path: Path, file: str, text: str
-) -> None:
+def test_named_values_keep_name_and_score_and_the_encoder_names_the_rest(tmp_path: Path, file: str, text: str) -> None:
     write_image(tmp_path)
     (tmp_path / file).write_text(text)
     needs = PerceptionNeeds(crop_ratios=(1.0, 1.5))

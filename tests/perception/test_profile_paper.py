@@ -1,4 +1,4 @@
-"""The profile ``paper`` as a whole on tiny models with random weights: rooms, real recordings, no models at all."""
+"""The complete profile ``paper`` on tiny models with random weights: rooms, real recordings, no models at all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_p
 from su3d_bench.store.predictions import read_prediction
 
 SCENE = SceneInfo("rgbd", "wall", 1, 1, "camera")
-# Random weights are sure of nothing, so little is asked of them.
+# Random weights give low scores, so the thresholds are low.
 OPEN: dict[str, Any] = {
     "grounded": {"boxes": {"box_threshold": 0.3, "text_threshold": 0.3}},
     "automatic": {
@@ -62,7 +62,7 @@ def no_models(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 FRAME = frame_of(blocks(96, 128))
 
 
-def test_named_regions_come_with_features_of_their_crops(models: Path, tmp_path: Path) -> None:
+def test_named_regions_have_features_of_their_crops(models: Path, tmp_path: Path) -> None:
     needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2), name_features=True)
     perception = built(config_of(models), tmp_path)
     found = perception.detect(FRAME, needs, Timer())
@@ -74,7 +74,7 @@ def test_named_regions_come_with_features_of_their_crops(models: Path, tmp_path:
     assert found.captions == tuple(f"{'an' if name[0] in 'aeiou' else 'a'} {name} in a scene" for name in found.names)
     assert (np.diff(found.scores) <= 0).all() and found.scores.max() <= 1
     assert found.score_scale == "published"
-    # Boxes of the masks, as the paper's crops are.
+    # Boxes of the masks, as in the paper's crops.
     rows = [np.flatnonzero(mask.any(axis=1)) for mask in found.masks]
     np.testing.assert_array_equal(found.boxes[:, [1, 3]], [[row[0], row[-1] + 1] for row in rows])
 
@@ -94,7 +94,7 @@ def test_named_regions_come_with_features_of_their_crops(models: Path, tmp_path:
                       "boxes": {"box_threshold": 0.25, "text_threshold": 0.25, "nms_iou": 0.4}}),
     ],
 )  # fmt: skip
-def test_each_methods_published_mask_settings_reach_the_models(
+def test_published_mask_settings_of_each_method_reach_the_models(
     models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, asked: dict[str, Any]
 ) -> None:
     class Asked(Exception):
@@ -121,7 +121,7 @@ def test_each_methods_published_mask_settings_reach_the_models(
     assert {key: found["boxes"][key] for key in inner} == inner
 
 
-def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(models: Path, tmp_path: Path) -> None:
+def test_same_frame_gives_the_same_bytes_from_models_and_cache(models: Path, tmp_path: Path) -> None:
     config, needs = config_of(models), PerceptionNeeds()
     uncached = config.model_copy(update={"cache": False})
     answers = [built(one, tmp_path).detect(FRAME, needs, Timer()) for one in (uncached, uncached, config, config)]
@@ -133,7 +133,7 @@ def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(mode
 
 def test_profile_reports_exactly_the_deviations_from_the_paper() -> None:
     ram = SimpleNamespace(tagger=SimpleNamespace(caveat=None))
-    encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
+    encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as reported by the encoder itself
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.paper_deviations(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
     assert profile_paper.paper_deviations(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
@@ -171,9 +171,7 @@ def test_missing_requested_tagger_fails_before_any_frame(models: Path, no_models
     check_models("embedded", PerceptionConfig())
 
 
-def test_a_room_runs_end_to_end(
-    models: Path, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_runs_end_to_end(models: Path, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     methods = ("opensu3d", "sam3d")  # named masks, and masks of everything

@@ -1,4 +1,4 @@
-"""What vertices and frames say of a thing in a scan: its sides, and words for its shape, colour and size."""
+"""The looks of an object in a scan from vertices and frames: its sides, and words for its shape, colour and size."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ GENERATOR = np.random.default_rng(0)
 
 
 def slab(length: float, width: float, height: float, degrees: float = 0.0) -> np.ndarray:
-    """Points (4000, 3) of a block, turned about the upright."""
+    """Points (4000, 3) of a block, rotated about the vertical axis."""
     points = GENERATOR.uniform(-0.5, 0.5, (4000, 3)) * (length, width, height)
     turn = np.deg2rad(degrees)
     rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
@@ -47,7 +47,7 @@ def polygon(n_corners: int, height: float = 0.5) -> np.ndarray:
 
 
 def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> Any:
-    """The words for its shape that are sure, and those that may be."""
+    """The certain words for its shape, and the possible ones."""
     looks = appearance_of(name, points, None, is_cut=is_cut)
     return looks.words & SHAPES, looks.maybe & SHAPES
 
@@ -67,21 +67,21 @@ def test_faces_are_round_square_or_rectangular() -> None:
 def test_intermediate_shapes_are_ambiguous() -> None:
     assert words_of("table", polygon(8)) == (frozenset(), {"round"})  # an octagon
     assert words_of("table", slab(1.18, 1, 0.7)) == (frozenset(), {"square", "rectangular"})
-    assert words_of("table", polygon(3)) == (frozenset(), frozenset())  # a triangle is none of them
+    assert words_of("table", polygon(3)) == (frozenset(), frozenset())  # a triangle has none of these shapes
 
 
 def test_cut_small_or_unsuitable_objects_have_no_shape() -> None:
     assert words_of("table", polygon(40), is_cut=True) == (frozenset(), SHAPES)
     assert words_of("table", slab(0.15, 0.15, 0.1)) == (frozenset(), SHAPES)
     assert words_of("chair", slab(0.5, 0.5, 0.9)) == (frozenset(), SHAPES)
-    assert words_of("cushion", slab(0.5, 0.2, 0.5)) == (frozenset(), SHAPES)  # a square one that leans
+    assert words_of("cushion", slab(0.5, 0.2, 0.5)) == (frozenset(), SHAPES)  # a leaning square one
 
 
 def test_colour_is_sure_only_under_all_lighting() -> None:
     red, blue = np.tile([200.0, 40.0, 40.0], (70, 1)), np.tile([50.0, 90.0, 180.0], (30, 1))
     assert possible_colours([np.concatenate([red, blue])]) == {"red", "blue"}
     assert possible_colours([np.concatenate([red, blue[:15]])]) == {"red"}
-    assert possible_colours([red[:3]]) == COLOURS  # too few pixels to say anything
+    assert possible_colours([red[:3]]) == COLOURS  # too few pixels for any word
     sight = Sight(0.1, "red", True, False, frozenset(("red", "pink")))
     looks = appearance_of("chair", slab(0.5, 0.5, 0.9), sight, is_cut=False)
     assert looks.words & COLOURS == {"red"} and looks.maybe & COLOURS == {"red", "pink"}
@@ -100,7 +100,7 @@ def test_clearly_long_and_tall_objects_are_recognized() -> None:
     assert build("box", 0.4, 0.4, 0.4) == (frozenset(), frozenset())
     assert build("blanket", 0.2, 0.2, 0.9) == build("door", 0.9, 0.1, 2.0) == (frozenset(), frozenset())
     assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
-    assert build("lamp", 0.2, 0.2, 0.5) == (frozenset(), {"tall"})  # such a one may be short for a lamp
+    assert build("lamp", 0.2, 0.2, 0.5) == (frozenset(), {"tall"})  # it may be short for a lamp
     assert build("keyboard", 0.5, 0.15, 0.03) == (frozenset(), {"long"})
 
 
@@ -128,7 +128,7 @@ def test_word_is_asked_only_if_unambiguous() -> None:
     assert set(asked(pair[0], doubtful)) == {"rectangular table"}
     assert asked(pair[0])["round table"] == ("property by name", (1,))
     three = asked(*pair, thing(3, "table", table, "round"))
-    assert three["round table"] == ("property", (1, 3))  # all that it is sure of
+    assert three["round table"] == ("property", (1, 3))  # all for which it is certain
 
 
 def test_scan_sizes_ignore_objects_cut_by_images() -> None:
@@ -166,14 +166,14 @@ LABELS = LabelSet("replica", (20, 80), ("chair", "table"))
 
 
 def wall_of_dots(instance: int, x: float, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) of a square 2 m before the camera, and the instance of each."""
+    """Points (N, 3) of a square 2 m in front of the camera, and the instance of each."""
     line = np.linspace(-side / 2, side / 2, 60)
     points = np.stack([*np.meshgrid(line + x, line), np.full((60, 60), 2.0)], axis=-1).reshape(-1, 3)
     return points, np.full(len(points), instance)
 
 
 def seen_by_one_camera(depth_m: float = 2.0) -> tuple[Any, GroundTruth]:
-    """A large red square and a small green one, on an image that is red on its left and green on its right."""
+    """A large red square and a small green one, in an image that is red on the left and green on the right."""
     parts = [wall_of_dots(1, -0.5, 0.8), wall_of_dots(2, 0.5, 0.05)]
     points, instance = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     semantic = np.where(instance == 1, 20, 80)
@@ -190,7 +190,7 @@ def seen_by_one_camera(depth_m: float = 2.0) -> tuple[Any, GroundTruth]:
     return dataset, truth
 
 
-def test_the_share_of_the_image_is_that_of_the_projected_square() -> None:
+def test_image_share_equals_that_of_the_projected_square() -> None:
     dataset, truth = seen_by_one_camera()
     seen = sights(dataset, "s", truth, 1)
     assert seen[1].share == pytest.approx((0.8 * FOCAL / 2) ** 2 / (HEIGHT * WIDTH), rel=0.1)  # 32 pixels a side
@@ -248,5 +248,5 @@ def test_object_at_image_border_is_cut(aside: float, is_cut: bool) -> None:
         ((228, 192, 48), "yellow"), ((228, 118, 36), "orange"), ((122, 62, 152), "purple"), ((232, 138, 166), "pink"),
     ],
 )  # fmt: skip
-def test_the_colours_of_the_rooms_have_their_words(rgb: tuple[int, int, int], word: str) -> None:
+def test_colours_of_the_rooms_have_the_expected_words(rgb: tuple[int, int, int], word: str) -> None:
     assert colour_word(np.tile(np.array(rgb, np.float64), (100, 1))) == word

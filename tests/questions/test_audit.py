@@ -1,4 +1,4 @@
-"""A sample of questions to look at: its draw, its sheets and pages, and what the verdicts add up to."""
+"""A sample of questions for auditing: how it is drawn, its sheets and pages, and the totals of the verdicts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ROOM = SceneMap(
 
 
 def audited(monkeypatch: pytest.MonkeyPatch, *questions: Question) -> list[AuditedQuestion]:
-    """The hand-made questions on ROOM, and those that templates make of it, as they are looked at."""
+    """The hand-written questions on ROOM and those generated from templates, as audited."""
     monkeypatch.setattr("su3d_bench.questions.audit.scene_objects", lambda *_: ROOM)
     monkeypatch.setattr("su3d_bench.questions.audit.fullest_truth", lambda *_: None)
     monkeypatch.setattr("su3d_bench.questions.audit.questions_of", lambda *_: questions)

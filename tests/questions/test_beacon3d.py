@@ -1,4 +1,4 @@
-"""Beacon3D: its files, its two evaluations to the last bit, chains made from a truth, and what is wrong with a file."""
+"""Beacon3D: its files, its two evaluations to the last bit, chains from ground truth, and invalid files."""
 
 from __future__ import annotations
 

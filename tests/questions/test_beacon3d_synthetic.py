@@ -1,4 +1,4 @@
-"""Beacon3D's questions made of a scene, and a language model that judges what was answered in words."""
+"""Beacon3D's questions generated from a scene, and a language model that judges free-form answers."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ ROOM = SceneMap(
 )
 
 
-# ---- made questions
+# ---- generated questions
 
 
 def test_each_object_has_three_questions_and_three_chains() -> None:
@@ -72,7 +72,7 @@ def test_each_object_has_three_questions_and_three_chains() -> None:
     assert sum(len(of_class) for of_class in fewer["room"].values()) == 1
 
 
-# By the number of the thing that it is about.
+# By the number of the object that it is about.
 ANSWERS = {
     (1, "What color is the desk?"): ("appearance", "Brown"),
     (1, "Is the desk blue?"): ("appearance", "No"),
@@ -104,7 +104,7 @@ def test_answers_are_those_of_the_boxes_and_colours() -> None:
 
 
 class Scripted:
-    """A language model that gives scores by the question."""
+    """A language model that returns a fixed score per question."""
 
     def __init__(self, scores: dict[str, Any]) -> None:
         self.scores, self.asked = scores, list[ChatRequest]()
@@ -116,7 +116,7 @@ class Scripted:
 
 
 def has_each_question_once(problem: Any) -> bool:
-    """Whether no two scenes share a question, by which the scripted model tells answers apart."""
+    """Whether no two scenes share a question, because the scripted model selects its score by the question."""
     entries = questions_of_objects(problem["metadata"], "here").entries
     asked = {(one.scene, one.question.lower()) for one in entries}
     return len({question for _, question in asked}) == len(asked)

@@ -1,4 +1,4 @@
-"""Files of text queries: both forms, each fault once, damaged copies, and a map scored under query-ap."""
+"""Files of text queries: both formats, each error once, damaged copies, and a map scored under query-ap."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ QUERIES = {"room0": (TextQuery("a place to sit", (1,)), TextQuery("something to 
 
 
 def write_map(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The two objects of a made scene as a map of an instance each, and features of the texts that ask for them."""
+    """The two objects of a synthetic scene as a map with one instance each, with the features of their query texts."""
     write_render(folder / "data")
     write_original(folder / "data", QUADS, [0, 0, 5, 5], TWO_OBJECTS)
     monkeypatch.setenv("SU3D_DATA", str(folder / "data"))
@@ -80,7 +80,7 @@ def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
         truth = flat(dataset, scene, variant)
         return replace(truth, points=truth.points + truth.points[:, 1:2] * np.array([[0.1, 0, 1]], np.float32))
 
-    monkeypatch.setattr(Replica, "ground_truth", tilted)  # what is flat has no volume, and no overlap in ScanRefer
+    monkeypatch.setattr(Replica, "ground_truth", tilted)  # flat objects have no volume, and no overlap in ScanRefer
     write_map(tmp_path, monkeypatch)
     rows = [
         ("a place to sit", 0),

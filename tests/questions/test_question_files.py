@@ -1,4 +1,4 @@
-"""Files of questions: own forms, those of ScanRefer, Nr3D and SQA3D, the paper's queries, hostile copies, the verb."""
+"""Question files: own formats, ScanRefer, Nr3D and SQA3D, the paper's queries, hostile copies, and the command."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_damaged_files_are_read_or_give_one_line_error(tmp_path: Path, name: str
         assert n_refused > 10
 
 
-def test_the_papers_queries_are_asked_of_its_13_scenes() -> None:
+def test_paper_queries_are_asked_for_its_13_scenes() -> None:
     found = paper_queries()
     assert len({one.scene for one in found}) == 13
     assert Counter(one.kind for one in found if one.scene == "replica/room0") == {

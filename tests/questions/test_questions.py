@@ -1,4 +1,4 @@
-"""Questions: their ids, what is generated from boxes and classes, labels and their other names."""
+"""Questions: their ids, generation from boxes and classes, labels and synonyms."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ THINGS = SceneMap(
 ASKED = {(one.kind, one.text): one.answers for one in generate("a/b", THINGS)}
 
 
-def test_an_id_depends_on_scene_kind_and_text_alone() -> None:
+def test_question_id_depends_only_on_scene_kind_and_text() -> None:
     one = new_question("a/b", "instance", "chair", (3, 1, 3), "x")
     assert one == replace(new_question("a/b", "instance", "chair", (1, 3), "y"), source="x")
     assert len({question_id(*key) for key in (("a/b", "instance", "chair"), ("a/b", "property", "chair"))}) == 2
@@ -59,7 +59,7 @@ def test_object_between_two_unique_objects_is_asked() -> None:
 
 
 def row_of(*things: MapObject) -> dict[tuple[str, str], tuple[int, ...] | None]:
-    """What is asked of things that stand about, with enough others that nothing is too common."""
+    """The questions on the given objects, with enough others that no question is too general."""
     others = [placed(100 + k, f"thing{k}", (20.0 + 3 * k, 20, 0), (0.5, 0.5, 0.5)) for k in range(9)]
     return {(one.kind, one.text): one.answers for one in generate("a/b", SceneMap((*things, *others)))}
 
@@ -75,7 +75,7 @@ def test_relation_shared_by_all_of_a_name_is_a_separate_kind() -> None:
     assert both["relative", "cup on a table"] == (3,) and ("relative by name", "cup on a table") not in both
 
 
-def test_a_pair_near_a_threshold_is_not_asked_about() -> None:
+def test_pair_near_a_threshold_is_not_asked_about() -> None:
     table = placed(1, "table", (0, 0, 0), (1, 1, 0.7))
     near, doubtful = (
         placed(2, "chair", (1.15, 0, 0), (0.5, 0.5, 0.9)),

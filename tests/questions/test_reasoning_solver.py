@@ -1,4 +1,4 @@
-"""The built-in solver and its grammar, on a scene small enough to work out by hand and on a made room."""
+"""The built-in solver and its grammar, on a scene small enough to solve by hand and on a generated room."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ def test_geometric_questions_are_answered(
 @pytest.mark.parametrize(
     ("question", "reason"),
     [
-        ("I am feeling cold, what should I do?", "none of those that geometry settles"),
-        ("", "none of those"),
+        ("I am feeling cold, what should I do?", "the built-in solver cannot read the question"),
+        ("", "the built-in solver cannot read"),
         ("Which chair is closer to the bed?", "the map has no 'chair'"),
-        ("What is between the bed?", "'between' needs two things"),
-        ("How far is the bed from the bed?", "one thing in the map"),
+        ("What is between the bed?", "'between' needs two objects"),
+        ("How far is the bed from the bed?", "one object in the map"),
     ],
 )
 def test_unsettled_questions_are_reported(solver: Solver, question: str, reason: str) -> None:
@@ -94,11 +94,11 @@ def test_unsettled_questions_are_reported(solver: Solver, question: str, reason:
 
 
 def test_left_depends_on_viewpoint_and_is_noted() -> None:
-    # Who stands at the origin and looks along +x sees what has the greater y on the left.
+    # From the origin looking along +x, the object with the greater y is on the left.
     scene = SceneMap((thing(1, "chair", box(2, 0.5, 0, 0.2, 0.2, 1)), thing(2, "sofa", box(2, -0.5, 0, 0.2, 0.2, 1))))
     near = Solver(scene, np.zeros(3)).answer("Is the chair left of the sofa?")
     assert near.value is True
-    assert near.notes == ("left and right as seen from the eye given (0.00, 0.00)",)
+    assert near.notes == ("left and right as seen from the given eye (0.00, 0.00)",)
     assert Solver(scene, np.array([5.0, 0.0, 0.0])).answer("Is the chair left of the sofa?").value is False
     assert Solver(scene, np.array([5.0, 0.0, 0.0])).answer("Is the chair to the right of the sofa?").value is True
     assert "middle of the map" in Solver(scene).answer("Is the chair left of the sofa?").notes[0]
@@ -113,9 +113,7 @@ def test_unknown_noun_falls_back_to_encoder_with_a_note() -> None:
     asked = Solver(bedroom(), None, nearest)
     found = asked.answer("Which sink is closer to the bunk?")
     assert found.object_ids == (9,)
-    assert found.notes[0] == (
-        "the map has no 'bunk'; taken for 'bed', the nearest name by the text encoder (cosine 0.90)"
-    )
+    assert found.notes[0] == ("the map has no 'bunk'; used 'bed', the nearest name by the text encoder (cosine 0.90)")
     assert not asked.answer("Which sink is closer to the harp?").is_decided
 
 
@@ -162,13 +160,13 @@ def test_nearest_object_answer_matches_all_distances(room: SceneMap) -> None:
         assert best == (max if one.kind == "farthest" else min)(away, key=lambda key: away[key])
 
 
-def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
+def test_map_names_are_n_prime_then_label_then_n() -> None:
     made = replace(
         instances(np.zeros((2, 3), np.float32), [np.array([0]), np.array([1])], ["", "couch"]),
         names=("lamp", "sofa"),
         boxes=np.array([[[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [np.nan, 1, 1]]], np.float32),
     )
-    assert [one.name for one in map_of(made).objects] == ["lamp"]  # a box that is not finite is left out
+    assert [one.name for one in map_of(made).objects] == ["lamp"]  # an instance without a finite box is excluded
     sound = replace(made, boxes=np.zeros((2, 2, 3), np.float32))
     assert [one.name for one in map_of(sound).objects] == ["lamp", "couch"]
     assert [one.name for one in map_of(sound, RefinedNames(("a", "b"), "test")).objects] == ["a", "b"]
@@ -177,7 +175,7 @@ def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
 
 
 class Said:
-    """A language model that says one thing."""
+    """A language model with one fixed reply."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -211,13 +209,13 @@ def test_oversized_map_is_truncated_by_relevance_with_a_note() -> None:
     found = LanguageSolver(scene, Said("sink #9"), config).answer("Which sink is closer to bed?")
     assert found.object_ids == (9,)
     assert found.notes[0].startswith(
-        f"the map has 318 objects, more than the model reads at once; it was given the {len(context.objects)} "
+        f"the map has 318 objects, more than fit into the model's context; it got the {len(context.objects)} "
     )
     assert {one.id for one in solving.by_relevance(scene, "Which sink is closer to bed?")[:3]} == {1, 9, 10}
     assert context_for(bedroom(), "x", LanguageConfig()).note == ""
 
 
-def test_a_model_that_refuses_leaves_the_question_unsettled() -> None:
+def test_refusal_of_the_model_leaves_the_question_unsettled() -> None:
     found = LanguageSolver(bedroom(), Said("I'm sorry, I can't help with that."), LanguageConfig()).answer(
         "Which sink is closer to bed?"
     )
@@ -231,7 +229,7 @@ each_case = pytest.mark.parametrize("case", PAGE, ids=[case["question"] for case
 
 
 def shown_map(case: Any) -> SceneMap:
-    """The objects that the page shows, each a box of the case's size about its centroid; row k is the k-th."""
+    """The objects on the page, each with a box of the case's size around its centroid; row k is the k-th."""
     things = []
     for row, one in enumerate(case["objects"]):
         centre, half = np.array(one["centroid"], np.float64), np.array(one["size"], np.float64) / 2
@@ -245,12 +243,12 @@ def truth_of(case: Any) -> TrueAnswer:
 
 
 def objects_of_rows(scene: SceneMap) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Each instance stands for the object that bears its id."""
+    """Each instance stands for the object with its id."""
     return np.array(scene.ids, np.int64)
 
 
 def page_model(case: Any) -> Said:
-    """A language model that says what the page shows."""
+    """A language model that replies as on the page."""
     ids = {name: case[name] for name in ("object_ids", "reference_ids")}
     return Said(json.dumps({"reasoning": "as shown", "answer": case["told"], **ids}))
 

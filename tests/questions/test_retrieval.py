@@ -34,7 +34,7 @@ def instances_with(features: Float64Array | None) -> Instances:
     return Instances.of(np.zeros((n, 3), np.float32), [np.array([k]) for k in range(n)], features=features)
 
 
-def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None:
+def test_retrieval_ranks_by_cosine_for_any_feature_length() -> None:
     found = instances_with(np.array([[0.1, 0.1], [9.0, 1.0], [0.0, 0.0], [0.5, 0.0]]))
     east, north = rank_all(found, ["east", "north"], TwoWords())
     assert east.order.tolist() == [3, 1, 0, 2]
@@ -42,7 +42,7 @@ def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None
     assert north.order.tolist() == [0, 1, 2, 3]  # 2 and 3 are equal: the order of the map
 
 
-def test_retrieval_without_comparable_features_is_refused() -> None:
+def test_retrieval_without_comparable_features_is_rejected() -> None:
     with pytest.raises(PredictionError, match="no features"):
         rank(instances_with(None), "east", TwoWords())
     with pytest.raises(PredictionError, match="3 dimensions, encoder 'two-words' has 2"):
@@ -50,7 +50,7 @@ def test_retrieval_without_comparable_features_is_refused() -> None:
 
 
 def as_the_program_of_conceptfusion_shows(similarity: Float64Array) -> list[int]:
-    """What its examples/demo_text_query.py leaves of the similarities: relative to their range, from 0.6 on."""
+    """The points kept by its examples/demo_text_query.py: similarity of at least 0.6 relative to the range."""
     similarity = (similarity + 1.0) / 2.0
     relative = (similarity - similarity.min()) / (similarity.max() - similarity.min() + 1e-12)
     return np.flatnonzero(relative >= 0.6).tolist()
@@ -61,7 +61,7 @@ def test_feature_only_retrieval_matches_original_program(rows_at_once: int, monk
     monkeypatch.setattr(questions_model, "BLOCK_ROWS", rows_at_once)
     random = np.random.default_rng(3)
     features = random.normal(size=(60, 2)).astype(np.float16)
-    features[::9] = 0  # no feature, no part
+    features[::9] = 0  # without a feature they are ignored
     dense = DenseFeatures(random.normal(size=(60, 3)).astype(np.float32), features)
     has = np.flatnonzero(features.any(axis=1))
     found = retrieved_points(dense, ["east", "north"], TwoWords())
@@ -86,7 +86,7 @@ def plan_of(*sides_m: tuple[float, float]) -> Instances:
 
 
 @pytest.mark.parametrize("name", ["walls", "Wall", "hardwood floor", "the ground"])
-def test_names_of_background_are_left_out(name: str) -> None:
+def test_background_names_are_excluded(name: str) -> None:
     assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig()) == (f"'{name}' is background",)
     assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig(background_names=())) == ("",)
 
@@ -96,7 +96,7 @@ def test_objects_on_walls_and_floors_are_retained(name: str) -> None:
     assert exclusion_reasons(plan_of((1, 1)), (name,), FilterConfig()) == ("",)
 
 
-def test_a_box_that_covers_the_map_from_above_is_left_out() -> None:
+def test_box_that_covers_the_map_from_above_is_excluded() -> None:
     made = plan_of((9.8, 9.8), (9.7, 9.7), (1, 10))  # 96 %, 94 %, 10 %
     assert exclusion_reasons(made, ("rug",) * 3, FilterConfig()) == (
         "its box has 96 % of the map's area from above",

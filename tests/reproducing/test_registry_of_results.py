@@ -48,7 +48,7 @@ def test_rows_of_several_bundles_share_one_ranking_per_protocol_best_first(regis
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('"version": 2', '"version": 3', "was scored under rooms-semantic version 3, here is version 2"),
+        ('"version": 2', '"version": 3', "was scored under rooms-semantic version 3, now it is version 2"),
         ('"is_partial": false', '"is_partial": true', "is partial"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Sweeps: the variants that a request stands for, and one run of them."""
+"""Sweeps: the variants of a request, and one run of them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from su3d_bench.runs.ablation import ablation_rows, read_rows
 PAINTED = f"{SCENES}/painted.py"
 
 
-def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself() -> None:
+def test_sweep_of_the_paper_has_nine_rows_and_defaults_name_the_method_itself() -> None:
     rows = ablation_rows(
         "opensu3d", ["m=1,5,10", "k=1,3,5", "ratios=[0.1,1,1.1],[0.8,1,1.2],[0.5,1,1.5]"], is_grid=False
     )
@@ -35,15 +35,15 @@ def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself
         (["m="], "expected KEY=VALUE"),
         (["m=0"], "--vary m=0: input should be greater"),
         (["k=0.5"], "crop levels must be an integer"),
-        (["m=" + ",".join(map(str, range(1, 1100)))], "1099 variants; at most 1000"),
+        (["m=" + ",".join(map(str, range(1, 1100)))], "1099 variants; one run can have at most 1000"),
     ],
 )
-def test_a_wrong_sweep_is_one_line(vary: list[str], message: str) -> None:
+def test_invalid_sweep_is_rejected(vary: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=f"(?i){message}"):
         ablation_rows("opensu3d", vary, is_grid=False)
 
 
-def test_a_sweep_is_one_run_with_its_rows_beside_it(painted_place: Path) -> None:
+def test_sweep_is_one_run_with_its_rows_stored_beside_it(painted_place: Path) -> None:
     words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "stride=1,2", "drop=0,1", "--no-pictures"]
     words += ["--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic", "--jobs", "1"]
     assert main([*words, "--out", "out"]) == 0

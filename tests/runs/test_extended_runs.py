@@ -1,4 +1,4 @@
-"""A folder belongs to one request: another one extends it, replaces it or is refused."""
+"""A folder belongs to one request: another one extends it, replaces it or is rejected."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def record(name: str, out: str = "out") -> Any:
     return json.loads(Path(out, name).read_text())
 
 
-def test_scenes_methods_and_protocols_join_and_no_finished_job_is_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extending_merges_requests_and_runs_no_finished_job_again(monkeypatch: pytest.MonkeyPatch) -> None:
     dropping = f"{COLLECTOR}@drop=1"
     assert run("[ab]", "--set", "collector.noise_m=0.02") == 0
     made = {path: path.stat().st_mtime_ns for path in Path("out").rglob("prediction.npz")}
@@ -55,7 +55,7 @@ def test_scenes_methods_and_protocols_join_and_no_finished_job_is_run_again(monk
     assert f'scenes = ["{PAINTED}/[ab]", "{PAINTED}/c"]  # --scenes\n' in text
     assert "noise_m = 0.02  # --set collector.noise_m\n" in text and "drop = 0  # default\n" in text
     monkeypatch.setattr(scene_feeding, "write_prediction", None)
-    assert main(["run", "--config", "out/run.toml", *REST, "--out", "out"]) == 0  # its own file is its request
+    assert main(["run", "--config", "out/run.toml", *REST, "--out", "out"]) == 0  # the same request
 
 
 CANNOT_JOIN = {
@@ -70,16 +70,16 @@ CANNOT_JOIN = {
 }
 
 
-def test_what_cannot_be_joined_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_extending_with_different_settings_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("a") == 0
     capsys.readouterr()
     for more, clause in CANNOT_JOIN.items():
         assert extend(f"{PAINTED}/b", *more.split()) == 2
-        assert f"out: cannot be extended by this ({clause})" in capsys.readouterr().err
+        assert f"out: cannot be extended by this request ({clause})" in capsys.readouterr().err
         assert [path.name for path in Path("out/scenes").iterdir()] == ["painted.a"]
 
 
-def test_an_unfinished_run_is_as_safe_as_a_finished_one(
+def test_unfinished_run_is_as_protected_as_a_finished_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*_: Any) -> None:
@@ -92,21 +92,21 @@ def test_an_unfinished_run_is_as_safe_as_a_finished_one(
     before = Path("out/run.json").read_bytes(), Path("out/run.toml").read_bytes()
     capsys.readouterr()
     assert run("a") == 2
-    assert "holds another run (scene painted/b is not asked for now); --extend adds" in capsys.readouterr().err
+    assert "contains a different run (scene painted/b is not requested now); --extend adds" in capsys.readouterr().err
     assert (Path("out/run.json").read_bytes(), Path("out/run.toml").read_bytes()) == before
     assert extend(f"{PAINTED}/c") == 0
     assert run("[abc]", out="whole") == 0
     assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
 
 
-def test_a_run_is_replaced_but_for_the_maps_that_are_asked_for_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_replacing_a_run_keeps_maps_that_are_requested_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("[abc]") == 0
     kept = RunFolder(Path("out")).job("painted/a", "collector").prediction
     made = kept.stat().st_mtime_ns
     capsys.readouterr()
     assert main(["run", f"{PAINTED}/a", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures",
                  "--jobs", "1", "--replace", "--out", "out"]) == 0  # fmt: skip
-    went = "--replace: 4 of the 6 maps in out go: painted/b, painted/c by collector, oracle\n"
+    went = "--replace: 4 of the 6 maps in out will be removed: painted/b, painted/c by collector, oracle\n"
     assert capsys.readouterr().err.startswith(went)
     assert run("a", out="whole") == 0
     assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
@@ -116,7 +116,7 @@ def test_a_run_is_replaced_but_for_the_maps_that_are_asked_for_as_they_are(capsy
     assert record("metrics.json")["seed"] == 3 and kept.stat().st_mtime_ns != made
 
 
-def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
+def test_map_of_other_data_is_only_computed_again_with_replace(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("a") == 0
@@ -126,7 +126,7 @@ def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
     monkeypatch.setattr(scene_run, "build_perception", lambda *_, **__: other)
     capsys.readouterr()
     assert run("a") == 2
-    assert "(perception was colours-1, now colours-2); --replace puts this one in its place" in capsys.readouterr().err
+    assert "(perception was colours-1, now colours-2); --replace overwrites it" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in before} == before
     assert run("a", "--replace") == 0
     assert (
@@ -135,21 +135,21 @@ def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
     )
 
 
-def test_files_of_others_are_not_removed_with_a_run_that_is_replaced(capsys: pytest.CaptureFixture[str]) -> None:
+def test_replacing_a_run_does_not_remove_foreign_files(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("[ab]") == 0
     Path("out/notes.txt").write_text("mine")
     notes = Path("out/scenes/painted.b/collector/notes.txt")
     notes.write_text("mine")
     capsys.readouterr()
     assert run("a", "--replace") == 2
-    assert "notes.txt: is of no run and would go with what --replace removes; move it" in capsys.readouterr().err
+    assert "notes.txt: does not belong to a run, but --replace would remove it; move it" in capsys.readouterr().err
     assert len(record("run.json")["scenes"]) == 2
     notes.unlink()
     assert run("a", "--replace") == 0
     assert Path("out/notes.txt").read_text() == "mine"
 
 
-def test_a_replacement_that_is_killed_midway_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_replacement_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run("[abc]") == 0
     removed = 0
 
@@ -184,7 +184,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 @pytest.mark.parametrize(
     ("damage", "has_record"), [*((damage, known) for damage in DAMAGE for known in (True, False)), ("missing", True)]
 )
-def test_a_request_that_a_power_cut_spoilt_is_taken_up_by_the_same_command_and_by_no_other(
+def test_run_with_a_damaged_request_is_only_resumed_by_the_same_command(
     damage: str, has_record: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("a") == 0
@@ -193,10 +193,10 @@ def test_a_request_that_a_power_cut_spoilt_is_taken_up_by_the_same_command_and_b
     request.unlink() if damage == "missing" else request.write_bytes(DAMAGE[damage](whole[0]))
     if not has_record:
         os.unlink("out/run.json")
-    assert run("a", "--seed", "1") == 2  # its maps are of another request
+    assert run("a", "--seed", "1") == 2  # its maps belong to another request
     if has_record:
         assert run("b") == 2
-        assert "holds another run (scene painted/a is not asked for now" in capsys.readouterr().err
+        assert "contains a different run (scene painted/a is not requested now" in capsys.readouterr().err
         assert numbers.read_bytes() == whole[1]
     assert run("a") == 0
     assert (request.read_bytes(), numbers.read_bytes()) == whole

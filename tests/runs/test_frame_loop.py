@@ -1,4 +1,4 @@
-"""Frames are read ahead in order; a scratch of a method is fed a made-up frame before the clock runs."""
+"""Frames are read ahead in order; a disposable method is fed a synthetic frame before timing starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ N_FRAMES = 40
 
 
 class Watched(Sequence[int]):
-    """Frames, each its position, whose reading is noted; ``read`` is called before a frame is given."""
+    """Frames, each equal to its position, whose reads are recorded; ``read`` is called before a frame is returned."""
 
     def __init__(self, read: Callable[[int], object] = lambda _: None) -> None:
         self.begun: list[int] = []
@@ -37,11 +37,11 @@ def threads() -> int:
 
 
 def settle(ahead: ReadAhead[int]) -> None:
-    """Wait until all reads that were ordered, and would be done by a free thread, have begun."""
+    """Wait until all submitted reads that a free thread would run have begun."""
     ahead._threads.submit(int).result(10)
 
 
-def test_frames_come_in_their_order_however_long_each_takes() -> None:
+def test_frames_arrive_in_order_however_long_each_takes() -> None:
     is_read = [threading.Event() for _ in range(N_FRAMES)]
 
     def read(position: int) -> None:
@@ -53,7 +53,7 @@ def test_frames_come_in_their_order_however_long_each_takes() -> None:
         assert [ahead.next_frame() for _ in range(N_FRAMES)] == list(range(N_FRAMES))
 
 
-def test_no_more_frames_are_read_than_may_wait() -> None:
+def test_no_more_frames_are_read_ahead_than_allowed() -> None:
     frames = Watched()
     with ReadAhead(frames, N_FRAMES, n_ahead=3) as ahead:
         for n_taken in range(1, 10):
@@ -63,7 +63,7 @@ def test_no_more_frames_are_read_than_may_wait() -> None:
             assert len(frames.begun) == n_taken + 3
 
 
-def test_a_broken_frame_fails_when_it_is_asked_for_and_not_before() -> None:
+def test_broken_frame_fails_when_requested_and_not_before() -> None:
     def read(position: int) -> None:
         if position == 2:
             raise DataError("frame 2: broken")
@@ -76,7 +76,7 @@ def test_a_broken_frame_fails_when_it_is_asked_for_and_not_before() -> None:
 
 
 @pytest.mark.parametrize("n_taken", [0, 1, 7, N_FRAMES])
-def test_leaving_early_ends_the_threads_and_reads_nothing_more(n_taken: int) -> None:
+def test_leaving_early_ends_the_threads_and_stops_reading(n_taken: int) -> None:
     frames = Watched()
     with ReadAhead(frames, N_FRAMES) as ahead:
         for _ in range(n_taken):
@@ -91,8 +91,8 @@ WARMED = [name for name in registry.METHODS if getattr(registry.load("method", n
 
 
 @pytest.mark.parametrize("name", WARMED)
-def test_a_made_up_frame_goes_through_every_step(name: str) -> None:
-    # Keeps the map. A class of its own: what ``isinstance`` has said of the method's own class would be remembered.
+def test_warm_up_frame_runs_every_step(name: str) -> None:
+    # Keeps the map. A separate class, because ``isinstance`` results for the method's own class would be cached.
     method = type("Kept", (registry.load("method", name),), {"close": lambda self: None})()
     warm_up(method)
     assert method.n_points > 0

@@ -1,4 +1,4 @@
-"""What a run says at its end and of its settings: next commands, changed settings, what was found without a truth."""
+"""Output at the end of a run and about its settings: next commands and changed settings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def commands_in(lines: list[str]) -> list[list[str]]:
     return [shlex.split(line.removeprefix("next:"))[1:] for line in lines if " su3d-bench " in line]
 
 
-def test_a_run_ends_with_its_pictures_and_commands_that_are_true_for_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_ends_with_pictures_and_next_commands_that_work(capsys: pytest.CaptureFixture[str]) -> None:
     lines = lines_of(capsys, "--methods", COLLECTOR, "oracle", "--out", "runs/of mine")
     start = lines.index("run folder: runs/of mine")
     pictures = lines[start + 1].removeprefix("pictures: ").partition(" and ")[0]
@@ -45,14 +45,14 @@ def test_a_run_ends_with_its_pictures_and_commands_that_are_true_for_it(capsys: 
 
 
 def run_with(**given: Any) -> FinishedRun:
-    """A run of whose folder nothing is read; ``__`` stands between the parts of a path."""
+    """A run whose folder is never read; ``__`` separates the parts of a path."""
     entries = tuple(Setting(tuple(name.split("__")), value, "run.toml:1") for name, value in given.items())
     record: Any = None
     return FinishedRun(RunFolder(Path("run")), record, {}, {}, 0, RunData(Settings(entries), {}))
 
 
-def test_settings_that_are_not_the_methods_own_are_named_with_their_values() -> None:
-    """A stride of the whole run is a setting of each method that has another; of an unknown method none is named."""
+def test_changed_settings_are_listed_with_their_values() -> None:
+    """The stride of a run is a changed setting of each method with a different one; an unknown method has none."""
     run = run_with(method__opensu3d__eps=0.05, method__opensu3d__top_m=5, method__opensu3d__border_px=20)
     assert run.changed("opensu3d") == ("eps = 0.05",)
     assert run_with(stride=10).changed("opensu3d") == ("stride = 10",)

@@ -17,7 +17,7 @@ def plate(z: float, half: float = 0.5) -> Float32Array:
 
 
 def two_plates(names: tuple[str, ...] = ("rug", "lamp")) -> Instances:
-    """A large plate with a small one above it; the large mask holds the small one's points too."""
+    """A large plate with a small one above it; the large mask also contains the small one's points."""
     points = np.concatenate([plate(0.0), plate(0.4, half=0.2)])
     n_low = len(plate(0.0))
     return Instances.of(points, [np.arange(len(points)), np.arange(n_low, len(points))], names=names, captions=names)
@@ -28,14 +28,14 @@ def camera(width: int = 40, height: int = 40) -> Camera:
     return Camera(np.diag([1.0, -1, -1]), np.array([0.0, 0, 5]), 30.0, False, box, width, height)
 
 
-def test_the_nearest_point_is_seen_whatever_the_order() -> None:
+def test_nearest_point_is_visible_in_any_point_order() -> None:
     points = np.array([[0, 0, 0], [0, 0, 1], [0, 0, -1]], np.float32)
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
         seen = render(points[order], 0.01, camera()).point
         assert set(seen[seen >= 0]) == {order.index(1)}
 
 
-def test_every_view_holds_the_whole_room() -> None:
+def test_every_view_contains_the_whole_room() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-3, 1, 0], [4, 3, 2], (4000, 3)).astype(np.float32)
     for one in view_cameras(room_bounds(points), 200, 160):
@@ -48,7 +48,7 @@ def test_every_view_holds_the_whole_room() -> None:
         assert len(kept) > 0.5 * len(points)
 
 
-def test_of_overlapping_masks_the_smaller_one_is_seen(tmp_path: Path) -> None:
+def test_smaller_of_two_overlapping_masks_is_visible(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
     paths = draw_scene(two_plates(), None, tmp_path / "pictures", "two plates")

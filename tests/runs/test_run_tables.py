@@ -39,18 +39,18 @@ def table(*results: dict[str, Any], is_partial: bool = False) -> str:
     return markdown_table({"is_partial": is_partial, "limit": 3, "results": list(results)})
 
 
-def test_a_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
+def test_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
     row = next(line for line in table(result()).splitlines() if "opensu3d" in line)
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells == ["opensu3d", "40.8 [38.9, 42.6]", "31.2", "97.1 / 100.0", "8", "99.1 / 99.8 / 100.0"]
 
 
-def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
+def test_generated_rooms_in_another_datasets_layout_are_labelled() -> None:
     method: Any = SimpleNamespace(needs=PerceptionNeeds(masks="grounded"), caveat=None)
     perception: Any = SimpleNamespace(caveat=None, encoder=SimpleNamespace(name="embedded"))
     scene = SceneInfo("replica", "office0", 1, 1, "rendered-rooms")
     said = caveat_of(method, perception, scene)
-    assert said == "made rooms in the layout of replica, not its scenes"
+    assert said == "generated rooms in the layout of replica, not its scenes"
     assert caveat_of(method, perception, replace(scene, image_domain="camera")) is None
     assert caveat_of(method, perception, replace(scene, dataset="rooms")) is None
 
@@ -70,7 +70,7 @@ def numbers(*warned: str) -> NumbersRecord:
     )
 
 
-def test_where_confidences_come_from_is_told_by_the_protocol_or_seen_in_the_predictions() -> None:
+def test_source_of_confidences_is_reported() -> None:
     own, ones = load_protocol("rooms-instance"), load_protocol("replica-openmask3d")
     assert confidences_of(load_protocol("rooms-semantic"), numbers()) is None
     assert confidences_of(ones, numbers()) == "1 for every instance, by the protocol"

@@ -1,4 +1,4 @@
-"""What a run makes of its scenes, and what it leaves in its folder."""
+"""The results of a run, and the files that it writes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_run_leaves_the_folder_that_the_design_promises(finished: Path) -> None:
+def test_run_writes_the_documented_files(finished: Path) -> None:
     names = {path.relative_to(finished).as_posix() for path in finished.rglob("*") if path.is_file()}
     per_job = ("prediction.npz", "counts.npz", "updates.csv", "log.txt", "done.json")
     expected = {f"scenes/painted.{s}/{m}/{f}" for s in "abcd" for m in ("collector", "oracle") for f in per_job}
@@ -39,7 +39,7 @@ def test_a_run_leaves_the_folder_that_the_design_promises(finished: Path) -> Non
     assert set(record["data_digests"]) == {f"painted/{scene}" for scene in "abcd"}
 
 
-def test_perfect_perception_gives_a_perfect_score_and_its_ceiling(finished: Path) -> None:
+def test_perfect_perception_gives_perfect_scores_and_ceilings(finished: Path) -> None:
     for one in metrics(str(finished))["results"]:
         assert one["method"] == "collector"
         assert one["n_planned"] == one["result"]["n_scenes"] == 4
@@ -48,7 +48,7 @@ def test_perfect_perception_gives_a_perfect_score_and_its_ceiling(finished: Path
             assert one["ceiling"][name] == 1.0
 
 
-def test_the_same_command_again_does_nothing_and_gives_the_same_bytes(
+def test_repeated_command_does_nothing_and_gives_the_same_bytes(
     finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = (finished / "metrics.json").read_bytes()
@@ -58,7 +58,7 @@ def test_the_same_command_again_does_nothing_and_gives_the_same_bytes(
     assert (finished / "metrics.json").read_bytes() == before
 
 
-def test_a_seed_gives_its_bytes_and_another_seed_others() -> None:
+def test_same_seed_gives_the_same_bytes_and_another_seed_does_not() -> None:
     noise = ("--set", "collector.noise_m=0.02")
     assert run(*noise, scenes="a", out="one") == 0
     assert run(*noise, scenes="a", out="two") == 0
@@ -89,9 +89,7 @@ CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-i
         ("crash", f"painted/b: painted.py:{CRASHES}: ZeroDivisionError: a mistake in a plug-in"),
     ],
 )
-def test_a_scene_that_fails_leaves_the_others_unharmed(
-    fault: str, line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_failing_scene_does_not_affect_others(fault: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--set", f"painted.fault={fault}", scenes="[ab]") == 3
     answer = capsys.readouterr()
     assert f"su3d-bench: {line}\n" in answer.err
@@ -106,7 +104,7 @@ def test_a_scene_that_fails_leaves_the_others_unharmed(
         assert one["result"]["scenes"] == ["painted/a"]
 
 
-def test_a_scene_that_failed_is_taken_up_again_once_it_is_mended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_scene_is_resumed_once_it_is_fixed(monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken(ColourPerception):
         def detect(self, frame: Any, *rest: Any) -> Any:
             if frame.index == 3:
@@ -121,7 +119,7 @@ def test_a_scene_that_failed_is_taken_up_again_once_it_is_mended(monkeypatch: py
     assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
 
 
-def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.CaptureFixture[str]) -> None:
+def test_scenes_whose_names_differ_only_in_a_slash_have_separate_maps(capsys: pytest.CaptureFixture[str]) -> None:
     twins = ["run", "--scenes", f"{SCENES}/painted.py:Twins/*", *words()[3:]]
     assert main(twins) == 0
     folders = sorted(path.name for path in Path("out/scenes").iterdir())
@@ -139,7 +137,7 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
     assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
 
 
-def test_what_was_found_stands_in_place_of_dashes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unscored_maps_are_summarised_instead_of_dashes(capsys: pytest.CaptureFixture[str]) -> None:
     noisy = [*words(scenes="b")[3:], "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.3"]
     assert main(["run", "--scenes", f"{PAINTED}/b", *noisy, "--set", "painted.fault=no-truth"]) == 0
     said = capsys.readouterr()

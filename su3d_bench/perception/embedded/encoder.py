@@ -1,6 +1,6 @@
-"""The encoder that the project trained itself, run by ONNX Runtime: no download, no GPU, no torch; on a GPU by torch.
+"""The project's own encoder, run by ONNX Runtime without download, GPU or torch; on a GPU it is run by torch.
 
-Its training and its measured accuracy are in ``model_card.md`` beside the weights.
+Its training and its measured accuracy are in ``model_card.md`` next to the weights.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ IMAGE_SIZE = 64
 IMAGE_FILE = "image.onnx"
 TEXT_FILE = "text.onnx"
 PREPROCESSING_VERSION = "1"
-BATCH = 32  # images that run through the network together: 1.6 times as fast as one by one, and no gain beyond
-N_TRIED = 5  # images by which a machine shows that a batch moves no bit; odd, so that kernels meet a remainder
+BATCH = 32  # images per batch: 1.6 times as fast as one by one; larger batches gain nothing
+N_TRIED = 5  # images for testing that batching changes no bit; odd, so that kernels process a remainder
 
 
 def shrink(image: UInt8Array) -> UInt8Array:
-    """``image`` (h, w, 3) stretched to 64 x 64: by area where an axis shrinks, linearly where it grows.
+    """``image`` (h, w, 3) resized to 64 x 64: area resampling along an axis that shrinks, linear along one that grows.
 
-    The axes are resampled apart because OpenCV's area mode stops averaging in both as soon as one of them grows.
+    The axes are resampled separately because OpenCV's area mode stops averaging in both as soon as one of them grows.
     """
     import cv2
 
@@ -46,23 +46,23 @@ def shrink(image: UInt8Array) -> UInt8Array:
 
 
 def log_size(height: int, width: int) -> tuple[float, float]:
-    """What the stretch takes away: log2 of the crop's height and width in pixels, 0 at 64 and 1 at 256."""
+    """The size lost by resizing: log2 of the crop's height and width in pixels, scaled to 0 at 64 and 1 at 256."""
     return float(np.log2(height) - 6.0) / 2.0, float(np.log2(width) - 6.0) / 2.0
 
 
 class EmbeddedEncoder:
     """Two small towers trained on rendered rooms only; files are read at first use.
 
-    Every text runs through the network alone and all on one thread, so that a feature never depends on what else is in
-    the batch or on the machine's number of cores. Images run in batches where these give the bits that each image gives
-    alone, which is tried at the first use, and else alone too. On a ``device`` other than ``cpu`` torch runs the
-    towers, images always in batches, and features differ from those of the CPU by rounding.
+    Every text runs through the network alone and on one thread, so that a feature never depends on the rest of the
+    batch or on the number of cores. Images run in batches if a test at first use shows that this changes no bit,
+    otherwise one by one. On a ``device`` other than ``cpu`` torch runs the towers, images always in batches, and
+    features differ from those of the CPU by rounding.
     """
 
     name = "su3d-embedded"
     dim = DIM
-    trained_on = "rooms that the program rendered, other ones than the built-in"
-    # questions/generator.py asks for "cushion on a sofa", the training said "cushion on sofa", of the same relations
+    trained_on = "rooms rendered by the program, different from the built-in ones"
+    # questions/generator.py asks for "cushion on a sofa", training captions had "cushion on sofa", with equal relations
     relative_remark = (
         "relation words and the pattern of these queries are those of the captions that the embedded encoder was "
         "trained on"
@@ -74,11 +74,11 @@ class EmbeddedEncoder:
 
     @cached_property
     def digest(self) -> str:
-        """Moves with the weights of either tower, with the preprocessing, the tokenizer and the kind of device."""
+        """A digest of the weights of both towers, the preprocessing, the tokenizer and the kind of device."""
         return self._digest_on(self.device.partition(":")[0])
 
     def is_same_space(self, digest: str) -> bool:
-        """Whether ``digest`` is of these weights and this preparation, be it on another device."""
+        """Whether ``digest`` is of the same weights and preprocessing, possibly on another device."""
         return digest in (self._digest_on("cpu"), self._digest_on("cuda"))
 
     def _digest_on(self, kind: str) -> str:
@@ -111,7 +111,7 @@ class EmbeddedEncoder:
 
     @cached_property
     def _batch(self) -> int:
-        """How many images run together: 1 where the kernels chosen on this machine round otherwise in a batch."""
+        """The batch size of images: 1 if the kernels on this machine round differently in a batch."""
         if self.device != "cpu":
             return BATCH
         noise = np.random.default_rng(0)
@@ -121,14 +121,14 @@ class EmbeddedEncoder:
         return BATCH if np.array_equal(alone, self._in_batches(pixels, log_sizes, N_TRIED)) else 1
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
-        """Features (N, 128) of texts; a text of articles alone gives the tower's feature of no words."""
+        """Features (N, 128) of texts; a text of only articles gets the feature of the empty text."""
         features = np.zeros((len(texts), DIM), np.float32)
         for row, ids in enumerate(token_ids(texts)):
             features[row] = self._text_tower.run(None, {"ids": ids[None]})[0][0]
         return features
 
     def unseen_words(self, text: str) -> tuple[str, ...]:
-        """The words of ``text`` that stood in none of the training's captions, of which only spellings are known."""
+        """The words of ``text`` that are in no training caption, so that only their spelling is used."""
         from su3d_bench.perception.embedded.lexicon import trained_words
 
         return unknown_words(text, trained_words())

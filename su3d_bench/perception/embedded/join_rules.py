@@ -12,10 +12,10 @@ from su3d_bench.perception.embedded.surface_graph import Graph, IndexArray, Piec
 
 
 class JoinWeights(BaseModel):
-    """What speaks for (positive) and against (negative) two touching surfaces being parts of one object.
+    """Evidence for (positive) and against (negative) two touching surfaces being parts of one object.
 
-    Log-odds for each unit of a cue, by logistic regression over the borders in rooms that no benchmark uses; a lower
-    ``bias`` leaves more regions apart. The cues are those of ``rules.join_cues``.
+    Log-odds per unit of a cue, by logistic regression over the borders in rooms that no benchmark uses; a lower
+    ``bias`` keeps more regions separate. The cues are those of ``join_cues``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -23,32 +23,32 @@ class JoinWeights(BaseModel):
     bias: float = 2.8
     contrast: float = -0.68  # colour difference right at the border
     concave: float = -1.25  # the border is an inner edge
-    stepped_colour: float = -3.73  # the colours differ, and the surfaces lie off each other's plane by centimetres
-    raised_colour: float = -0.8  # the same for millimetres, and one is much smaller: a plate on a table
+    stepped_colour: float = -3.73  # the colours differ, and the surfaces are off each other's plane by centimetres
+    raised_colour: float = -0.8  # the same for millimetres, if one is much smaller: a plate on a table
     gap: float = -1.0  # share of the border with a jump in depth
-    step: float = -1.77  # how far it jumps
+    step: float = -1.77  # size of the jump
     contact: float = 0.71  # length of border without a jump
     depth: float = 1.25  # share of the border where depth is known
     larger: float = -0.63  # size of the larger of the two
 
 
 class QualityWeights(BaseModel):
-    """What makes a region's score: log-odds that its mask overlaps an object by half, fitted on the same rooms."""
+    """Weights of a region's score: log-odds that its mask overlaps an object by half, fitted on the same rooms."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     bias: float = -8.75
-    border: float = 6.48  # how sure the region is of its borders, 0..1
+    border: float = 6.48  # certainty of the region's borders, 0..1
     cut_off: float = -2.26  # share of the outline at the border of the image
-    size: float = 1.47  # tenfold pixels
-    compactness: float = 3.94  # 1 for a square, less for what is drawn out or frayed
+    size: float = 1.47  # per factor of ten in pixels
+    compactness: float = 3.94  # 1 for a square, less for elongated or ragged regions
 
 
 class SegmenterConfig(BaseModel):
     """Parameters that define edges, surfaces and objects.
 
-    Colours are CIELAB units with lightness counted ``lightness_weight``, because shading moves lightness more than hue;
-    angles are degrees; jumps in depth are relative to the depth. Parameters are grouped by stage: larger ``*_scale``,
+    Colours are CIELAB units with lightness times ``lightness_weight``, because shading changes lightness more than hue;
+    angles are degrees; depth jumps are relative to the depth. Parameters are grouped by stage: larger ``*_scale``,
     ``surface_*`` and ``object_*`` values merge more, ``min_region_px`` drops more.
     """
 
@@ -60,9 +60,9 @@ class SegmenterConfig(BaseModel):
     smoothing_colour: float = Field(default=35.0, gt=0)  # bilateral filter: colour steps above this stay sharp
     noise_floor: float = Field(default=1e-4, ge=0)  # 1/m: quieter disparity is not smoothed; 0.4 mm at 2 m
     noise_smoothing: float = Field(default=4.0, gt=0)  # bilateral filter of disparity, in standard deviations
-    noise_margin: float = Field(default=4.0, ge=0)  # standard deviations that no step in depth may rest on
+    noise_margin: float = Field(default=4.0, ge=0)  # noise standard deviations not counted as a depth step
     depth_jump: float = Field(default=0.012, gt=0)
-    normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller beside jumps in depth
+    normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller near jumps in depth
     normal_keep: float = Field(default=0.001, ge=0)  # relative depth by which a neighbour's plane must fit better
 
     # superpixels
@@ -80,7 +80,7 @@ class SegmenterConfig(BaseModel):
     # structure: floor, walls, ceiling
     structure_min_fraction: float = Field(default=0.03, gt=0, le=1)
     structure_distance_m: float = Field(default=0.03, gt=0)
-    structure_relief_m: float = Field(default=0.1, gt=0)  # doors and windows lie within this of their wall
+    structure_relief_m: float = Field(default=0.1, gt=0)  # doors and windows are within this of their wall
     structure_behind_fraction: float = Field(default=0.02, ge=0, le=1)
     structure_flush_m: float = Field(default=0.005, gt=0)
     structure_flush_relative: float = Field(default=0.0015, gt=0)
@@ -90,7 +90,7 @@ class SegmenterConfig(BaseModel):
 
     # objects
     join: JoinWeights = JoinWeights()
-    parts_caution: float = Field(default=1.5, ge=0)  # taken off the bias where parts are asked for, not objects
+    parts_caution: float = Field(default=1.5, ge=0)  # subtracted from the bias if parts are requested, not objects
 
     # answer
     quality: QualityWeights = QualityWeights()
@@ -98,7 +98,7 @@ class SegmenterConfig(BaseModel):
 
 
 def join_surfaces(graph: Graph, config: SegmenterConfig, is_apart: BoolArray | None = None) -> Graph:
-    """Superpixels of like colour across borders without jump or crease, joined; what ``is_apart`` joins nothing."""
+    """Superpixels joined if similar in colour across borders without jump or crease, except those ``is_apart``."""
 
     def cost(current: Graph) -> Float64Array:
         colour, contrast, bend, gap = _differences(current)
@@ -114,7 +114,7 @@ def join_surfaces(graph: Graph, config: SegmenterConfig, is_apart: BoolArray | N
 
 
 def _differences(graph: Graph) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-    """Of every border: distance of the mean colours, mean contrast, mean bend rad, fraction of pairs with a jump."""
+    """For every border: distance of the mean colours, mean contrast, mean bend rad, fraction of pairs with a jump."""
     borders, means = graph.borders, graph.pieces.mean_colour()
     colour = np.linalg.norm(means[borders.a] - means[borders.b], axis=1)
     n_smooth = borders.n_deep - borders.gap
@@ -125,7 +125,7 @@ def _differences(graph: Graph) -> tuple[Float64Array, Float64Array, Float64Array
 
 @dataclass(frozen=True)
 class StructuralPlane:
-    """A floor, wall or ceiling: points p on it have ``normal`` . p = ``offset``; ``colour`` is its mean.
+    """A floor, wall or ceiling: its points p satisfy ``normal`` . p = ``offset``; ``colour`` is its mean.
 
     ``roughness_m`` is the root mean square distance of its points: the noise of the depth.
     """
@@ -137,7 +137,7 @@ class StructuralPlane:
 
 
 def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[StructuralPlane]:
-    """Large planes with nothing behind, largest first: floor, walls, ceiling."""
+    """Large planes with nothing behind them, largest first: floor, walls, ceiling."""
     pieces = surfaces.pieces
     centroid, normal, colour = pieces.centroid(), pieces.unit_normal(), pieces.mean_colour()
     total = max(float(pieces.n_pixels.sum()), 1.0)
@@ -155,7 +155,7 @@ def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[Structur
         has_depth = pieces.n_points > 0
         is_parallel = has_depth & (normal @ axis > np.cos(np.deg2rad(12)))
         on_plane = is_parallel & (np.abs(distance) < tolerance)
-        # A wall hides what is behind it; a door stands before a wall that is larger than the door.
+        # A wall hides everything behind it; a door is in front of a wall that is larger than the door.
         is_relief = is_parallel & (np.abs(distance) < config.structure_relief_m)
         is_level = np.abs(distance) < np.maximum(0.25 * tolerance, rms)
         n_level = pieces.n_points[is_relief & is_level].sum()
@@ -169,7 +169,7 @@ def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[Structur
 
 
 def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: SegmenterConfig) -> IndexArray:
-    """The structural plane (N,) that a piece lies flush with, -1 for none."""
+    """The structural plane (N,) that a piece is flush with, -1 for none."""
     plane_of_piece = np.full(len(pieces), -1, np.intp)
     centroid, normal = pieces.centroid(), pieces.unit_normal()
     tolerance = np.maximum(config.structure_flush_m, config.structure_flush_relative * centroid[:, 2])
@@ -192,7 +192,7 @@ def remove_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, Bool
         return surfaces, np.zeros(len(surfaces.pieces), bool)
     colours = np.stack([plane.colour for plane in planes])
     flush = plane_of_flush(graph.pieces, planes, config)
-    # Shading moves lightness: it counts less for what lies flush with a wall.
+    # Shading changes lightness: it counts less for pieces flush with a wall.
     weights = np.array([config.structure_lightness_weight, 1, 1])
     off_colour = np.linalg.norm((graph.pieces.mean_colour() - colours[flush]) * weights, axis=1)
     flush[off_colour > config.structure_colour] = -1
@@ -224,7 +224,7 @@ def _marks_after(joined: Graph, before: Graph, mark: IndexArray) -> IndexArray:
 
 
 def join_objects(graph: Graph, is_structure: BoolArray, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
-    """Surfaces joined to objects where the evidence speaks for it; structure joins nothing and stays marked."""
+    """Surfaces joined to objects if the evidence supports it; structure is not joined and stays marked."""
 
     def cost(current: Graph) -> Float64Array:
         return 2 / (1 + np.exp(np.clip(join_evidence(current, config.join), -30, 30)))
@@ -244,9 +244,9 @@ def join_evidence(graph: Graph, weights: JoinWeights) -> Float64Array:
 
 
 def join_cues(graph: Graph) -> dict[str, Float64Array]:
-    """What each weight of ``JoinWeights`` is multiplied with, at every border (E,).
+    """The factors of the weights in ``JoinWeights``, at every border (E,).
 
-    Cues are combined as boundary detectors do (Martin, Fowlkes and Malik 2004); that concave edges part objects and
+    Cues are combined as in boundary detectors (Martin, Fowlkes and Malik 2004); that concave edges separate objects and
     convex ones join parts is from Stein et al. (2014). Most saturate, as 1 - exp(-value / scale).
     """
     borders, pieces = graph.borders, graph.pieces
@@ -272,7 +272,7 @@ def _saturating(values: Float64Array, scale: float) -> Float64Array:
 
 
 def _distance_of_planes(graph: Graph) -> Float64Array:
-    """How far m (E,) the centre of either piece lies off the other's plane, the larger of the two."""
+    """Distance m (E,) of the centre of a piece from the other's plane, the larger of the two."""
     borders, centroid, normal = graph.borders, graph.pieces.centroid(), graph.pieces.unit_normal()
     between = centroid[borders.a] - centroid[borders.b]
     off_a = np.abs((between * normal[borders.a]).sum(axis=1))
@@ -283,10 +283,10 @@ def _distance_of_planes(graph: Graph) -> Float64Array:
 def region_quality(
     graph: Graph, is_structure: BoolArray, at_image_border: Float64Array, config: SegmenterConfig
 ) -> Float64Array:
-    """How likely (N,) each piece is one whole object, 0..1; less where little of its depth is known.
+    """Probability (N,) that each piece is one complete object, 0..1; lower if little of its depth is known.
 
-    The log-odds rise with how sure its borders are, with its size and its compactness, and fall with the share of its
-    outline that the image cuts off. ``at_image_border`` (N,) counts its pixels there.
+    The log-odds rise with the certainty of its borders, its size and its compactness, and fall with the share of its
+    outline cut off by the image. ``at_image_border`` (N,) counts its pixels there.
     """
     borders, pieces, weights = graph.borders, graph.pieces, config.quality
     apart = 1 / (1 + np.exp(np.clip(join_evidence(graph, config.join), -30, 30)))

@@ -1,4 +1,4 @@
-"""Loops of the segmenter over pixels and its graph, compiled; import this module only where a frame is segmented."""
+"""Compiled loops of the segmenter over pixels and its graph; import this module only to segment a frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from su3d_bench.numerics.clusters import root_of
 
 @njit(cache=True)
 def discontinuities(disparity: Float32Array, jump: float, margin: float, slope_factor: float) -> BoolArray:
-    """Pixels (H, W) beside a jump of the relative disparity that the slopes on its two sides do not explain.
+    """Pixels (H, W) next to a jump of the relative disparity that the slopes on its two sides do not explain.
 
     Steps below ``margin`` (1/m) are noise.
     """
@@ -71,8 +71,8 @@ def _sums(disparity: Float32Array, x: Float64Array, y: Float64Array) -> Float64A
 def fit_planes(disparity: Float32Array, radius: Int32Array, x: Float64Array, y: Float64Array) -> Float32Array:
     """Planes (H, W, 3): (A, B, C) with 1/z = A x + B y + C in the square window of ``radius``; zeros where unknown.
 
-    ``x`` (W,) and ``y`` (H,) are the ray coordinates (u - cx) / fx and (v - cy) / fy. As A X + B Y + C Z = 1, the
-    vector (A, B, C) is a normal of the plane, away from the camera, whose length is 1 / distance.
+    ``x`` (W,) and ``y`` (H,) are the ray coordinates (u - cx) / fx and (v - cy) / fy. Since A X + B Y + C Z = 1, the
+    vector (A, B, C) is a normal of the plane, pointing away from the camera, whose length is 1 / distance.
     """
     height, width = disparity.shape
     table = _sums(disparity, x, y)
@@ -108,7 +108,7 @@ def fit_planes(disparity: Float32Array, radius: Int32Array, x: Float64Array, y: 
 def _misfit(
     a: float, b: float, c: float, disparity: Float32Array, v: int, u: int, x: Float64Array, y: Float64Array
 ) -> float:
-    """Mean relative error of a plane at (v, u) and those of its four neighbours that lie near it in depth."""
+    """Mean relative error of a plane at (v, u) and those of its four neighbours that are near it in depth."""
     height, width = disparity.shape
     here = disparity[v, u]
     base = a * x[u] + b * y[v] + c
@@ -136,10 +136,10 @@ def sharpen_planes(
     x: Float64Array,
     y: Float64Array,
 ) -> Float32Array:
-    """For every pixel the plane, of its own and those ``reach`` pixels away in eight directions, that fits it best.
+    """For every pixel the best fitting plane, among its own and those ``reach`` pixels away in eight directions.
 
-    Windows that straddle an edge blur it; a window a step to the side lies on one surface. A pixel keeps its own plane
-    unless another misfits by ``own_bonus`` (relative depth) and a quarter of the noise ``margin`` (1/m) less.
+    Windows that straddle an edge blur it; a window one step to the side is on one surface. A pixel keeps its own plane
+    unless another misfit is smaller by ``own_bonus`` (relative depth) and a quarter of the noise ``margin`` (1/m).
     """
     height, width = disparity.shape
     sharp = planes.copy()
@@ -169,7 +169,7 @@ def sharpen_planes(
 
 @njit(cache=True)
 def double_planes(planes: Float32Array, disparity: Float32Array, x: Float64Array, y: Float64Array) -> Float32Array:
-    """Planes at twice the resolution: of the four planes around a pixel the one that fits its ``disparity`` best."""
+    """Planes at twice the resolution: of the four planes around a pixel, the best fit to its ``disparity``."""
     height, width = disparity.shape
     half_height, half_width = planes.shape[0], planes.shape[1]
     full = np.zeros((height, width, 3), np.float32)
@@ -194,7 +194,7 @@ def double_planes(planes: Float32Array, disparity: Float32Array, x: Float64Array
 
 @njit(cache=True)
 def _reach(planes: Float32Array, v: int, u: int, x: float, y: float, q: float, worst: float) -> float:
-    """How far the plane at (v, u) misses disparity ``q`` at ray (x, y); ``worst`` where there is no plane."""
+    """The distance of the plane at (v, u) from disparity ``q`` at ray (x, y); ``worst`` if there is no plane."""
     a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
     if a == 0 and b == 0 and c == 0:
         return worst
@@ -221,7 +221,7 @@ def _jump(
 
 @njit(cache=True)
 def _chord(planes: Float32Array, v: int, u: int, v1: int, u1: int) -> float:
-    """Distance of the unit normals of two pixels; 0 where one is unknown."""
+    """Distance of the unit normals of two pixels; 0 if one is unknown."""
     a0, b0, c0 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
     a1, b1, c1 = planes[v1, u1, 0], planes[v1, u1, 1], planes[v1, u1, 2]
     if a0 == a1 and b0 == b1 and c0 == c1:
@@ -246,7 +246,7 @@ def pair_costs(
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Colour, depth and normal difference (2, H, W) of each pixel to its right (0) and lower (1) neighbour, in units.
 
-    The depth difference is the part of the relative step that no slope explains; -1 where one of the two has no depth.
+    The depth difference is the part of the relative step that no slope explains; -1 if one of the two has no depth.
     """
     height, width = disparity.shape
     colour = np.zeros((2, height, width), np.float32)
@@ -369,7 +369,7 @@ def sum_pixels(
 
 @njit(cache=True)
 def connected(a: NDArray[np.intp], b: NDArray[np.intp], n: int) -> tuple[NDArray[np.intp], int]:
-    """The component (n,) of each of ``n`` nodes under links from ``a`` to ``b`` (L,), and how many there are.
+    """The component (n,) of each of ``n`` nodes under links from ``a`` to ``b`` (L,), and the number of components.
 
     Components are counted in the order of their first nodes.
     """

@@ -31,14 +31,14 @@ TOKENIZER_VERSION = "1"
 
 _ARTICLES = frozenset({"a", "an", "the"})
 _NOT_PLURAL = ("ss", "us", "is", "as")
-_EDGES = ".,;:!?()[]{}<>/\\\"'\u201c\u201d\u2018\u2019-\u2013\u2014"  # around a word, and no part of it
+_EDGES = ".,;:!?()[]{}<>/\\\"'\u201c\u201d\u2018\u2019-\u2013\u2014"  # around a word, but not part of it
 _WORD = re.compile(r"[a-z0-9]+")
 
 
 def words(text: str) -> tuple[str, ...]:
     """The lower-case words of ``text`` without articles, plurals reduced, at most ``N_WORDS``.
 
-    A hyphen parts words, an apostrophe does not: "TV-screens" reads as "tv screen".
+    A hyphen separates words, an apostrophe does not: "TV-screens" becomes "tv screen".
 
     >>> words("An indoor-plant next to the shelves")
     ('indoor', 'plant', 'next', 'to', 'shelf')
@@ -48,7 +48,7 @@ def words(text: str) -> tuple[str, ...]:
 
 
 def unknown_words(text: str, known: Collection[str]) -> tuple[str, ...]:
-    """What of ``text`` is none of the ``known`` words, as it is written, each once; all of it where nothing is a word.
+    """The parts of ``text`` not in the ``known`` words, as written, each once; all of it if it has no word.
 
     >>> unknown_words("the Xqzzy on a shelf", {"on", "shelf"}), unknown_words("??", {"on"})
     (('Xqzzy',), ('??',))
@@ -60,7 +60,7 @@ def unknown_words(text: str, known: Collection[str]) -> tuple[str, ...]:
 
 
 def singular(word: str) -> str:
-    """``word`` without an English plural ending; close enough to put both forms on one row.
+    """``word`` without an English plural ending; approximate, so that both forms share one row.
 
     >>> [singular(word) for word in ("plants", "dishes", "shelves", "candies", "glass")]
     ['plant', 'dish', 'shelf', 'candy', 'glass']
@@ -85,7 +85,7 @@ def fnv1a(text: str) -> int:
 
 
 def _spread(text: str, n_rows: int) -> int:
-    """A row in 1..n_rows-1; the high bits are folded in, for FNV's low bits alone repeat on short words."""
+    """A row in 1..n_rows-1; the high bits are folded in, because FNV's low bits alone repeat on short words."""
     value = fnv1a(text)
     return 1 + ((value >> 15) ^ value) % (n_rows - 1)
 
@@ -118,14 +118,14 @@ def token_ids(texts: Sequence[str]) -> Int64Array:
 
 Words = Mapping[str, tuple[str, ...]]
 _TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("lexicon.toml")))
-# Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
+# Colour words with their sRGB values; chosen to be far apart in CIELAB.
 COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = tuple(
     (name, (red, green, blue)) for name, (red, green, blue) in _TABLE["colour_values"].items()
 )
 
 
 class NamingConfig(BaseModel):
-    """How regions get their names: ``prompt`` with the name at ``{}``, compared at softmax ``temperature``."""
+    """How regions are named: ``prompt`` with the name at ``{}``, compared with softmax ``temperature``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -134,19 +134,19 @@ class NamingConfig(BaseModel):
 
 
 def vocabulary() -> tuple[str, ...]:
-    """The class names that regions may be called, in the order of the list file."""
+    """The class names for regions, in the order of the list file."""
     text = files("su3d_bench.perception.embedded.weights").joinpath("vocabulary.txt").read_text(encoding="utf-8")
     return listed_words(text)
 
 
 def listed_words(text: str) -> tuple[str, ...]:
-    """The words of a list, one a line, empty lines and those that begin with # aside."""
+    """The words of a list, one per line, ignoring empty lines and those that begin with #."""
     lines = (line.strip() for line in text.splitlines())
     return tuple(line for line in lines if line and not line.startswith("#"))
 
 
 def scene_caption(name: str, colour: str | None = None) -> str:
-    """The template caption of a region: "a green chair in a scene"; of one without a name, "an object in a scene"."""
+    """The template caption of a region: "a green chair in a scene"; without a name, "an object in a scene"."""
     name = name.strip() or "object"
     return f"{with_article(name if colour is None else f'{colour} {name}')} in a scene"
 
@@ -154,7 +154,7 @@ def scene_caption(name: str, colour: str | None = None) -> str:
 def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
     """The colour word nearest in CIELAB to the median colour under ``mask``; None for an empty mask.
 
-    Of a large mask some thousand evenly spread pixels are looked at.
+    For a large mask about a thousand evenly spread pixels are used.
     """
     import cv2
 
@@ -165,7 +165,7 @@ def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
     table = np.array([value for _, value in COLOURS], np.float32)
     samples = np.concatenate([np.median(pixels, axis=0)[None].astype(np.float32), table]) / np.float32(255)
     lab = cv2.cvtColor(samples[None], cv2.COLOR_RGB2LAB)[0]
-    # Shading moves lightness far more than hue, so lightness counts for half.
+    # Shading changes lightness far more than hue, so lightness counts half.
     difference = (lab[1:] - lab[0]) * np.array([0.5, 1.0, 1.0], np.float32)
     return COLOURS[int(np.argmin((difference**2).sum(axis=1)))][0]
 
@@ -179,7 +179,7 @@ class Names:
 
 
 class PromptedWords:
-    """A list of ``words`` in a prompt, with "{}" where the word stands; encoded at the first use."""
+    """A list of ``words`` in a prompt, with "{}" as the placeholder; encoded at the first use."""
 
     def __init__(self, encoder: Encoder, words: Sequence[str], prompt: str) -> None:
         self.words = tuple(words)
@@ -188,7 +188,7 @@ class PromptedWords:
 
     def similarity(self, features: Float32Array) -> Float64Array:
         """The cosines (K, W) of ``features`` (K, D) of images with the words."""
-        # einsum sums in one order whatever the number of threads; a matrix product may not.
+        # einsum sums in the same order for any number of threads; a matrix product may not.
         similarity: Float64Array = np.einsum("kd,wd->kw", features.astype(np.float64), self._features)
         return similarity
 
@@ -224,9 +224,9 @@ GROUPS = _words("groups")  # words that cover several classes
 AFFORDANCES = _words("uses")  # a phrase and every class of which it is true
 ROOM_NAMES = _words("rooms")
 COLOUR_WORDS, SIZE_WORDS, RELATION_WORDS = map(_words, ("colours", "sizes", "relations"))
-SURFACES = frozenset(_TABLE["surfaces"])  # what nearly everything stands on; captions prefer another neighbour
+SURFACES = frozenset(_TABLE["surfaces"])  # nearly everything stands on these; captions prefer another neighbour
 MATERIALS = tuple(_TABLE["materials"])
-# The captions of the training around a name; ``{a}`` stands for the name after its article.
+# The training captions around a name; ``{a}`` stands for the name with its article.
 CLASS_TEMPLATES = ("{a} in a scene", "an image of {a}", "{}", "{a}", "{} in scene", "a picture of {a}", "there is {a}")
 ANYTHING = ("thing", "object", "item")
 

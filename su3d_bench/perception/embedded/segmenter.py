@@ -1,4 +1,4 @@
-"""A segmenter that needs no weights: superpixels of colour, depth and normals; surfaces; objects by convexity."""
+"""A segmenter without weights: superpixels of colour, depth and normals; surfaces; objects by convexity."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Grap
 
 
 def _cheap_first(cost: Float32Array) -> Int64Array:
-    """Places of the pairs of neighbours in the flat ``cost`` (2, H, W), by its levels of 1 / 64.
+    """Positions of the pairs of neighbours in the flat ``cost`` (2, H, W), sorted by its levels of 1 / 64.
 
-    Those of equal level are in row-major order, right neighbours first.
+    Pairs of equal level are in row-major order, right neighbours first.
     """
     level = np.minimum(cost * 64, MAX_LEVELS - 1).astype(np.int16)
     level[0, :, -1] = level[1, -1] = -1  # no neighbour
@@ -62,7 +62,7 @@ def _cheap_first(cost: Float32Array) -> Int64Array:
 
 
 def _at_working_size(frame: Frame, max_width: int) -> tuple[UInt8Array, Float32Array, Float64Array]:
-    """Colour averaged and depth sampled at a whole fraction of the size, with the intrinsics that fit the samples."""
+    """Colour averaged and depth sampled at a whole fraction of the size, with the matching intrinsics."""
     import cv2
 
     factor = -(-frame.rgb.shape[1] // max_width)
@@ -86,9 +86,9 @@ def _smooth_lab(rgb: UInt8Array, config: SegmenterConfig) -> Float32Array:
 
 
 def _denoised(disparity: Float32Array, config: SegmenterConfig) -> tuple[Float32Array, float]:
-    """``disparity`` without most of its noise, and the standard deviation of what is left.
+    """``disparity`` without most of its noise, and the standard deviation of the remaining noise.
 
-    The noise of depth cameras grows with the square of depth (Khoshelham and Elberink 2012): that of disparity is even.
+    Depth noise grows with the square of depth (Khoshelham and Elberink 2012), so that it is uniform in disparity.
     """
     import cv2
 
@@ -106,7 +106,7 @@ def disparity_noise(disparity: Float32Array) -> float:
     size = min(left.shape[1], here.shape[1], right.shape[1])
     left, here, right = left[:, :size], here[:, :size], right[:, :size]
     bends = np.abs(left - 2 * here + right)[(left > 0) & (here > 0) & (right > 0)]
-    # 1.2816: the 80th percentile of |x| for unit normal x; it leaves out most edges, and still counts the steps of
+    # 1.2816: the 80th percentile of |x| for unit normal x; it excludes most edges, but still counts the steps of
     # coarsely quantised depth, whose differences are mostly 0. sqrt(6): a second difference adds 1 + 4 + 1 variances.
     return float(np.quantile(bends, 0.8)) / (1.2816 * float(np.sqrt(6))) if len(bends) else 0.0
 
@@ -133,7 +133,7 @@ def _planes(
 
 
 class RgbdSegmenter:
-    """Regions of any RGB-D frame: whole ``objects`` without floor, walls and ceiling; or ``parts`` of everything."""
+    """Regions of any RGB-D frame: complete ``objects`` without floor, walls and ceiling; or ``parts`` of everything."""
 
     name = "rgbd"
 
@@ -146,7 +146,7 @@ class RgbdSegmenter:
         self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest(*CODE))
 
     def segment(self, frame: Frame) -> Regions:
-        """Masks that do not overlap, largest first."""
+        """Non-overlapping masks, largest first."""
         import cv2
 
         cv2.setNumThreads(1)

@@ -1,4 +1,4 @@
-"""A graph of neighbouring surface pieces that is contracted in rounds."""
+"""A graph of neighbouring surface pieces, contracted in rounds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ IndexArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Pieces:
-    """Sums over the pixels of N pieces; of points and normals only where depth is known.
+    """Sums over the pixels of N pieces; points and normals only where depth is known.
 
     ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``point`` (N, 3) sum of camera-frame points m;
     ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3) sum of unit normals towards the camera;
@@ -33,7 +33,7 @@ class Pieces:
 
     @classmethod
     def from_sums(cls, sums: Float64Array) -> Pieces:
-        """Pieces out of the columns of ``kernels.sum_pixels``."""
+        """Pieces from the columns of ``kernels.sum_pixels``."""
         return cls(
             n_pixels=sums[:, 0],
             n_points=sums[:, 1],
@@ -59,7 +59,7 @@ class Pieces:
         return self.point / np.maximum(self.n_points, 1)[:, None]
 
     def unit_normal(self) -> Float64Array:
-        """Mean directions (N, 3), zero where no normal is known."""
+        """Mean directions (N, 3), zero if no normal is known."""
         length = np.linalg.norm(self.normal, axis=1, keepdims=True)
         return self.normal / np.where(length > 0, length, 1)
 
@@ -75,11 +75,11 @@ class Pieces:
 
 @dataclass(frozen=True)
 class Borders:
-    """Sums along the E borders between pieces ``a`` < ``b`` (E,): pixel pairs, and what was measured at each pair.
+    """Sums along the E borders between pieces ``a`` < ``b`` (E,): pixel pairs, and the measurements at each pair.
 
-    ``length`` pairs; ``contrast`` colour difference; ``n_deep`` pairs with depth on both sides; ``gap`` pairs of those
-    with a jump in depth; ``jump`` relative depth steps of those; ``bend`` signed angle between the pieces over the
-    pairs without a jump, convex positive.
+    ``length`` pairs; ``contrast`` colour difference; ``n_deep`` pairs with depth on both sides; ``gap`` those of them
+    with a jump in depth; ``jump`` their relative depth steps; ``bend`` signed angle between the pieces over the pairs
+    without a jump, positive if convex.
     """
 
     a: IndexArray
@@ -106,7 +106,7 @@ class Borders:
 
 @dataclass(frozen=True)
 class Graph:
-    """Pieces and borders, and which piece each of the first superpixels is in (S,)."""
+    """Pieces and borders, and the piece of each original superpixel (S,)."""
 
     pieces: Pieces
     borders: Borders
@@ -145,7 +145,7 @@ def merge_cheapest(
 
     The limit rises to 1 in ``n_levels`` steps. At each step every piece joins its cheapest neighbour below the limit,
     and costs are recomputed from the joined sums, until none is left. Ties go to the pair first by (a, b).
-    Pieces that stand ``is_apart`` (N,) join nothing.
+    Pieces with ``is_apart`` (N,) are not joined.
     """
     if is_apart is not None:
         apart_first = is_apart[graph.piece_of_superpixel]
@@ -175,7 +175,7 @@ def measure_borders(
 ) -> Borders:
     """The borders of the superpixels in ``labels`` (H, W), from per-pair colour and depth differences (2, H, W).
 
-    Depth differences are relative, in units of ``depth_unit``, from which on they are jumps; -1 where unknown.
+    Depth differences are relative, in units of ``depth_unit``, and count as jumps from 1 on; -1 where unknown.
     """
     a, b, contrasts, depth = border_pairs(labels, contrast, depth_cost)
     deep, gap = (depth >= 0).astype(np.float64), (depth >= 1).astype(np.float64)
@@ -190,7 +190,7 @@ def border_pairs(
 ) -> tuple[IndexArray, IndexArray, Float32Array, Float32Array]:
     """The neighbouring pixels of different ``labels`` (H, W): the lower and the higher label, and both differences.
 
-    First the pairs along rows, then those along columns, as ``contrast`` and ``depth_cost`` (2, H, W) have them.
+    First the pairs along rows, then those along columns, as in ``contrast`` and ``depth_cost`` (2, H, W).
     """
     differs = np.zeros(contrast.shape, bool)
     np.not_equal(labels[:, :-1], labels[:, 1:], out=differs[0, :, :-1])
@@ -202,7 +202,7 @@ def border_pairs(
 
 
 def signed_bend(pieces: Pieces, a: IndexArray, b: IndexArray) -> Float64Array:
-    """Angles (E,) rad between the normals of pieces ``a`` and ``b``: positive where the edge is convex."""
+    """Angles (E,) rad between the normals of pieces ``a`` and ``b``: positive if the edge is convex."""
     normal, centroid = pieces.unit_normal(), pieces.centroid()
     angle = np.arccos(np.clip((normal[a] * normal[b]).sum(axis=1), -1, 1))
     known = (pieces.n_points[a] > 0) & (pieces.n_points[b] > 0)

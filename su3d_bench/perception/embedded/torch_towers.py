@@ -1,4 +1,4 @@
-"""The towers of the embedded encoder in torch: what is trained, and what runs the ONNX files' weights on a GPU."""
+"""The towers of the embedded encoder in torch: used for training, and to run the ONNX files' weights on a GPU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXT_DIM = 128
 
 
 class TorchTower:
-    """One tower on ``device``, called as the session of ONNX Runtime that it stands in for is."""
+    """One tower on ``device``, with the interface of the ONNX Runtime session that it replaces."""
 
     def __init__(self, path: Path, *, is_image: bool, device: str) -> None:
         make_deterministic(device)
@@ -39,7 +39,7 @@ class TorchTower:
 
 
 def with_weights(tower: nn.Module, path: Path, device: str) -> nn.Module:
-    """``tower`` with the weights of the file at ``path``, where each convolution holds its normalisation."""
+    """``tower`` with the weights of the file at ``path``, in which convolutions include their normalisation."""
     onnx = require("onnx", f"the embedded encoder on device '{device}'")
     for layers in [module for module in tower.modules() if isinstance(module, nn.Sequential)]:
         for k, (layer, after) in enumerate(pairwise(list(layers))):
@@ -48,7 +48,7 @@ def with_weights(tower: nn.Module, path: Path, device: str) -> nn.Module:
     graph = onnx.load(str(path)).graph
     stored = {weight.name: torch.tensor(onnx.numpy_helper.to_array(weight)) for weight in graph.initializer}
     names = [name for name, layer in tower.named_modules() if isinstance(layer, nn.Conv1d | nn.Conv2d)]
-    # Normalised convolutions have lost their names in the file; nodes stand in the order in which they run.
+    # Normalised convolutions have lost their names in the file; nodes are in execution order.
     nodes = [node for node in graph.node if node.op_type == "Conv"]
     state = {name: value for name, value in stored.items() if name in tower.state_dict()}
     for name, node in zip(names, nodes, strict=True):
@@ -83,8 +83,8 @@ class Residual(nn.Module):
 class ImageTower(nn.Module):
     """Pixels (N, 64, 64, 3) uint8 and log sizes (N, 2) to features (N, 128) of length 1.
 
-    The crop's size enters as two constant planes, for the stretch to 64 x 64 has hidden it. The middle of the last map
-    is pooled once more on its own: there stands the object, around it the context.
+    The crop's size is added as two constant planes, because resizing to 64 x 64 hides it. The middle of the last
+    feature map is also pooled separately: it shows the object, and the rest its context.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class ImageTower(nn.Module):
 
 
 class TextTower(nn.Module):
-    """Table rows (N, 16, 10) int64 to features (N, 128) of length 1; convolutions see the order of words."""
+    """Table rows (N, 16, 10) int64 to features (N, 128) of length 1; convolutions capture the word order."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
 """Names and captions of image crops by a vision-language model, with the tagger's name as fallback.
 
-And the paper's own words to its models, those of other tasks too.
+Also the paper's own prompts for its models, including those for other tasks.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from su3d_bench.perception.language.parsing import CaptionForm, described, is_re
 
 # opensu3d.tex, section III-A.
 DESCRIBE = "Give name and description to the object. Output e.g. `name':`description'"
-# opensu3d.tex, section III-C. The paper prints no more; how to answer is ours, so that the reply can be read.
+# opensu3d.tex, section III-C. The paper prints no more; the answer format is ours, so that the reply can be parsed.
 REFINE = "assign a single name to the object based on a given list of names"
 REFINE_FORM = "Answer with that name alone."
 # opensu3d.tex, section III-E, the six points of the prompting strategy.
@@ -33,19 +33,19 @@ STRATEGY = (
     "Assume `Tolerance' if necessary.",
 )
 
-# What of the language model's settings moves a caption; times, prices and limits do not.
+# Settings of the language model that affect a caption; times, prices and limits do not.
 CAPTION_SETTINGS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
 logger = logging.getLogger(__name__)
 
 
 def list_of_names(names: Sequence[str]) -> str:
-    """The names as they are given to the model."""
+    """The names in the form given to the model."""
     return json.dumps(list(names), ensure_ascii=False)
 
 
 @dataclass(frozen=True)
 class CropCaption:
-    """Name and caption of a crop, who gave them, and why where it was not the model; ``key`` leads to the reply."""
+    """Name and caption of a crop, their source, and the reason for a fallback; ``key`` identifies the reply."""
 
     name: str
     caption: str
@@ -55,7 +55,7 @@ class CropCaption:
 
 
 class Captioner:
-    """Asks the vision model for the name and description of each crop; ``digest`` moves with what moves an answer."""
+    """Asks the vision model for the name and description of each crop; ``digest`` covers all that affects an answer."""
 
     def __init__(self, model: LanguageModel, config: LanguageConfig) -> None:
         self._model = model

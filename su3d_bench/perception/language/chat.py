@@ -26,12 +26,12 @@ from su3d_bench.store.run_folder import check_no_links
 
 Purpose = Literal["caption", "refine", "ask", "judge"]
 CHARACTERS_PER_TOKEN = 4  # OpenAI's rule of thumb for English
-MESSAGE_TOKENS = 8  # what the frame of a message costs, roughly
+MESSAGE_TOKENS = 8  # approximate overhead per message
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """An RGB picture (h, w, 3) that goes along with a request."""
+    """An RGB image (h, w, 3) that is part of a request."""
 
     rgb: UInt8Array
 
@@ -45,11 +45,11 @@ class Image:
         import cv2
 
         done, packed = cv2.imencode(".png", np.ascontiguousarray(self.rgb[:, :, ::-1]))
-        assert done, "a picture in memory is packed"
+        assert done, "an image in memory can be encoded"
         return packed.tobytes()
 
     def n_tokens(self, detail: str) -> int:
-        """Tokens by OpenAI's rule for GPT-4 with vision: 85, and 170 a tile of 512 pixels unless detail is low."""
+        """Tokens by OpenAI's rule for GPT-4 with vision: 85, plus 170 per tile of 512 pixels unless detail is low."""
         if detail == "low":
             return 85
         height, width = self.rgb.shape[:2]
@@ -71,9 +71,9 @@ def fitted(rgb: UInt8Array, max_px: int) -> Image:
 
 @dataclass(frozen=True)
 class ChatRequest:
-    """One question; ``key`` addresses it by content, the server that answers left aside.
+    """One question; ``key`` identifies it by content, independent of the server.
 
-    ``form``: the JSON that is asked of a server which can be held to a schema.
+    ``form``: the JSON schema requested from servers that support one.
     """
 
     purpose: Purpose
@@ -88,7 +88,7 @@ class ChatRequest:
     form: type[BaseModel] | None = None
 
     def record(self) -> dict[str, Any]:
-        """The request as it is stored: images by their digest."""
+        """The request as stored, with images as digests."""
         schema = {} if self.form is None else {"schema": self.form.model_json_schema()}
         return schema | {
             "model": self.model,
@@ -125,7 +125,7 @@ class ChatRequest:
 
     @property
     def n_input_tokens(self) -> int:
-        """A rough count of the tokens that go in."""
+        """A rough count of the input tokens."""
         words = n_tokens(self.system) + n_tokens(self.text) + 2 * MESSAGE_TOKENS
         return words + sum(image.n_tokens(self.image_detail) for image in self.images)
 
@@ -137,9 +137,9 @@ def n_tokens(text: str) -> int:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a request: ``text``, or the reason of a ``failure``.
+    """The result of a request: ``text``, or the reason of a ``failure``.
 
-    ``dropped`` names the parameters that the server would not take; ``was_stored``: nobody was asked.
+    ``dropped`` names the parameters that the server did not accept; ``was_stored``: no request was sent.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -158,7 +158,7 @@ Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 class Price(BaseModel):
-    """US dollars for a million tokens."""
+    """US dollars per million tokens."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -171,10 +171,10 @@ _GPT4_TURBO = Price(input_usd=10.0, output_usd=30.0)
 
 
 class LanguageConfig(BaseModel):
-    """Which models are asked, how long one waits for them, and what a command may spend.
+    """Which models are used, timeouts, and what a command may spend.
 
-    ``base_url`` empty: ``$OPENAI_BASE_URL``, else the service of OpenAI. The key is read from the environment variable
-    ``key_variable`` and stands nowhere else. ``budget_tokens``, ``budget_usd`` and ``requests_per_minute`` 0: no limit.
+    ``base_url`` empty: ``$OPENAI_BASE_URL``, otherwise the service of OpenAI. The key is only read from the environment
+    variable ``key_variable``. ``budget_tokens``, ``budget_usd`` and ``requests_per_minute`` 0: no limit.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
@@ -185,20 +185,20 @@ class LanguageConfig(BaseModel):
     vision_model: str = Field(default="gpt-4-vision-preview", min_length=1, max_length=200)
     text_model: str = Field(default="gpt-4-1106-preview", min_length=1, max_length=200)
     temperature: float = Field(default=0.0, ge=0, le=2)  # 0: the paper's
-    # Sent where a server takes it; the paper names none.
+    # Sent if a server accepts it; the paper names none.
     seed: int | None = Field(default=0, ge=0, lt=2**31)
     max_answer_tokens: int = Field(default=1000, ge=1, le=100_000)
-    # Tokens that the text model reads and writes in all: 128,000 of gpt-4-1106-preview.
+    # Total tokens that the text model reads and writes: 128,000 for gpt-4-1106-preview.
     context_tokens: int = Field(default=128_000, ge=1000)
     image_detail: Literal["auto", "low", "high"] = "auto"
-    # A larger crop is scaled down: OpenAI's models see the shorter side of an image at 768 pixels at most.
+    # A larger crop is scaled down: OpenAI's models see the shorter side of an image at no more than 768 pixels.
     max_image_px: int = Field(default=768, ge=32, le=4096)
     timeout_s: Seconds = 120.0  # without a byte of the answer
     max_retries: int = Field(default=4, ge=0, le=20)  # of the client library, with growing pauses
     max_answer_bytes: int = Field(default=1_000_000, ge=1000, le=100_000_000)
     requests_per_minute: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     max_concurrent: int = Field(default=4, ge=1, le=64)
-    # So many requests given up one after the other end the command: the server is down, not the request bad.
+    # This many consecutive failed requests end the command, because the server is most likely down.
     max_failures_in_a_row: int = Field(default=5, ge=1)
     budget_tokens: int = Field(default=0, ge=0)
     budget_usd: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -212,7 +212,7 @@ class LanguageConfig(BaseModel):
 
 
 def check_address(address: str) -> None:
-    """A ``ValueError`` where ``address`` is no http or https address, or holds a user name or a password."""
+    """A ``ValueError`` if ``address`` is not an http or https URL, or contains a user name, a password or a query."""
     if not address:
         return
     try:
@@ -259,7 +259,7 @@ class ReplyStore:
             return None
 
     def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
-        """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
+        """The stored reply: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
         check_no_links(self.folder.parent, self.folder / IMAGES)
         make_folder(self.folder)
         with self._locked():

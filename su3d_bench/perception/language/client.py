@@ -21,16 +21,16 @@ from su3d_bench.core.system.devices import require
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, ReplyStore, check_address, n_tokens
 
 HOSTED = "https://api.openai.com/v1"
-NO_KEY = "none"  # servers on one's own machine ask for no key, the client library for any text
-MAX_TOKENS = 100_000_000  # of one request; no model reads or writes so many
+NO_KEY = "none"  # local servers need no key, but the client library requires some text
+MAX_TOKENS = 100_000_000  # per request; no model reads or writes that many
 OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens", "response_format")
 PLACE = "(key)"
-MIN_KEY_LENGTH = 8  # what is shorter is no secret: "none", "EMPTY", "test"
+MIN_KEY_LENGTH = 8  # shorter keys are not secret: "none", "EMPTY", "test"
 KEY_LIKE = re.compile(r"\b(?:sk|pk|key|gsk|hf)[-_][A-Za-z0-9_\-*]{6,}", re.IGNORECASE)
 
 
 class LanguageModel(Protocol):
-    """What captions, names and reasoning need of a language model."""
+    """The interface of a language model for captions, names and reasoning."""
 
     def ask_all(self, requests: Sequence[ChatRequest]) -> list[Reply]:
         """The replies to ``requests``, in order."""
@@ -40,8 +40,8 @@ class LanguageModel(Protocol):
 class ChatClient:
     """An OpenAI-compatible server with stored replies; thread-safe.
 
-    ``offline``: a question without a stored reply is a ``StoreError``. A request that failed for good is stored as
-    that, so that a rerun is identical; ``retry_failed`` gives it another chance.
+    ``offline``: a question without a stored reply is a ``StoreError``. A request that failed permanently is stored as
+    failed, so that a rerun is identical; ``retry_failed`` sends it again.
     """
 
     def __init__(
@@ -73,9 +73,9 @@ class ChatClient:
                 raise
 
     def ask(self, request: ChatRequest) -> Reply:
-        """The stored reply, or that of the server; a request that cannot be answered gives a reply with a failure.
+        """The stored reply, or that of the server; a request that cannot be answered returns a reply with a failure.
 
-        Raises ``ModelMissing`` where the server, the key or the model is not there, ``RunIncomplete`` at the cap.
+        Raises ``ModelMissing`` if the server, the key or the model is not available, ``RunIncomplete`` at the cap.
         """
         with self._lock:
             own = self._locks.setdefault(request.key, threading.Lock())
@@ -128,7 +128,7 @@ class ChatClient:
 
 
 class _Pace:
-    """Lets requests pass no faster than the limit, all threads together."""
+    """Limits the request rate over all threads."""
 
     def __init__(self, per_minute: float) -> None:
         self._gap_s = 60.0 / per_minute if per_minute else 0.0
@@ -149,7 +149,7 @@ class _Pace:
 
 
 class _Failed(Exception):
-    """A request was not answered; ``is_down``: for a reason that may lie with the server and not with the request."""
+    """A request was not answered; ``is_down``: possibly because of the server and not because of the request."""
 
     def __init__(self, reason: str, *, is_down: bool) -> None:
         super().__init__(reason)
@@ -176,7 +176,7 @@ class _Usage(BaseModel):
 
 
 class _Completion(BaseModel):
-    """What is read of a chat completion."""
+    """The fields that are read from a chat completion."""
 
     model: str = ""
     choices: list[_Choice] = Field(min_length=1)
@@ -200,9 +200,9 @@ class Server:
         return printable(urlsplit(self._address).netloc, 200)
 
     def send(self, request: ChatRequest) -> Reply:
-        """The answer; parameters that the server refuses by name are left out, and stay so.
+        """The answer; parameters that the server rejects by name are omitted from then on.
 
-        Raises ``_Failed``, and ``ModelMissing`` where no request can be answered: no server, no key, no such model.
+        Raises ``_Failed``, and ``ModelMissing`` if no request can be answered: no server, no key, no such model.
         """
         with self._lock:
             self._client = self._client or self._connected()
@@ -211,7 +211,7 @@ class Server:
             refused = self._post(_without(request.body(), dropped))
             if isinstance(refused, str):
                 if refused in dropped:
-                    raise _Failed(f"the server refuses '{refused}'", is_down=False)
+                    raise _Failed(f"the server rejects '{refused}'", is_down=False)
                 with self._lock:
                     self._dropped = (*self._dropped, refused)
                 continue
@@ -236,7 +236,7 @@ class Server:
         )
 
     def _post(self, body: dict[str, Any]) -> bytes | str:
-        """The answer's content, or the name of an optional parameter that the server refuses."""
+        """The content of the answer, or the name of an optional parameter that the server rejects."""
         import openai
 
         n_tries = self._config.max_retries + 1
@@ -301,7 +301,7 @@ class Server:
         return text.replace(self._key, PLACE) if len(self._key) >= MIN_KEY_LENGTH else text
 
     def _shown(self, text: str, limit: int = 200) -> str:
-        """What a server says, fit for a message or a record: without the key or what looks like one."""
+        """Text from a server, safe for a message or a record: without the key or anything that looks like one."""
         return printable(KEY_LIKE.sub(PLACE, self._without_key(text)), limit)
 
 
@@ -323,7 +323,7 @@ def _key_of(config: LanguageConfig) -> str:
 
 
 def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
-    """``body`` without what the server refused; newer models take the cap of the answer under another name."""
+    """``body`` without the rejected parameters; newer models have another name for the answer limit."""
     kept = {name: value for name, value in body.items() if name not in dropped}
     if "max_tokens" in dropped:
         kept["max_completion_tokens"] = body["max_tokens"]
@@ -331,13 +331,13 @@ def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _bounded(max_bytes: int) -> Callable[[Any], None]:
-    """A hook that ends the reading of a response beyond ``max_bytes``, and of one that is packed, with an error."""
+    """A hook that raises an error for a response larger than ``max_bytes`` or a compressed one."""
 
     def hook(response: Any) -> None:
         if response.headers.get("content-encoding", "identity") not in ("", "identity"):
-            raise _TooLarge("packed")
+            raise _TooLarge("compressed")
         body = response.stream
-        # The client library has its own choice of httpx or httpx2.
+        # The client library uses either httpx or httpx2.
         base = sys.modules[type(response).__module__.partition(".")[0]].SyncByteStream
 
         class Bounded(base):  # type: ignore[misc, valid-type]
@@ -357,12 +357,12 @@ def _bounded(max_bytes: int) -> Callable[[Any], None]:
     return hook
 
 
-# ---- what asking costs
+# ---- costs
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What ``n_requests`` different requests would cost at most; ``usd`` is None where a model has no price."""
+    """Upper bound of the cost of ``n_requests`` distinct requests; ``usd`` is None if a model has no price."""
 
     n_requests: int
     n_stored: int
@@ -380,7 +380,7 @@ class Estimate:
         cost = "no price in the table" if self.usd is None else f"at most {self.usd:.4f} USD"
         models = ", ".join(self.models) or "no model"
         return (
-            f"{self.n_requests} requests, {self.n_stored} of them answered before; {to_send} to send to {models}: "
+            f"{self.n_requests} requests, {self.n_stored} of them already answered; {to_send} to send to {models}: "
             f"about {self.input_tokens:,} tokens in, at most {self.output_tokens:,} out, {cost}"
         )
 
@@ -394,7 +394,7 @@ def cost_usd(config: LanguageConfig, model: str, input_tokens: int, output_token
 
 
 def estimate_of(config: LanguageConfig, to_send: Sequence[ChatRequest], n_stored: int) -> Estimate:
-    """The most that sending ``to_send`` can cost, beside ``n_stored`` requests that have replies."""
+    """Upper bound of the cost of ``to_send``, in addition to ``n_stored`` requests that have replies."""
     costs = [cost_usd(config, request.model, request.n_input_tokens, request.max_answer_tokens) for request in to_send]
     known = [cost for cost in costs if cost is not None]
     return Estimate(
@@ -408,7 +408,7 @@ def estimate_of(config: LanguageConfig, to_send: Sequence[ChatRequest], n_stored
 
 
 class Spending:
-    """What was spent so far, with the cap of the configuration; may be used from several threads."""
+    """The amount spent so far, limited by the configured cap; thread-safe."""
 
     def __init__(self, config: LanguageConfig) -> None:
         self._config = config
@@ -420,9 +420,9 @@ class Spending:
 
     @contextmanager
     def reserved(self, request: ChatRequest) -> Iterator[list[Reply]]:
-        """Holds what ``request`` may cost; the block puts the reply into the list that it gets.
+        """Reserve the maximum cost of ``request``; the block appends the reply to the list that it gets.
 
-        A ``RunIncomplete`` where the cap would be passed. A request without a reply is counted by its input.
+        A ``RunIncomplete`` if the cap would be exceeded. A request without a reply is counted by its input.
         """
         tokens = request.n_input_tokens + request.max_answer_tokens
         usd = self._cost(request.model, request.n_input_tokens, request.max_answer_tokens)
@@ -455,11 +455,11 @@ class Spending:
         cap = self._config
         if cap.budget_tokens and self.tokens + self._reserved_tokens + tokens > cap.budget_tokens:
             raise RunIncomplete(
-                f"language: budget_tokens = {cap.budget_tokens:,} is reached ({self.tokens:,} spent); what was "
-                "answered is kept: raise the cap and run the same command again"
+                f"language: budget_tokens = {cap.budget_tokens:,} is reached ({self.tokens:,} spent); replies "
+                "so far are stored: raise the cap and run the same command again"
             )
         if cap.budget_usd and self.usd + self._reserved_usd + usd > cap.budget_usd:
             raise RunIncomplete(
-                f"language: budget_usd = {cap.budget_usd:g} is reached ({self.usd:.4f} USD spent); what was answered "
-                "is kept: raise the cap and run the same command again"
+                f"language: budget_usd = {cap.budget_usd:g} is reached ({self.usd:.4f} USD spent); replies so far "
+                "are stored: raise the cap and run the same command again"
             )

@@ -1,7 +1,7 @@
 """Parse replies of language models: a name and description, one name, or an answer with object ids.
 
-Servers that take a schema answer in JSON. What others write is searched for JSON, then for the form that the paper's
-prompt shows; what holds nothing of use is None. Every pattern reads a bounded text.
+Servers that support a schema answer in JSON. Other answers are searched for JSON, then for the format in the paper's
+prompt; an answer without usable content is None. Every pattern reads a text of bounded length.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from su3d_bench.core.errors import printable
 from su3d_bench.perception.embedded.lexicon import words
 
-MAX_READ = 8000  # characters of an answer; a name, a caption or an answer stands within
+MAX_READ = 8000  # characters read per answer, enough for a name, a caption or an answer
 MAX_NAME_CHARACTERS, MAX_NAME_WORDS = 60, 5
 MAX_CAPTION_CHARACTERS = 500
 MAX_OBJECTS_TRIED = 20
@@ -31,7 +31,7 @@ _REFUSAL = re.compile(
     re.IGNORECASE,
 )
 _FENCE = re.compile(r"```[a-zA-Z]*")
-# Name: X, Description: Y, in quotes or without, on one line or two
+# Name: X, Description: Y, with or without quotes, on one line or two
 _LABELLED = re.compile(
     rf"\b(?:name|object)[{_QUOTE}]*[ \t]*:\s*(?P<name>[^\n:]{{1,80}}?)[,;\s{_QUOTE}]*"
     rf"\b(?:description|caption)[{_QUOTE}]*[ \t]*:\s*(?P<caption>[^\n]{{1,2000}})",
@@ -44,7 +44,7 @@ _BARE_PAIR = re.compile(
     r"^[-*•\d.\s]*(?P<name>[^\n:.,;!?]{1,60}?)\s*(?:[:：]|\s[-–—]+\s)\s*(?P<caption>[^\n]{3,2000})$", re.M
 )
 _NAME_LEAD = re.compile(r"^(?:the )?(?:[a-z]+ ){0,2}(?:name|answer|label)(?: is)?\s*[:：]?\s*", re.IGNORECASE)
-# Words of sentences: no name of a thing has them.
+# Words of sentences, which no object name contains.
 _NO_NAME = frozenset(
     (
         "is", "are", "was", "be", "am", "i", "you", "we", "it", "its", "they", "cannot", "could", "would", "should",
@@ -55,7 +55,7 @@ _NO_NAME = frozenset(
 )  # fmt: skip
 _NO_OBJECT = frozenset({"object", "objects", "thing", "item", "image", "n/a"})
 _KEYS_OF_ERRORS = frozenset({"error", "message", "refusal", "reason", "status"})
-# Ids are of 64 bits: a part of a segment has one of a dozen digits (opensu3d/postprocess.py).
+# Ids have 64 bits: a part of a segment has an id of about a dozen digits (opensu3d/postprocess.py).
 _ID = r"\d{1,18}(?!\d)"
 _OBJECT_ID = re.compile(rf"(?:#|\b(?:ids?|objects?)[\s_:#=\[(]*)({_ID}(?:\s*(?:,|and|&)\s*#?{_ID})*)", re.IGNORECASE)
 
@@ -70,7 +70,7 @@ class CaptionForm(BaseModel):
 
 
 class _Answer(BaseModel):
-    """The JSON of an answer, as the prompt of the solver asks for it; lists may hold what is no id."""
+    """The JSON of an answer, as requested in the solver's prompt; lists may contain values that are not ids."""
 
     answer: bool | int | float | str
     object_ids: list[Any] = []
@@ -88,7 +88,7 @@ class Described:
 
 @dataclass(frozen=True)
 class Answered:
-    """An answer in words, the ids of the objects that it names and of those they are compared with, the reasons."""
+    """An answer in words, the ids of its objects and of the reference objects, and the reasons."""
 
     text: str
     object_ids: tuple[int, ...]
@@ -124,7 +124,7 @@ def described(text: str) -> Described | None:
 
 
 def chosen_name(text: str, names: Sequence[str]) -> str | None:
-    """The name that an answer settles on: one of ``names``, in their spelling, or a short noun phrase of its own."""
+    """The name chosen by an answer: one of ``names``, in their spelling, or a short noun phrase of its own."""
     plain = _FENCE.sub("", text[:MAX_READ]).strip()
     told = next((value["name"] for value in _json_objects(plain) if isinstance(value.get("name"), str)), plain)
     lines = [_NAME_LEAD.sub("", line.strip(_QUOTE + " ")) for line in told.splitlines() if line.strip()]
@@ -143,9 +143,9 @@ def chosen_name(text: str, names: Sequence[str]) -> str | None:
 
 
 def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
-    """The answer of a model that was asked for JSON with ``answer`` and ``object_ids``; from prose where it gave that.
+    """The answer of a model that was asked for JSON with ``answer`` and ``object_ids``; prose is parsed too.
 
-    Ids that are none of ``known_ids`` are left out.
+    Ids that are not in ``known_ids`` are dropped.
     """
     plain = _FENCE.sub("", text[:MAX_READ]).strip()
     if not plain:
@@ -173,7 +173,7 @@ def _ids(listed: list[Any], known: Collection[int]) -> tuple[int, ...]:
 
 
 def clean_name(text: str) -> str | None:
-    """``text`` as a name: lower case, without quotes, article and full stop; None where it is no noun phrase.
+    """``text`` as a name: lower case, without quotes, article and full stop; None if it is not a noun phrase.
 
     >>> clean_name('"The Office Chair".'), clean_name("I cannot tell")
     ('office chair', None)

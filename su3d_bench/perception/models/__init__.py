@@ -1,1 +1,1 @@
-"""Foundation models: which there are, where their files lie, and how they are loaded and run."""
+"""Foundation models: the catalogue, the location of their files, and how they are loaded and run."""

@@ -1,4 +1,4 @@
-"""Every model by its short name, from ``catalogue.toml``: the files that it comes in, from where, its licence."""
+"""Every model by its short name, from ``catalogue.toml``: its files, their source, and its licence."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ONNX_MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class ModelForm:
-    """One set of files in which a model comes; the first of ``files`` is the weights.
+    """One set of files of a model; the first of ``files`` is the weights.
 
-    ``repository`` is its name on the Hugging Face hub, ``source`` where a person fetches it; ``architecture`` what
-    open_clip calls the model; ``sha256`` by file name; ``is_read`` false: named here to be recognised, not loaded.
+    ``repository`` is its name on the Hugging Face hub, ``source`` the address for a manual download; ``architecture``
+    its name in open_clip; ``sha256`` by file name; ``is_read`` false: only recognised, not loaded.
     """
 
     form: FormName
@@ -37,10 +37,10 @@ class ModelForm:
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """One model: ``n_parameters_million`` rules the memory that it takes; ``forms`` in the order they are tried.
+    """One model: ``n_parameters_million`` determines its memory; ``forms`` are in the order in which they are tried.
 
-    ``known_as``: architecture and training in open_clip's words, which protocols and run records use for encoders.
-    ``trained_on``: the data of its training, as its publisher names them.
+    ``known_as``: architecture and training as named by open_clip, which protocols and run records use for encoders.
+    ``trained_on``: its training data, as named by the publisher.
     """
 
     name: str
@@ -54,17 +54,17 @@ class ModelEntry:
     trained_on: str = ""
 
     def memory_mb(self, bytes_a_weight: int) -> int:
-        """What the weights alone take on the device, in MB; activations come on top."""
+        """The memory of the weights on the device, in MB, without activations."""
         return self.n_parameters_million * bytes_a_weight
 
     @property
     def fetched(self) -> ModelForm:
-        """The form that ``su3d-bench models fetch`` brings: a publisher's one file where it is read, else the hub's."""
+        """The form that ``su3d-bench models fetch`` downloads: the publisher's file if supported, else the hub's."""
         originals = [form for form in self.forms if form.form == "original" and form.is_read]
         return originals[0] if originals else self.forms[0]
 
     def form(self, name: FormName) -> ModelForm:
-        """The form called ``name``; raises ``ConfigError`` where the model does not come in it."""
+        """The form ``name``; raises ``ConfigError`` if the model is not available in it."""
         for form in self.forms:
             if form.form == name:
                 return form
@@ -87,16 +87,16 @@ def _form(name: str, row: Mapping[str, Any]) -> ModelForm:
 _TABLE = parse_toml(file_text(Path(__file__).with_name("catalogue.toml")))
 MODELS: Mapping[str, ModelEntry] = MappingProxyType({name: _entry(name, row) for name, row in _TABLE["models"].items()})
 SETTINGS: tuple[str, ...] = tuple(_TABLE["settings"])
-# What a profile loads unasked; profiles that are not named load no model of this table.
+# Models that a profile loads by default; other profiles load no model of this table.
 PROFILE_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"paper": ("clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus")}
 )
-# What the papers' experiments need beside it: OpenMask3D's set-up encodes with this.
+# Additional models for the papers' experiments: OpenMask3D's set-up uses this encoder.
 PAPERS_ENCODERS = ("clip-vit-l-14-336",)
 
 
 def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
-    """The model called ``name``, of ``kind`` where one is asked for; raises ``ConfigError`` for any other name."""
+    """The model ``name``, of ``kind`` if given; raises ``ConfigError`` for any other name."""
     known = [entry.name for entry in MODELS.values() if kind is None or entry.kind == kind]
     if name not in known:
         what = kind or "model"
@@ -105,7 +105,7 @@ def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
 
 
 def encoder_known_as(name: str | None) -> ModelEntry | None:
-    """The encoder that protocols and run records call ``name``."""
+    """The encoder named ``name`` in protocols and run records."""
     return next(
         (entry for entry in MODELS.values() if name and entry.known_as == name and entry.kind == "encoder"), None
     )

@@ -1,4 +1,4 @@
-"""Which foundation models a run loads, how they run, and how the profile ``paper`` makes tags, boxes and masks."""
+"""Which foundation models a run loads, how they run, and how the profile ``paper`` computes tags, boxes and masks."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def _one_of(kind: Kind, *more: str) -> AfterValidator:
 class ModelsConfig(BaseModel):
     """How foundation models run.
 
-    ``device``: ``cpu``, ``cuda`` (the GPUs in turn, one a job) or ``cuda:1``. ``precision`` ``auto``: float16 on a GPU
-    that has it, float32 elsewhere. ``batch`` 0: 1 on the CPU, so that no feature depends on the rest of its batch, and
-    what the memory holds on a GPU. ``encoder`` None: the profile's own. ``runtime``: who runs the encoder;
-    ``provider`` None: the one of ``device``, for ``runtime`` ``onnx`` alone. ``folder``: searched instead of
-    ``$SU3D_MODELS``; ``paths``: a model's folder or file by the model's name. ``transform``: ``original`` prepares
+    ``device``: ``cpu``, ``cuda`` (the GPUs in turn, one per job) or ``cuda:1``. ``precision`` ``auto``: float16 on a
+    GPU that supports it, otherwise float32. ``batch`` 0: 1 on the CPU, so that no feature depends on the rest of its
+    batch, and as much as fits into memory on a GPU. ``encoder`` None: the profile's own. ``runtime``: the library that
+    runs the encoder; ``provider`` None: the one of ``device``, only for ``runtime`` ``onnx``. ``folder``: searched
+    instead of ``$SU3D_MODELS``; ``paths``: a model's folder or file by model name. ``transform``: ``original`` prepares
     images as open_clip does, ``transformers`` as that library's image processor does.
     """
 
@@ -85,10 +85,10 @@ TaggerName = Literal["auto", "ram", "ram-onnx", "words"]
 class PaperConfig(BaseModel):
     """Tags, boxes and masks; the defaults are OpenSU3D's.
 
-    ``tagger`` ``auto``: RAM++ through its package, else exported, else the likeliest ``n_tags`` words of ``words``, a
-    text file (our own list where it is not set). ``grounded`` and ``automatic`` hold for methods that ask for no
+    ``tagger`` ``auto``: RAM++ from its package, otherwise exported, otherwise the most likely ``n_tags`` words of
+    ``words``, a text file (our own list if not set). ``grounded`` and ``automatic`` apply to methods that request no
     settings of their own. ``segmenter``: which SAM; ``sam_runtime`` ``onnx``: as exported by ``tools/export_onnx.py``.
-    ``captions`` ``model``: names and captions of crops are asked of the vision model of ``perception.language``.
+    ``captions`` ``model``: names and captions of crops come from the vision model of ``perception.language``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -105,5 +105,5 @@ class PaperConfig(BaseModel):
     @model_validator(mode="after")
     def _words_are_used(self) -> PaperConfig:
         if self.words is not None and self.tagger in ("ram", "ram-onnx"):
-            raise ValueError(f"words are for the tagger 'words', and '{self.tagger}' has a list of its own")
+            raise ValueError(f"words are for the tagger 'words', but '{self.tagger}' has its own list")
         return self

@@ -1,8 +1,8 @@
-"""Where the files of a model lie on this machine, their digests, and what is read from them; nothing is ever fetched.
+"""The location of a model's files on this machine, their digests, and reading them; nothing is ever downloaded.
 
-A model is looked for, in this order: at the path that the configuration names; below the configured folder or
-``$SU3D_MODELS`` (``~/.cache/su3d-bench/models`` where it is not set); in the Hugging Face cache
-(``$HF_HUB_CACHE``, ``$HF_HOME/hub``, ``~/.cache/huggingface/hub``).
+A model is searched in this order: at the path named in the configuration; below the configured folder or
+``$SU3D_MODELS`` (default ``~/.cache/su3d-bench/models``); in the Hugging Face cache (``$HF_HUB_CACHE``,
+``$HF_HOME/hub``, ``~/.cache/huggingface/hub``).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """One model as it lies here: ``weights`` is the file of weights, or the manifest of an exported model."""
+    """The files of one model on this machine; ``weights`` is its weights file, or the manifest of an exported model."""
 
     entry: ModelEntry
     form: ModelForm
@@ -54,28 +54,28 @@ class ModelFiles:
     weights: Path
 
     def digests(self) -> dict[str, str]:
-        """SHA-256 by file name of the weights and of every file of settings beside them."""
+        """SHA-256 by file name of the weights and of every settings file next to them."""
         names = dict.fromkeys((self.weights.name, *SETTINGS))
         return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
 
     def wrong_digests(self) -> list[str]:
-        """A line for each file whose digest is not the published one."""
+        """One line per file whose digest differs from the published one."""
         digests = self.digests()
         advice = what_to_fetch(self.entry, (self.form,))
         return [
-            f"{self.folder / name}: sha256 is {digests[name]}, published is {known}; {advice}"
+            f"{self.folder / name}: sha256 is {digests[name]}, but the published one is {known}; {advice}"
             for name, known in self.form.sha256.items()
             if name in digests and digests[name] != known
         ]
 
 
 def models_folder(configured: Path | None = None) -> Path:
-    """Where models are put: ``configured``, else ``$SU3D_MODELS``, else the user's cache."""
+    """Where models are stored: ``configured``, otherwise ``$SU3D_MODELS``, otherwise the user's cache."""
     return (configured or Path(os.environ.get("SU3D_MODELS") or DEFAULT_FOLDER)).expanduser().absolute()
 
 
 def hub_cache() -> Path:
-    """Where the Hugging Face libraries keep what they fetched."""
+    """The cache folder of the Hugging Face libraries."""
     if folder := os.environ.get("HF_HUB_CACHE"):
         return Path(folder).expanduser()
     return Path(os.environ.get("HF_HOME") or "~/.cache/huggingface").expanduser() / "hub"
@@ -88,10 +88,10 @@ def locate(
     path: Path | None = None,
     folder: Path | None = None,
 ) -> ModelFiles:
-    """The files of model ``name`` in the first of ``forms`` (all that are read) that is whole.
+    """The files of model ``name`` in the first of ``forms`` (default: all supported) that is complete.
 
-    ``path``: the configured file or folder, beside which nothing is searched; ``folder``: searched instead of
-    ``$SU3D_MODELS``. Raises ``ModelMissing`` with what to fetch from where, and ``ConfigError`` for an unknown name.
+    ``path``: the configured file or folder, the only one searched if given; ``folder``: searched instead of
+    ``$SU3D_MODELS``. Raises ``ModelMissing`` with what to download, and ``ConfigError`` for an unknown name.
     """
     entry = model_entry(name)
     read = tuple(form for form in entry.forms if form.is_read)
@@ -125,7 +125,7 @@ def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles
 
 
 def _folders(entry: ModelEntry, form: ModelForm, configured: Path | None) -> Iterator[Path]:
-    """Where a form may lie, the most telling place first."""
+    """Where a form may be stored, the most specific place first."""
     root = models_folder(configured)
     if form.form == "onnx":
         yield root / f"{entry.name}-onnx"
@@ -141,7 +141,7 @@ def _folders(entry: ModelEntry, form: ModelForm, configured: Path | None) -> Ite
 
 
 def _snapshots(folder: Path) -> Iterator[Path]:
-    """The snapshot that ``main`` stands for; where that is not known, the only one."""
+    """The snapshot of ``main``; if that is unknown, the only one."""
     snapshots = folder / "snapshots"
     try:
         revision = file_text(folder / "refs" / "main").strip()
@@ -152,7 +152,7 @@ def _snapshots(folder: Path) -> Iterator[Path]:
         return
     folders = sorted(path for path in snapshots.glob("*") if path.is_dir())
     if len(folders) > 1:
-        raise ConfigError(f"{snapshots}: holds {len(folders)} snapshots but no refs/main; select one with models.paths")
+        raise ConfigError(f"{snapshots}: has {len(folders)} snapshots but no refs/main; select one with models.paths")
     yield from folders
 
 
@@ -161,7 +161,7 @@ def _names(requirement: str) -> list[str]:
 
 
 def _whole(entry: ModelEntry, form: ModelForm, folder: Path) -> ModelFiles | None:
-    """The files of ``form`` in ``folder``; None where one is missing."""
+    """The files of ``form`` in ``folder``; None if one is missing."""
     if _lacking(form, folder):
         return None
     weights = next(folder / name for name in _names(form.files[0]) if (folder / name).is_file())
@@ -169,7 +169,7 @@ def _whole(entry: ModelEntry, form: ModelForm, folder: Path) -> ModelFiles | Non
 
 
 def _lacking(form: ModelForm, folder: Path) -> list[str]:
-    """The requirements of which no alternative lies whole in ``folder``."""
+    """The requirements for which no alternative is complete in ``folder``."""
     return [
         requirement.replace(" | ", " or ").replace(" + ", " and ")
         for requirement in form.files
@@ -178,7 +178,7 @@ def _lacking(form: ModelForm, folder: Path) -> list[str]:
 
 
 def what_to_fetch(entry: ModelEntry, forms: Sequence[ModelForm]) -> str:
-    """What to do for one of ``forms`` of ``entry``: the command that brings or makes it, else its files and address."""
+    """How to get one of ``forms`` of ``entry``: the command to download or export it, else its files and address."""
     if entry.fetched in forms:
         return f"run: su3d-bench models fetch {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
     if forms[0].form == "onnx":
@@ -188,7 +188,7 @@ def what_to_fetch(entry: ModelEntry, forms: Sequence[ModelForm]) -> str:
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, kept in ``$SU3D_CACHE`` under its path, size and time of change: weights are gigabytes."""
+    """SHA-256 of a file, cached in ``$SU3D_CACHE`` by path, size and modification time, since weights are large."""
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise ConfigError(f"{path}: is not a regular file")
@@ -207,21 +207,21 @@ def file_sha256(path: Path) -> str:
 
 
 def digest_cache() -> Path:
-    """The folder of noted digests, in the cache of perception."""
+    """The folder of cached digests, in the perception cache."""
     root = Path(os.environ.get("SU3D_CACHE") or "~/.cache/su3d-bench/cache").expanduser()
     return root / DIGEST_FOLDER
 
 
 def _note(key: str, digest: str) -> dict[str, str]:
-    """What is kept of a digest, with one of the note itself, so that a damaged one counts as absent."""
+    """The cache entry of a digest, with a digest of the entry itself, so that a damaged one counts as absent."""
     return {"of": key, "sha256": digest, "check": digest_bytes(f"{key}\n{digest}".encode())}
 
 
 def read_weights(path: Path, device: str = "cpu") -> dict[str, Any]:
-    """The tensors of a ``.safetensors`` file, or of a torch file that is read with ``weights_only=True``.
+    """The tensors of a ``.safetensors`` file, or of a torch file read with ``weights_only=True``.
 
-    ``device`` ``meta`` reads names, shapes and types alone. A torch file that holds one level more, under ``model`` or
-    ``state_dict``, gives that level. Raises ``DataError`` for any other content.
+    ``device`` ``meta`` reads only names, shapes and types. If a torch file has another level under ``model`` or
+    ``state_dict``, that level is returned. Raises ``DataError`` for any other content.
     """
     if path.suffix == ".safetensors":
         content = _read_safetensors(path, device)
@@ -266,7 +266,7 @@ def _read_pickled(path: Path, device: str) -> Any:
 
 
 def check_settings_size(path: Path) -> None:
-    """Refuse a file of settings or words that is far larger than any model's; one that is not there is fine."""
+    """Reject a file of settings or words that is far larger than any model's; a missing one is accepted."""
     if path.is_file() and path.stat().st_size > MAX_SETTINGS_BYTES:
         raise DataError(
             f"{path}: has {path.stat().st_size} bytes; a model's settings have at most {MAX_SETTINGS_BYTES}"
@@ -283,12 +283,12 @@ def read_settings(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as JSON ({bounded(error, 80)}); download it again") from error
     if not isinstance(content, dict):
-        raise DataError(f"{path}: holds a {type(content).__name__}, expected a table")
+        raise DataError(f"{path}: contains a {type(content).__name__}, expected a table")
     return content
 
 
 def checked(kind: type[Checked], values: Mapping[str, Any], where: object) -> Checked:
-    """``kind`` of the ``values`` that a file gave; raises ``DataError`` with the first that is none."""
+    """``values`` from a file as ``kind``; raises ``DataError`` with the first invalid one."""
     try:
         return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
@@ -298,17 +298,17 @@ def checked(kind: type[Checked], values: Mapping[str, Any], where: object) -> Ch
 
 
 def bounded(error: object, limit: int = 160) -> str:
-    """What ``error`` says, as one printable line of at most ``limit`` characters."""
+    """The message of ``error`` as one printable line of at most ``limit`` characters."""
     return printable(str(error), limit)
 
 
-# A worker segments one scene after another; a segmenter, a detector and a tagger stay in memory.
+# A worker processes one scene after another; a segmenter, a detector and a tagger stay in memory.
 MAX_KEPT = 3
 _kept: OrderedDict[tuple[object, ...], object] = OrderedDict()
 
 
 def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) -> Loaded:
-    """What ``load`` makes of ``files`` at ``place``, from memory where they are unchanged since it was last asked."""
+    """The result of ``load`` for ``files`` at ``place``, from memory if they are unchanged since the last call."""
     status = files.weights.stat()
     key = (files.entry.name, str(files.weights), status.st_size, status.st_mtime_ns, *place)
     if key not in _kept:
@@ -320,14 +320,14 @@ def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) 
 
 
 def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
-    """A transformers model in float32 on the CPU from local files; weights that are missing are an error, never random.
+    """A transformers model in float32 on the CPU from local files; missing weights are an error, never random.
 
-    ``more`` goes to ``from_pretrained``.
+    ``more`` is passed to ``from_pretrained``.
     """
     from safetensors import SafetensorError
 
     if files.weights.suffix in PICKLED:
-        read_weights(files.weights, "meta")  # says in our words what is wrong with the file
+        read_weights(files.weights, "meta")  # raises our own error for an invalid file
     try:
         model, info = model_class.from_pretrained(
             str(files.folder),
@@ -349,7 +349,7 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
 
 
 def load_class(files: ModelFiles, class_name: str) -> Any:
-    """The model of transformers' class ``class_name``; a ``DataError`` where the folder holds another."""
+    """The model of transformers' class ``class_name``; a ``DataError`` if the folder contains a different one."""
     transformers = require_transformers(f"model '{files.entry.name}'")
     model_class = getattr(transformers, class_name)
     model_type = read_settings(files.folder / "config.json").get("model_type")

@@ -1,4 +1,4 @@
-"""From the configuration to encoders and to the networks of the profile ``paper``, each read when it is first used."""
+"""Encoders and the networks of the profile ``paper`` from the configuration, each read at first use."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
 def load_encoder(
     config: ModelsConfig, *, default: str = EMBEDDED, cache: FrameCache | None = None, job_index: int = 0
 ) -> Encoder:
-    """The encoder that ``config`` names, or ``default``, the profile's own, where it names none.
+    """The encoder named in ``config``, or ``default``, the profile's own, if it names none.
 
-    ``cache`` keeps the features of texts; ``job_index`` chooses among several GPUs. Raises ``ModelMissing`` for a
-    package or file that is not here, before anything heavy is loaded.
+    ``cache`` stores the features of texts; ``job_index`` chooses among several GPUs. Raises ``ModelMissing`` for a
+    missing package or file, before anything heavy is loaded.
     """
     name = config.encoder or default
     if name == EMBEDDED:
@@ -66,14 +66,14 @@ def load_encoder(
 
 
 def check_encoder(config: ModelsConfig, name: str) -> None:
-    """Raises what ``load_encoder`` would of packages and files of encoder ``name``; nothing is imported or read."""
+    """Raises the errors of ``load_encoder`` for packages and files of encoder ``name``; nothing is imported or read."""
     encoder_files(config, name)
     for package in PACKAGES_OF_RUNTIME[config.runtime]:
         require_installed(package, f"encoder '{name}'")
 
 
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
-    """Where the files of encoder ``name`` lie in the form that the configured runtime reads."""
+    """The files of encoder ``name`` in the form that the configured runtime reads."""
     model_entry(name, "encoder")
     return locate(name, (RUNTIME_FORM[config.runtime],), path=config.paths.get(name), folder=config.folder)
 
@@ -117,7 +117,7 @@ def _onnx_encoder(
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
-# A worker makes a new encoder for each method and scene; the towers, gigabytes of them, are kept.
+# A worker creates a new encoder for each method and scene; the towers, which take gigabytes, are cached.
 @lru_cache(maxsize=1)
 def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
     if runtime == "open_clip":
@@ -142,7 +142,7 @@ _SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
 def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, job_index: int = 0) -> Networks:
     """Tagger, detector and segmenter as configured.
 
-    Raises ``ModelMissing`` for a package or file that is not here, before anything heavy is read.
+    Raises ``ModelMissing`` for a missing package or file, before anything heavy is read.
     """
     for package in PACKAGES:
         require(package, "profile 'paper'")
@@ -150,7 +150,7 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     detector = _locate(models, DETECTOR, ("transformers",))
     device = device_for(models.device, job_index)
     precision = precision_for(models.precision, device)
-    # What moves a number is the kind of device, not which of several.
+    # Numbers depend on the kind of device, not on which of several is used.
     digests = [content_key(device.partition(":")[0], precision)]
     digests += [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
     if config.sam_runtime == "onnx":
@@ -174,7 +174,7 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
 
 
 def is_front_end_available(config: PaperConfig, models: ModelsConfig) -> bool:
-    """Whether the profile can run: packages, encoder, detector and segmenter are here; tags can do without RAM++."""
+    """Whether the profile can run: packages, encoder, detector and segmenter are installed; RAM++ is optional."""
     try:
         _check_networks(config, models)
     except (ModelMissing, ConfigError):
@@ -183,7 +183,7 @@ def is_front_end_available(config: PaperConfig, models: ModelsConfig) -> bool:
 
 
 def check_front_end(config: PaperConfig, models: ModelsConfig) -> None:
-    """Raises ``ModelMissing`` for the first package or file that is not here; nothing heavy is imported or read."""
+    """Raises ``ModelMissing`` for the first missing package or file; nothing heavy is imported or read."""
     _check_networks(config, models)
     if config.tagger == "ram":
         require_installed("ram", "tagger 'ram'")
@@ -210,13 +210,13 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
 
 
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
-    """The tagger that is asked for, or with ``auto`` the first that is here."""
+    """The configured tagger, or with ``auto`` the first that is available."""
     if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
         with _skip_missing(config.tagger):
             require("ram", "tagger 'ram'")
             files = _locate(models, TAGGER, ("original",))
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
-            # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
+            # RAM++'s own code mixes in float32, so it runs in float32 on every device.
             load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
             return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
@@ -232,7 +232,7 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
 
 
 def _skip_missing(tagger: str) -> AbstractContextManager[None]:
-    """A model that is not here is an error where it was asked for by its name."""
+    """Ignore a missing model for ``auto``; if it was requested by name, the error is raised."""
     return suppress(ModelMissing) if tagger == "auto" else nullcontext()
 
 
@@ -241,7 +241,7 @@ WARM_TEXT = "a chair in a scene"
 
 @dataclass(frozen=True)
 class ModelState:
-    """A model of the catalogue and the forms of it that are here; where none is, ``missing`` says what to fetch."""
+    """A model of the catalogue and its forms on this machine; if there is none, ``missing`` names what to download."""
 
     entry: ModelEntry
     files: tuple[ModelFiles, ...]
@@ -254,7 +254,7 @@ class ModelState:
 
 
 def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None = None) -> ModelState:
-    """Which forms of ``entry`` are here, at ``path`` or where models are looked for."""
+    """The forms of ``entry`` on this machine, at ``path`` or where models are searched."""
     forms = []
     for form in entry.forms:
         with suppress(ModelMissing, ConfigError):
@@ -268,7 +268,7 @@ def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None
 
 
 def problems_of(files: ModelFiles) -> list[str]:
-    """Everything that is wrong with the files of a model, a line each; of the weights the names alone are read."""
+    """Everything that is wrong with the files of a model, one line each; only the names of the weights are read."""
     problems = files.wrong_digests()
     try:
         if files.form.form == "onnx":
@@ -297,16 +297,16 @@ def _problems_of_export(files: ModelFiles) -> list[str]:
 
 
 def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[str, str]]:
-    """For a run's record: the SHA-256 of every file of the models ``names`` that are here, by model and file name."""
+    """For a run's record: the SHA-256 of every file of the installed models ``names``, by model and file name."""
     states = [model_state(model_entry(name), config.paths.get(name), config.folder) for name in dict.fromkeys(names)]
     return {state.entry.name: state.files[0].digests() for state in states if state.files}
 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """What it took to load and run something once: ``stages_ms`` of the run, ``memory_mb`` at most meanwhile.
+    """The cost of loading and running something once: ``stages_ms`` of the run, peak ``memory_mb``.
 
-    ``memory_of``: ``cuda:0`` for what torch took there, ``process`` for the whole process in main memory.
+    ``memory_of``: ``cuda:0`` for torch's memory there, ``process`` for the whole process in main memory.
     """
 
     what: str
@@ -330,7 +330,7 @@ def warm_encoder(encoder: Encoder, device: str) -> WarmUp:
 
 
 def warm_perception(perception: Any, device: str) -> WarmUp:
-    """Let ``perception``, a profile that was built, detect in one made frame twice: loading, then running."""
+    """Run ``perception`` of a built profile on one synthetic frame twice: loading, then running."""
     needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))  # S_r of the paper
     frame = warm_frame()
 
@@ -364,7 +364,7 @@ def warm_scene() -> SceneInfo:
 
 
 def warm_frame() -> Frame:
-    """A made frame (480, 640): three coloured boxes before a wall."""
+    """A synthetic frame (480, 640): three coloured boxes in front of a wall."""
     rgb = np.full((480, 640, 3), 205, np.uint8)
     depth_m = np.full((480, 640), 3.0, np.float32)
     for left, colour, distance_m in ((60, (190, 40, 40), 2.0), (260, (50, 140, 60), 2.3), (460, (40, 60, 180), 2.6)):

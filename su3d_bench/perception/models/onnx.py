@@ -1,4 +1,4 @@
-"""Models exported to ONNX: their ``manifest.json``, and sessions that give the same answer every time."""
+"""Models exported to ONNX: their ``manifest.json``, and deterministic sessions."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PROVIDERS: dict[Provider, str] = {
 
 
 class OnnxManifest(BaseModel):
-    """What is read of every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more beside it.
+    """The fields read from every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more fields.
 
-    Of each kind: ``FORMAT`` of its file, and the files that it ``REQUIRES``.
+    Each kind has the ``FORMAT`` of its file, and the files that it ``REQUIRES``.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -34,7 +34,7 @@ class OnnxManifest(BaseModel):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The manifest at ``path``; raises ``DataError`` for anything else, and where a required file is not named."""
+        """The manifest at ``path``; raises ``DataError`` for anything else, and if a required file is not listed."""
         content = read_settings(path)
         layout = content.get("format")
         if layout != cls.FORMAT:
@@ -45,12 +45,12 @@ class OnnxManifest(BaseModel):
             raise DataError(f"{path}: is not the manifest of an exported model ({bounded(error, 120)})") from error
         if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
             needed = " and ".join(cls.REQUIRES)
-            raise DataError(f"{path}: files must be names inside the folder, {needed} among them; export it again")
+            raise DataError(f"{path}: files must be names inside the folder, including {needed}; export it again")
         return manifest
 
 
 def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
-    """A line for each file of the exported model in ``folder`` that is missing or not the one that was written."""
+    """One line per file of the exported model in ``folder`` that is missing or differs from the exported one."""
     wrong = []
     for name, digest in manifest.files.items():
         path = folder / name
@@ -62,10 +62,10 @@ def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
 
 
 def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, n_threads: int = 1) -> Any:
-    """An ``InferenceSession`` of the model at ``path``; raises where the provider is absent or the file damaged.
+    """An ``InferenceSession`` of the model at ``path``; raises if the provider is missing or the file damaged.
 
     ``n_threads`` on the CPU: one, so that no sum depends on the machine's number of cores. Operators that a GPU
-    provider lacks run on the CPU.
+    provider does not support run on the CPU.
     """
     import onnxruntime
 
@@ -89,7 +89,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
         raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it again") from error
     used = session.get_providers()
     if PROVIDERS[provider] not in used:
-        # ONNX Runtime falls back to the CPU where a provider's own libraries do not load
+        # ONNX Runtime falls back to the CPU if a provider's own libraries do not load
         raise ModelMissing(
             f"provider '{provider}': onnxruntime failed to start it; install the CUDA libraries it needs"
         )
@@ -97,7 +97,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
 
 
 def _refusals() -> tuple[type[Exception], ...]:
-    """What ONNX Runtime raises for a file: classes of its own, with none in common but ``Exception``."""
+    """ONNX Runtime's own exceptions for a file, which have no common class except ``Exception``."""
     from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     found = (value for value in vars(state).values() if isinstance(value, type))
@@ -106,7 +106,7 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 def _chain(provider: Provider, device_index: int) -> list[Any]:
     on_device = {"device_id": device_index}
-    # the default searches an algorithm by timing, which may differ from run to run
+    # the default selects an algorithm by timing, which may differ from run to run
     fixed = {**on_device, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
     chains: dict[Provider, list[Any]] = {
         "cpu": [],

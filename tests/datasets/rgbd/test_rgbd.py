@@ -69,7 +69,7 @@ def test_unscored_run_needs_no_ground_truth_and_qualifies_its_labels(
     assert main([*words, "--out", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
     assert "no protocol scores these scenes" in said.out
-    assert "names and labels mean little here" in said.err and "ceiling" not in said.err
+    assert "names and labels are unreliable here" in said.err and "ceiling" not in said.err
     assert main([*words, "--methods", "oracle", "--out", str(tmp_path / "other")]) == 3
     assert "rgbd/desk: oracle needs ground truth, the dataset has none" in capsys.readouterr().err
 

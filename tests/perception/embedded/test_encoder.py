@@ -33,7 +33,7 @@ def images() -> list[UInt8Array]:
     return [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in sizes]
 
 
-def test_features_are_unit_float32_of_the_documented_shape(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
+def test_features_are_float32_unit_rows_of_documented_shape(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
     for features, n in ((encoder.encode_images(images), len(images)), (encoder.encode_texts(TEXTS), len(TEXTS))):
         assert features.shape == (n, DIM)
         assert features.dtype == np.float32
@@ -42,7 +42,7 @@ def test_features_are_unit_float32_of_the_documented_shape(encoder: EmbeddedEnco
     assert encoder.encode_texts([]).shape == (0, DIM)
 
 
-def test_a_feature_does_not_depend_on_its_batch(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
+def test_feature_does_not_depend_on_its_batch(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
     together = encoder.encode_images(images)
     for row, image in enumerate(images):
         assert np.array_equal(encoder.encode_images([image])[0], together[row])
@@ -60,7 +60,7 @@ def test_feature_depends_on_crop_size(encoder: EmbeddedEncoder) -> None:
     assert log_size(64, 256) == (0.0, 1.0)
 
 
-def test_shrinking_averages_an_axis_even_where_the_other_grows() -> None:
+def test_shrinking_axis_is_averaged_even_if_the_other_grows() -> None:
     stripes = np.zeros((8, 640, 3), np.uint8)
     stripes[:, ::2] = 200
     assert shrink(stripes).shape == (IMAGE_SIZE, IMAGE_SIZE, 3)
@@ -82,7 +82,7 @@ def test_model_card_describes_the_shipped_files(encoder: EmbeddedEncoder) -> Non
     assert card["largest_difference_from_torch"] < 1e-5
 
 
-def test_weights_need_nothing_but_standard_operators() -> None:
+def test_weights_only_use_standard_operators() -> None:
     import onnx
 
     for name in (IMAGE_FILE, TEXT_FILE):
@@ -105,7 +105,7 @@ def test_examples_in_docstrings_run() -> None:
         ("shelves", "shelf"),
     ],
 )
-def test_spellings_of_one_thing_have_the_same_ids(one: str, other: str) -> None:
+def test_spellings_of_one_word_have_the_same_ids(one: str, other: str) -> None:
     ids = token_ids([one, other])
     assert np.array_equal(ids[0], ids[1])
 
@@ -124,10 +124,10 @@ def test_words_missing_from_training_captions_are_listed() -> None:
     assert [encoder.unseen_words(text) for text in captions] == [()] * 4
     assert encoder.unseen_words('"Xqzzy", plant; xqzzy') == ("Xqzzy", "xqzzy")
     assert encoder.unseen_words("\u6905\u5b50") == ("\u6905\u5b50",)
-    assert encoder.unseen_words("the") == ("the",)  # nothing that it reads
+    assert encoder.unseen_words("the") == ("the",)  # contains nothing that the encoder uses
 
 
-def test_the_words_for_materials_are_those_of_the_rooms() -> None:
+def test_material_words_match_those_of_the_rooms() -> None:
     assert lexicon.MATERIALS == MATERIALS
 
 

@@ -1,4 +1,4 @@
-"""The RGB-D segmenter on scenes of boxes and planes whose regions are known; its graph against SciPy and NumPy."""
+"""The RGB-D segmenter on scenes of boxes and planes with known regions; its graph compared with SciPy and NumPy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def cast(boxes: dict[int, Box], camera_height_m: float = 0.9) -> tuple[Float32Array, Int32Array, Float64Array]:
-    """Depth, ids and normals seen from above by a camera that looks down at 45 degrees; id 1 is the ground z = 0."""
+    """Depth, ids and normals seen by a camera looking down at 45 degrees; id 1 is the ground z = 0."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
     c = np.sqrt(0.5)
@@ -44,7 +44,7 @@ def cast(boxes: dict[int, Box], camera_height_m: float = 0.9) -> tuple[Float32Ar
 
 
 def view(boxes: dict[int, Box], colours: dict[int, tuple[int, int, int]], noise: int = 4) -> tuple[Frame, Int32Array]:
-    """A lit frame of ``boxes`` on the ground, with a little noise on the colours, and its ids."""
+    """A lit frame of ``boxes`` on the ground, with slight colour noise, and its ids."""
     depth_m, ids, normals = cast(boxes)
     light = 0.75 + 0.25 * np.abs(normals @ np.array([0.3, 0.5, 0.81]))
     table = np.array([colours[key] for key in sorted(colours)], np.float64)
@@ -68,7 +68,7 @@ TWO_BOXES: dict[int, Box] = {
 GREY, RED, BLUE = (190, 190, 190), (170, 60, 50), (60, 80, 170)
 
 
-def test_two_boxes_that_touch_on_a_table_are_two_regions() -> None:
+def test_two_touching_boxes_on_a_table_are_two_regions() -> None:
     frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
     regions = objects(frame)
     assert best_iou(regions, ids == LEFT) > 0.9
@@ -84,7 +84,7 @@ def test_faces_of_a_box_are_one_object_but_several_parts() -> None:
     assert n_on_box >= 2
 
 
-def test_a_box_of_the_table_s_colour_is_found_by_shape() -> None:
+def test_box_of_the_tables_colour_is_found_by_shape() -> None:
     frame, ids = view({LEFT: TWO_BOXES[LEFT]}, {TABLE: GREY, LEFT: GREY})
     assert best_iou(objects(frame), ids == LEFT) > 0.8
 
@@ -113,7 +113,7 @@ def test_small_flush_patch_joins_wall_and_large_patch_is_object() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.2])
-def test_single_holes_in_the_depth_do_not_break_regions(fraction: float) -> None:
+def test_single_depth_holes_do_not_break_regions(fraction: float) -> None:
     frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
     holes = np.random.default_rng(1).random(frame.depth_m.shape) < fraction
     frame.depth_m[holes] = 0
@@ -123,14 +123,14 @@ def test_single_holes_in_the_depth_do_not_break_regions(fraction: float) -> None
 
 @pytest.mark.parametrize("depth_m", [0.0, 2.0, np.nan])
 @pytest.mark.parametrize("level", ["objects", "parts"])
-def test_a_flat_empty_frame_gives_few_regions_and_no_error(depth_m: float, level: str) -> None:
+def test_flat_empty_frame_gives_few_regions_and_no_error(depth_m: float, level: str) -> None:
     rgb: UInt8Array = np.full((120, 160, 3), 90, np.uint8)
     frame = Frame(0, 0.0, rgb, np.full((120, 160), depth_m, np.float32), np.eye(4), K)
     regions = RgbdSegmenter(SegmenterConfig(), "parts" if level == "parts" else "objects").segment(frame)
     assert len(regions.boxes) <= 1 and regions.masks.shape[1:] == (120, 160)
 
 
-def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
+def test_masks_do_not_overlap_boxes_fit_and_scores_are_fractions() -> None:
     frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
     for level in ("objects", "parts"):
         regions = RgbdSegmenter(SegmenterConfig(), "parts" if level == "parts" else "objects").segment(frame)
@@ -142,7 +142,7 @@ def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
 
 
 @pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])
-def test_components_are_counted_by_their_first_nodes(n: int, n_links: int) -> None:
+def test_components_are_numbered_by_their_first_nodes(n: int, n_links: int) -> None:
     a, b = np.random.default_rng(n_links).integers(0, n, (2, n_links))
     links = coo_matrix((np.ones(n_links, np.int8), (a, b)), shape=(n, n))
     n_components, expected = connected_components(links, directed=False)

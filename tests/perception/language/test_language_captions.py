@@ -1,4 +1,4 @@
-"""Names and captions by a vision model, labels n' by vote and by a model, and what is read out of free answers."""
+"""Names and captions by a vision model, labels n' by vote and by a model, and parsing of free-form answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
 
 
 class Spoken:
-    """A language model that says the same to everybody, or what ``texts`` has for each request."""
+    """A language model with one reply for all requests, or those of ``texts`` in turn."""
 
     def __init__(self, *texts: str, failure: str = "") -> None:
         self.texts = texts
@@ -87,7 +87,7 @@ def test_refusals_echoes_and_noise_give_no_caption(text: str) -> None:
         ("a very long noun phrase that nobody would ever take for the name of a thing", None),
     ],
 )
-def test_a_chosen_name_is_one_of_the_names_or_a_short_noun_phrase(text: str, name: str | None) -> None:
+def test_chosen_name_is_one_of_the_names_or_a_short_noun_phrase(text: str, name: str | None) -> None:
     assert chosen_name(text, NAMES) == name
 
 
@@ -104,7 +104,7 @@ def test_answer_ids_are_restricted_to_the_map() -> None:
 
 
 def test_long_part_ids_are_parsed_completely() -> None:
-    part = 123456000012  # of object 12; its first nine digits are another's
+    part = 123456000012  # of object 12; its first nine digits are the id of another object
     known = (123456000, part)
     told = answered(f'{{"answer": "lamp", "object_ids": [{part}], "reference_ids": ["#{part}", 123456000]}}', known)
     assert told is not None
@@ -149,7 +149,7 @@ def test_tagger_name_is_used_when_the_model_refuses(
 
 
 def seen() -> Instances:
-    """Two instances: one seen as a sofa once and as a couch twice, one never named."""
+    """Two instances: one named sofa once and couch twice, one never named."""
     made = instances(np.zeros((2, 3), np.float32), [np.array([0]), np.array([1])], None)
     return replace(
         made,

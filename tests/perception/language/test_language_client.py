@@ -1,4 +1,4 @@
-"""The client of language models against a server that answers, refuses, fails, hangs and floods."""
+"""The client of language models with a server that answers, refuses, fails, hangs and floods."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_rerun_uses_stored_replies(server: ChatServer, tmp_path: Path) -> None:
     assert everything_in(tmp_path) == files
 
 
-def test_the_request_is_that_of_a_chat_completion(server: ChatServer, tmp_path: Path) -> None:
+def test_request_is_a_chat_completion(server: ChatServer, tmp_path: Path) -> None:
     picture = Image(np.zeros((4, 6, 3), np.uint8))
     client(server, tmp_path).ask(ask("what is it?", images=(picture,), form=CaptionForm))
     body = server.bodies[0]
@@ -92,10 +92,10 @@ def test_transient_errors_are_retried(server: ChatServer, tmp_path: Path, troubl
         (Answered(raw=b'{"choices": [{"message": {"content": 5}}]}'), "not a chat completion"),
         (Answered(usage=(10**30, 1)), "not a chat completion"),
         (Answered(raw=b" " * 3_000_000), "larger than 100,000 bytes"),
-        (Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"}), "the answer is packed"),
+        (Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"}), "the answer is compressed"),
         (Answered(wait_s=30), "no answer within 0.3 s; tried 1 times"),
     ],
-    ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "huge", "packed", "hung"],
+    ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "huge", "compressed", "hung"],
 )
 def test_invalid_response_is_a_request_failure(
     server: ChatServer, tmp_path: Path, trouble: Answered, reason: str
@@ -210,7 +210,7 @@ def test_first_reply_of_two_processes_is_stored(server: ChatServer, tmp_path: Pa
 def test_budget_is_never_exceeded_and_can_be_raised(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: Answered(usage=(30, 10))
     questions = [ask(str(k)) for k in range(5)]
-    most = questions[0].n_input_tokens + 20  # what a request may cost
+    most = questions[0].n_input_tokens + 20  # maximum cost of one request
     with pytest.raises(RunIncomplete, match=r"budget_tokens = .* is reached"):
         client(server, tmp_path, budget_tokens=80 + most, max_concurrent=1).ask_all(questions)
     assert server.n_asked == 3
@@ -218,10 +218,10 @@ def test_budget_is_never_exceeded_and_can_be_raised(server: ChatServer, tmp_path
     assert server.n_asked == 5
 
 
-def test_a_budget_in_dollars_needs_a_price(server: ChatServer, tmp_path: Path) -> None:
+def test_dollar_budget_needs_a_price(server: ChatServer, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="'tiny-model' has no price"):
         client(server, tmp_path, budget_usd=1.0).ask(ask("x"))
-    priced = {"tiny-model": Price(input_usd=1e6, output_usd=2e6)}  # a dollar a token in, two a token out
+    priced = {"tiny-model": Price(input_usd=1e6, output_usd=2e6)}  # one dollar per input token, two per output token
     asked = client(server, tmp_path, budget_usd=100.0, prices=priced)
     asked.ask(ask("x"))
     assert asked.spending.usd == 10 * 1 + 5 * 2
@@ -241,7 +241,7 @@ def test_estimate_counts_stored_replies_and_sends_nothing(server: ChatServer, tm
     assert client(server, tmp_path).estimate([ask("new")]).usd is None
 
 
-def test_the_rate_limit_spaces_requests(server: ChatServer, tmp_path: Path) -> None:
+def test_rate_limit_spaces_requests(server: ChatServer, tmp_path: Path) -> None:
     pauses: list[float] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("su3d_bench.perception.language.client.sleep", pauses.append)

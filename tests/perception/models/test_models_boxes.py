@@ -1,4 +1,4 @@
-"""Boxes, automatic masks and images of foundation models, by hand and against transformers' own functions."""
+"""Boxes, automatic masks and images of foundation models, compared with hand-computed values and transformers."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def boxes_of(*rows: tuple[float, ...]) -> Float32Array:
     return np.array(rows, np.float32).reshape(-1, 4)
 
 
-def test_boxes_become_pixels_before_corners_as_in_the_original() -> None:
-    """Boxes of 1200x680 by ``Model.post_process_result``; the other order has other last bits."""
+def test_boxes_are_scaled_to_pixels_before_corners_as_in_the_original() -> None:
+    """Boxes of 1200x680 by ``Model.post_process_result``; the other order changes the last bits."""
     told = corners_of(boxes_of((0.34, 0.43, 0.97, 0.56)), 680, 1200)
     np.testing.assert_array_equal(told, boxes_of((-174.0, 102.0, 990.0, 482.79998779296875)))
 
@@ -36,7 +36,7 @@ def mask_of(rows: str) -> BoolArray:
     return np.array([[character == "#" for character in row] for row in rows.split()])
 
 
-def test_crops_and_points_equal_those_of_transformers() -> None:
+def test_crops_and_points_match_transformers() -> None:
     from transformers.models.sam.image_processing_pil_sam import _build_point_grid, _generate_per_layer_crops
 
     for height, width, n_layers in ((680, 1200, 2), (101, 57, 1), (480, 640, 0), (333, 1000, 3)):
@@ -51,7 +51,7 @@ def test_stability_score_matches_definition() -> None:
     import torch
     from transformers.models.sam.image_processing_pil_sam import _compute_stability_score
 
-    # Above 1: two pixels; above -1: four. At exactly the thresholds a pixel counts as below.
+    # Above 1: two pixels; above -1: four. A pixel exactly at a threshold counts as below.
     logits = torch.tensor([[[3.0, 1.5, 1.0], [-0.5, -1.0, -2.0]]])
     assert stability(logits, 1.0).tolist() == [0.5]
     assert np.isnan(stability(torch.full((1, 2, 2), -9.0), 1.0).numpy()).all()
@@ -59,7 +59,7 @@ def test_stability_score_matches_definition() -> None:
     assert torch.equal(stability(noise, 1.0), _compute_stability_score(noise, 0.0, 1))
 
 
-def test_which_boxes_a_crop_cuts_equals_transformers() -> None:
+def test_boxes_cut_by_a_crop_match_transformers() -> None:
     import torch
     from transformers.models.sam.image_processing_pil_sam import _is_box_near_crop_edge
 
@@ -72,14 +72,14 @@ def test_which_boxes_a_crop_cuts_equals_transformers() -> None:
     assert 0 < theirs.mean() < 1
 
 
-def test_a_mask_of_small_islands_keeps_the_largest_and_counts_as_changed() -> None:
+def test_mask_of_small_islands_keeps_the_largest_and_counts_as_changed() -> None:
     kept, changed = without_small_parts(mask_of("##..#. ......"), 5, "islands")
     assert changed
     np.testing.assert_array_equal(kept, mask_of("##.... ......"))
     alone, changed = without_small_parts(mask_of("##.... ......"), 5, "islands")
     assert changed, "as in the original: a small part was found, although it stays"
     np.testing.assert_array_equal(alone, mask_of("##.... ......"))
-    # Corner to corner is one part.
+    # Pixels touching at a corner are one part.
     assert not without_small_parts(mask_of("#. .#"), 2, "islands")[1]
     assert not without_small_parts(mask_of(".. .."), 2, "islands")[1]
 
@@ -105,7 +105,7 @@ def test_mask_filters_match_transformers() -> None:
     config = AutomaticMaskConfig(points_per_side=5, points_per_batch=25, box_nms_thresh=1.0, **settings)
     found = AutomaticMasks(Sam(TorchSam(tiny_sam())), config).regions(rgb)
     assert 3 < len(rle) < 75
-    assert len(found.masks) == len(rle), "with an overlap of 1 allowed nothing but the filters acts"
+    assert len(found.masks) == len(rle), "with an overlap of 1 allowed only the filters act"
     order = np.argsort(-scores.numpy(), kind="stable")
     np.testing.assert_allclose(found.scores, np.clip(scores.numpy()[order], 0, 1), atol=1e-4)
     np.testing.assert_allclose(found.boxes, boxes.numpy()[order], atol=1)

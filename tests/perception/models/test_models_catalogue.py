@@ -1,4 +1,4 @@
-"""Where models are looked for, in which order, and what is said of one that is not there."""
+"""Where models are searched, in which order, and the error for a missing one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLIP_FILES = ("model.safetensors", "config.json", "preprocessor_config.json", "t
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Every place that is searched lies below the test's own folder."""
+    """All searched places are below the test's own folder."""
     monkeypatch.setenv("SU3D_MODELS", str(tmp_path / "models"))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
@@ -50,8 +50,8 @@ def test_every_entry_is_complete() -> None:
         assert len({form.form for form in entry.forms}) == len(entry.forms)
         assert all(len(digest) == 64 for form in entry.forms for digest in form.sha256.values())
         assert all(form.architecture for form in entry.forms if form.form == "open_clip")
-        # float32: four bytes a parameter, which is what the published files hold
-        published = entry.forms[-1 if name == "ram-plus" else 0].size_mb  # of RAM++ the file holds more than runs
+        # float32: four bytes per parameter, as in the published files
+        published = entry.forms[-1 if name == "ram-plus" else 0].size_mb  # RAM++'s file has more than is used
         assert abs(entry.memory_mb(4) - published) / published < 0.05, name
     assert {name for names in PROFILE_MODELS.values() for name in names} <= set(MODELS)
 
@@ -76,7 +76,7 @@ def test_hugging_face_cache_is_searched_last_at_main_revision(home: Path) -> Non
     assert locate("clip-vit-b-32").folder == nearest
 
 
-def test_a_revision_that_would_leave_the_cache_is_not_followed(home: Path) -> None:
+def test_revision_outside_the_cache_is_not_followed(home: Path) -> None:
     outside = fill(home / "outside")
     folder = home / "hf" / "hub" / "models--openai--clip-vit-base-patch32"
     (folder / "refs").mkdir(parents=True)
@@ -122,7 +122,7 @@ def test_missing_model_error_names_the_download_command(home: Path) -> None:
         f"model 'clip-vit-h-14': not found below {home / 'models'}; run: su3d-bench models fetch clip-vit-h-14 (3.9 GB)"
     )
     with pytest.raises(ModelMissing, match=r"put open_clip_model\.safetensors of https://huggingface\.co/laion/"):
-        locate("clip-vit-h-14", ("open_clip",))  # which is not fetched
+        locate("clip-vit-h-14", ("open_clip",))  # which cannot be downloaded by the command
     with pytest.raises(ModelMissing, match=r"run: python tools/export_onnx\.py ram-plus --checkout DIR"):
         locate("ram-plus", ("onnx",))
 

@@ -1,4 +1,4 @@
-"""Encoders of random weights: preparation to the bit, features equal to the libraries' own, nothing taken on trust."""
+"""Encoders with random weights: preprocessing exact to the bit, features equal to the libraries', untrusted files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def config(folder: Path, encoder: str = "clip-vit-h-14", **settings: Any) -> Mod
 
 
 @pytest.mark.parametrize("name", ["clip-vit-h-14", "siglip-base-224"])
-def test_features_are_those_of_transformers_own_model_and_processor(folder: Path, name: str) -> None:
+def test_features_match_transformers_model_and_processor(folder: Path, name: str) -> None:
     import torch
     from transformers import AutoModel
 
@@ -66,7 +66,7 @@ def _unit(rows: Float32Array) -> Float32Array:
 
 
 @pytest.mark.parametrize("name", ["clip-vit-h-14", "siglip-base-224"])
-def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: str) -> None:
+def test_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: str) -> None:
     encoder = load_encoder(config(folder, name))
     images = noise_images(5)
     together = encoder.encode_images(images)
@@ -96,7 +96,7 @@ def test_digest_changes_with_everything_that_affects_features(folder: Path, tmp_
 
 
 class _CountingTowers:
-    """Towers that count; features are sums of what they are given."""
+    """Towers that count calls; features are sums of their inputs."""
 
     def __init__(self, batch: int = 2) -> None:
         self.batch = batch
@@ -130,7 +130,7 @@ def test_text_features_are_cached_on_disk(tmp_path: Path) -> None:
     assert later.n_texts == 0
 
 
-# ---- what can be wrong
+# ---- invalid files
 
 
 class _Payload:
@@ -139,7 +139,7 @@ class _Payload:
 
 
 @pytest.mark.parametrize("name", ["pytorch_model.bin", "weights.pt", "weights.pth"])
-def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) -> None:
+def test_weights_file_with_code_is_rejected(tmp_path: Path, name: str) -> None:
     import torch
 
     for form in (pickle.dumps({"a": _Payload()}), None):
@@ -158,7 +158,7 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
         ({"vision_config": {"num_hidden_layers": 10**6}}, "num_hidden_layers is 1000000"),
         ({"vision_config": [1]}, "vision_config is not a table"),
         ({"quantization_config": {}}, "the weights are quantised"),
-        ({"vision_config": {"image_size": 64}}, "the image tower takes 64 px"),
+        ({"vision_config": {"image_size": 64}}, "the image tower needs 64 px"),
     ],
 )
 def test_invalid_configuration_fails_before_loading(

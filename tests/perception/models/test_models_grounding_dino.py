@@ -1,4 +1,4 @@
-"""GroundingDINO around its network: texts, boxes and names, by hand and against transformers' own steps."""
+"""GroundingDINO around its network: texts, boxes and names, compared with hand-computed values and transformers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def detector(tokenizer: Any) -> GroundingDino:
 
 
 @pytest.mark.parametrize("size", [(40, 60), (60, 40), (40, 100), (48, 48)])
-def test_the_image_goes_in_as_transformers_prepares_it(detector: GroundingDino, size: tuple[int, int]) -> None:
+def test_image_is_prepared_as_in_transformers(detector: GroundingDino, size: tuple[int, int]) -> None:
     from transformers.models.grounding_dino.image_processing_pil_grounding_dino import GroundingDinoImageProcessorPil
 
     processor = GroundingDinoImageProcessorPil(size={"shortest_edge": DINO_PX[0], "longest_edge": DINO_PX[1]})
@@ -42,7 +42,7 @@ def test_the_image_goes_in_as_transformers_prepares_it(detector: GroundingDino, 
 
 
 def transformers_answer(detector: GroundingDino, box: float, text: float) -> dict[str, Any]:
-    """Boxes, scores and phrases by transformers' own reading of the same network's answer."""
+    """Boxes, scores and phrases by transformers' own postprocessing of the same network output."""
     import torch
     from transformers.models.grounding_dino.processing_grounding_dino import GroundingDinoProcessor
 
@@ -57,7 +57,7 @@ def transformers_answer(detector: GroundingDino, box: float, text: float) -> dic
 
 
 @pytest.mark.parametrize(("box", "text"), [(0.25, 0.25), (0.5, 0.7), (0.9, 0.999)])
-def test_boxes_scores_and_phrases_are_those_of_transformers(detector: GroundingDino, box: float, text: float) -> None:
+def test_boxes_scores_and_phrases_match_transformers(detector: GroundingDino, box: float, text: float) -> None:
     theirs = transformers_answer(detector, box, text)
     found = detector.detect(RGB, TAGS, BoxConfig(box_threshold=box, text_threshold=text, nms_iou=1.0))
     phrases = [" ".join(one.replace(".", "").replace("[SEP]", "").split()) for one in theirs["text_labels"]]
@@ -70,7 +70,7 @@ def test_boxes_scores_and_phrases_are_those_of_transformers(detector: GroundingD
 
 
 class Told(GroundingDino):
-    """A detector whose network says what it is told: token probabilities and boxes."""
+    """A detector whose network returns given token probabilities and boxes."""
 
     def __init__(
         self, tokenizer: Any, probabilities: Float32Array, boxes: Float32Array, longest_text: int = 32
@@ -91,7 +91,7 @@ PROBABILITIES = np.array(
     [
         [0, 0.6, 0.9, 0.0, 0.0, 0.0, 0.0, 0],  # cat .
         [0, 0.1, 0.0, 0.1, 0.8, 0.0, 0.0, 0],  # table
-        [0, 0.0, 0.0, 0.26, 0.3, 0.0, 0.0, 0],  # coffee table, in the place of the one before
+        [0, 0.0, 0.0, 0.26, 0.3, 0.0, 0.0, 0],  # coffee table, at the position of the previous one
         [0, 0.0, 0.7, 0.0, 0.0, 0.0, 0.0, 0],  # a full stop alone
         [0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 0],  # not above 0.25
     ],
@@ -106,7 +106,7 @@ CENTRES = np.array(
 def test_boxes_are_thresholded_suppressed_and_named_by_phrase(tokenizer: Any) -> None:
     told = Told(tokenizer, PROBABILITIES, CENTRES)
     found = told.detect(RGB, ["Cat", "coffee table", "cat"], BoxConfig())
-    assert told.texts == ["cat. coffee table."], "each tag is asked for once"
+    assert told.texts == ["cat. coffee table."], "each tag is requested once"
     # The third overlaps the second by exactly one half, more than 0.4; the fourth has no name.
     assert found.names == ("cat", "table")
     np.testing.assert_allclose(found.scores, [0.9, 0.8])
@@ -115,7 +115,7 @@ def test_boxes_are_thresholded_suppressed_and_named_by_phrase(tokenizer: Any) ->
 
 def test_conceptgraphs_names_boxes_by_first_word_of_phrase(tokenizer: Any) -> None:
     found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES)
-    # "table" is in "coffee table", which overlaps it by one half, which 0.5 allows; a full stop alone is the first tag.
+    # "table" is in "coffee table", which overlaps it by one half, allowed by 0.5; a full stop alone is the first tag.
     assert found.names == ("cat", "coffee table", "cat", "coffee table", "cat")
     np.testing.assert_allclose(found.scores, [0.9, 0.8, 0.7, 0.3, 0.25])
 

@@ -1,4 +1,4 @@
-"""Exported models: the same answers as torch, files that can be trusted, providers; the tool that exports them."""
+"""Exported models: the same results as torch, file checks, providers, and the export tool."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.floa
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny encoder and a tiny SAM, and what the tool makes of them."""
+    """A tiny encoder and a tiny SAM, and their exports."""
     root = tmp_path_factory.mktemp("models")
     write_tiny_clip(root / CLIP)
     tiny_sam().save_pretrained(root / "sam-vit-h")
@@ -42,7 +42,7 @@ def onnx_config(folder: Path, **settings: Any) -> ModelsConfig:
     return ModelsConfig(encoder=CLIP, folder=folder, runtime="onnx", **settings)
 
 
-def test_an_exported_encoder_gives_torchs_features_in_any_batch(folder: Path) -> None:
+def test_exported_encoder_matches_torch_in_any_batch(folder: Path) -> None:
     exported, batched = load_encoder(onnx_config(folder)), load_encoder(onnx_config(folder, batch=4))
     original = load_encoder(ModelsConfig(encoder=CLIP, folder=folder))
     images = noise_images(5)
@@ -54,7 +54,7 @@ def test_an_exported_encoder_gives_torchs_features_in_any_batch(folder: Path) ->
     assert exported.dim == original.dim and exported.digest != original.digest
 
 
-def test_an_exported_sam_gives_the_masks_of_torch(folder: Path) -> None:
+def test_exported_sam_matches_the_masks_of_torch(folder: Path) -> None:
     sam, other = Sam(TorchSam(tiny_sam())), Sam(load_onnx_sam(locate("sam-vit-h", ("onnx",), folder=folder)))
     assert other.network.image_px == SAM_PX
     mine, theirs = sam.look(blocks(40, 60)), other.look(blocks(40, 60))
@@ -70,7 +70,7 @@ def test_an_exported_sam_gives_the_masks_of_torch(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "file"), [(CLIP, "text.onnx"), ("sam-vit-h", "decoder.onnx")])
-def test_a_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file: str) -> None:
+def test_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file: str) -> None:
     changed = shutil.copytree(folder / f"{name}-onnx", tmp_path / f"{name}-onnx") / file
 
     def load() -> object:

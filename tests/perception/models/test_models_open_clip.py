@@ -1,4 +1,4 @@
-"""Encoders through open_clip: a small stand-in for the package, with the functions that are called and nothing else."""
+"""Encoders through open_clip: a small stand-in for the package, with only the functions that are called."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _tokens(texts: Sequence[str]) -> Any:
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The stand-in installed as ``open_clip``; the architectures that it was asked to make."""
+    """The stand-in installed as ``open_clip``; the architectures that were requested from it."""
     asked: list[str] = []
 
     def create_model(name: str, pretrained: None, precision: str, device: str) -> Any:
@@ -91,7 +91,7 @@ def _encoder(folder: Path, name: str = "clip-vit-h-14", **settings: Any) -> Enco
 
 
 @pytest.mark.parametrize("file", ["open_clip_model.safetensors", "open_clip_pytorch_model.bin"])
-def test_features_are_those_of_the_weights_in_the_file(tmp_path: Path, made: list[str], file: str) -> None:
+def test_features_match_the_weights_in_the_file(tmp_path: Path, made: list[str], file: str) -> None:
     import torch
 
     model = _write(tmp_path, "clip-vit-h-14", file=file)
@@ -105,13 +105,13 @@ def test_features_are_those_of_the_weights_in_the_file(tmp_path: Path, made: lis
     assert (made, encoder.dim, encoder.name) == (["ViT-H-14"], DIM, "ViT-H-14/laion2b_s32b_b79k")
 
 
-def test_openais_weights_are_run_with_the_activation_they_were_trained_with(tmp_path: Path, made: list[str]) -> None:
+def test_openai_weights_run_with_their_training_activation(tmp_path: Path, made: list[str]) -> None:
     _write(tmp_path, "clip-vit-l-14-336")
     _encoder(tmp_path, "clip-vit-l-14-336").encode_texts(["chair"])
     assert made == ["ViT-L-14-336-quickgelu"]
 
 
-def test_without_open_clip_one_line_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_open_clip_gives_one_line_naming_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _write(tmp_path, "clip-vit-h-14")
     monkeypatch.setitem(sys.modules, "open_clip", None)
     with pytest.raises(ModelMissing, match="needs the package 'open_clip': pip install open_clip_torch"):

@@ -1,4 +1,4 @@
-"""What the original programs answer, recorded in tests/cases/front_end.json with its source, is what comes out."""
+"""Results equal those of the original programs, recorded in tests/cases/front_end.json with their source."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def test_conceptgraphs_naming_matches_original_and_drops_no_box() -> None:
             whole = tag_of(phrase, case["tags"])
             n_lost += whole is None
             n_renamed += whole not in (None, answer)
-    assert n_lost > 20 and n_renamed > 2, "the cases tell the rule from that of whole tags"
+    assert n_lost > 20 and n_renamed > 2, "the cases distinguish the rule from that of whole tags"
 
 
 @pytest.mark.parametrize("case", CASES["sizes"], ids=lambda case: f"{case[0]}x{case[1]}")
-def test_the_detectors_image_has_the_originals_size(case: list[int]) -> None:
+def test_detector_image_has_the_size_of_the_original(case: list[int]) -> None:
     height, width, *answer = case
     assert list(size_with_shortest_side(height, width, 800, 1333)) == answer
 
@@ -65,19 +65,19 @@ def test_suppression_matches_torchvision_at_the_threshold(case: dict[str, Any]) 
 
 
 @pytest.mark.parametrize(("text", "cleaned", "words"), CASES["texts"], ids=[ascii(case[0]) for case in CASES["texts"]])
-def test_texts_are_cleaned_and_parted_as_open_clip_does(text: str, cleaned: str, words: list[str]) -> None:
+def test_texts_are_cleaned_and_split_as_in_open_clip(text: str, cleaned: str, words: list[str]) -> None:
     assert plain_text(text) == cleaned
-    # What transformers' tokenizer splits at, which knows the marks of a text's ends.
+    # The split of transformers' tokenizer, which has the start and end marks as tokens.
     known = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
     assert regex.findall(known, without_marks(plain_text(text))) == words
 
 
-def test_texts_in_a_broken_encoding_stay_broken() -> None:
+def test_texts_in_a_broken_encoding_are_not_repaired() -> None:
     for text, corrected in CASES["broken"]:
         assert plain_text(text) == text.lower() != corrected
 
 
-def test_the_mark_of_a_texts_end_does_not_end_a_text(tmp_path: Path) -> None:
+def test_end_of_text_mark_does_not_end_a_text(tmp_path: Path) -> None:
     from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
@@ -94,14 +94,14 @@ def test_the_mark_of_a_texts_end_does_not_end_a_text(tmp_path: Path) -> None:
 # ---- SAM
 
 
-def test_sams_pixels_are_the_originals_to_the_bit() -> None:
+def test_sam_pixels_match_the_original_to_the_bit() -> None:
     levels = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, axis=2)
     values = normalised_bytes(levels)[:, 0]
     assert hashlib.sha256(np.ascontiguousarray(values).astype("<f4").tobytes()).hexdigest() == CASES["sam_pixels"]
 
 
 @pytest.mark.parametrize("case", CASES["sam_points"], ids=lambda case: f"{case['height']}x{case['width']}")
-def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[str, Any]) -> None:
+def test_grid_points_reach_sam_with_the_bits_of_the_original(case: dict[str, Any]) -> None:
     import torch
 
     told: list[Any] = []
@@ -119,11 +119,11 @@ def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[
     n_side, side = case["points_per_side"], case["image_px"]
     config = AutomaticMaskConfig(points_per_side=n_side, points_per_batch=n_side**2)
     AutomaticMasks(Sam(Told()), config).regions(blocks(case["height"], case["width"]))
-    # transformers' SamPositionalEmbedding, on what TorchSam hands it.
+    # transformers' SamPositionalEmbedding, on the points from TorchSam.
     points = torch.from_numpy(as_shares_of_float32(told[0][:, 0], side))
     places = (2 * ((points + 0.5) / side) - 1).to(torch.float32).numpy()
     np.testing.assert_array_equal(places, np.array(case["places"], np.float32))
-    # Points that are rounded before, as a predictor's are, come out otherwise: the case tells one from the other.
+    # Points rounded before, as in the predictor, give different bits, so that the case detects a mix-up.
     size = case["width"], case["height"]
     scale = np.array(size_with_longest_side(*size, side)) / size
     rounded = ((point_grid(n_side) * size).astype(np.float32) * scale).astype(np.float32)
@@ -131,7 +131,7 @@ def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[
 
 
 @pytest.mark.parametrize(("original", "name"), CASES["sam_names"])
-def test_the_original_checkpoints_names_become_those_of_transformers(original: str, name: str) -> None:
+def test_original_checkpoint_names_are_mapped_to_transformers(original: str, name: str) -> None:
     assert name in tiny_sam().state_dict()
     assert name in sam_names({original: 0})
 
@@ -141,7 +141,7 @@ def mask_of(rows: str) -> BoolArray:
 
 
 class Drawn:
-    """The network of the case: of a point in a square that square, a larger one, and a vague mask."""
+    """The network of the case: for a point in a square it returns that square, a larger one, and a vague mask."""
 
     image_px = 64
 
@@ -173,7 +173,7 @@ def test_automatic_mask_boxes_match_original() -> None:
 
 
 @pytest.mark.parametrize(("rows", "box"), CASES["mask_boxes"])
-def test_boxes_of_masks_end_at_the_last_pixel(rows: str, box: list[int]) -> None:
+def test_mask_boxes_end_at_the_last_pixel(rows: str, box: list[int]) -> None:
     assert to_last_pixel(mask_boxes(mask_of(rows)[None]))[0].tolist() == box
 
 
@@ -185,7 +185,7 @@ def test_ram_image_resizing_matches_ram_and_conceptgraphs() -> None:
 
     rgb = blocks(96, 128)
     assert (GroundedConfig().ram_resample, GROUNDED_MASKS["conceptgraphs"].ram_resample) == ("bilinear", "bicubic")
-    # generate_gsa_results.py (5c4da70): image_pil.resize((384, 384)); the transform behind it finds nothing to do.
+    # generate_gsa_results.py (5c4da70): image_pil.resize((384, 384)); the following transform changes nothing.
     theirs = np.asarray(Image.fromarray(rgb).resize((RAM_PX, RAM_PX)))
     np.testing.assert_array_equal(resized(rgb, RAM_PX, RAM_PX, "bicubic"), theirs)
     assert (ram_pixels(rgb, "bicubic") != ram_pixels(rgb)).any()

@@ -1,4 +1,4 @@
-"""How images and texts are prepared for encoders: equal to the originals to the bit, and nothing skipped."""
+"""Preprocessing of images and texts for encoders: equal to the originals to the bit, without skipped steps."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from su3d_bench.perception.models.encoders.images import ImageTransform, read_tr
 from su3d_bench.perception.models.encoders.texts import canonical_text
 
 
-def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None:
+def test_centre_crop_window_is_rounded_as_in_each_library() -> None:
     # 7 wide after the resize, 4 kept: a surplus of 3. torchvision: round(1.5) = 2; transformers: 3 // 2 = 1.
     columns = np.arange(7, dtype=np.uint8) * 10
     image = np.tile(columns[None, :, None], (4, 1, 3))
@@ -28,7 +28,7 @@ def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None
     assert np.array_equal(np.rint(other[0, 0, 0] * 255), [10, 20, 30, 40])
 
 
-def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
+def test_clip_images_match_transformers_to_the_bit() -> None:
     from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
     side = {"height": CLIP_PX, "width": CLIP_PX}
@@ -41,7 +41,7 @@ def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> 
         assert np.array_equal(ours.pixels([image]), answer), image.shape
 
 
-def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
+def test_siglip_images_match_transformers_to_the_bit() -> None:
     from transformers.models.siglip.image_processing_pil_siglip import SiglipImageProcessorPil
 
     theirs = SiglipImageProcessorPil(size={"height": CLIP_PX, "width": CLIP_PX})
@@ -51,7 +51,7 @@ def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -
         assert np.array_equal(ours.pixels([image]), answer), image.shape
 
 
-def test_old_and_new_processor_files_give_the_transform(tmp_path: Path) -> None:
+def test_old_and_new_processor_files_give_the_same_transform(tmp_path: Path) -> None:
     path = tmp_path / "preprocessor_config.json"
     usual = {"image_mean": [0.1, 0.2, 0.3], "image_std": [1, 2, 3], "resample": 3}
     path.write_text(json.dumps(usual | {"size": 224, "crop_size": 224, "do_center_crop": True}))
@@ -74,9 +74,7 @@ def test_old_and_new_processor_files_give_the_transform(tmp_path: Path) -> None:
         ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
     ],
 )
-def test_a_processor_file_that_asks_for_another_recipe_is_refused(
-    tmp_path: Path, change: dict[str, Any], said: str
-) -> None:
+def test_processor_file_with_unusual_steps_is_rejected(tmp_path: Path, change: dict[str, Any], said: str) -> None:
     path = tmp_path / "preprocessor_config.json"
     usual = {"size": 32, "crop_size": 32, "image_mean": [0, 0, 0], "image_std": [1, 1, 1], "do_center_crop": True}
     path.write_text(json.dumps(usual | change))
@@ -91,7 +89,7 @@ def test_siglip_texts_lose_capitals_and_punctuation() -> None:
     assert canonical_text(" A  TV-screen, in the scene. ") == "a tvscreen in the scene"
 
 
-def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
+def test_long_texts_are_truncated_and_keep_their_end_token(tmp_path: Path) -> None:
     from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
@@ -104,7 +102,7 @@ def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
     assert (tokens[1, 1:-1] == words["chair</w>"]).all()
 
 
-def test_batches_are_halved_when_the_memory_runs_out() -> None:
+def test_batches_are_halved_when_memory_runs_out() -> None:
     import torch
 
     seen: list[int] = []

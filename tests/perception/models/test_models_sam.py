@@ -1,4 +1,4 @@
-"""Segment Anything around its network: what goes in and comes out, against transformers' own steps."""
+"""Segment Anything around its network: inputs and outputs compared with transformers' own steps."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def processor() -> Any:
 
 
 @pytest.mark.parametrize("size", [(40, 60), (61, 37), (64, 64), (200, 130)])
-def test_the_image_goes_in_as_transformers_prepares_it(size: tuple[int, int]) -> None:
+def test_image_is_prepared_as_in_transformers(size: tuple[int, int]) -> None:
     seen: list[Float32Array] = []
 
     class Looking:
@@ -69,17 +69,17 @@ def transformers_masks(multiple: bool, **prompt: Any) -> tuple[BoolArray, Float3
     return masks[0].numpy(), answer.iou_scores[0].numpy()
 
 
-def test_masks_of_boxes_are_the_best_of_three_that_transformers_gives(sam: Sam) -> None:
+def test_box_masks_are_the_best_of_three_as_in_transformers(sam: Sam) -> None:
     masks, scores = sam.from_boxes(sam.look(RGB), BOXES, is_single=False)
     theirs, predicted = transformers_masks(True, input_boxes=BOXES)
     best = predicted.argmax(axis=1)
-    assert best.any(), "the first mask is always the best: nothing is chosen"
+    assert best.any(), "the first mask is always the best, so that nothing is selected"
     np.testing.assert_allclose(scores, predicted.max(axis=1), atol=1e-5)
     assert (masks != theirs[np.arange(3), best]).mean() < 1e-3
     assert 0.05 < masks.mean() < 0.95
 
 
-def test_single_masks_of_boxes_and_of_points_are_those_of_transformers(sam: Sam) -> None:
+def test_single_masks_of_boxes_and_points_match_transformers(sam: Sam) -> None:
     image = sam.look(RGB)
     masks, scores = sam.from_boxes(image, BOXES, is_single=True)
     theirs, predicted = transformers_masks(False, input_boxes=BOXES)
@@ -129,5 +129,5 @@ def test_incomplete_checkpoint_fails() -> None:
     for name, tensor in tiny_sam().state_dict().items():
         assert (model.state_dict()[name] == tensor).all(), name
     state.pop("mask_decoder.iou_token.weight")
-    with pytest.raises(DataError, match=r"sam\.pth: is not a checkpoint of this SAM: .*iou_token"):
+    with pytest.raises(DataError, match=r"sam\.pth: not a checkpoint of this SAM: .*iou_token"):
         fill_sam(SamModel(tiny_sam().config), state, "sam.pth")

@@ -1,4 +1,4 @@
-"""Tags of an image: RAM++ through its package or exported, and words of a list that an encoder finds likeliest."""
+"""Tags of an image: RAM++ from its package or exported, and the words of a list most likely to an encoder."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RGB = blocks(40, 60)
 
 
 class ByColour:
-    """An encoder whose directions are red, green and blue: of an image its mean colour, of a text the word in it."""
+    """An encoder with the directions red, green and blue: the mean colour of an image, the word in a text."""
 
     name = digest = "colours"
     dim = 3
@@ -51,7 +51,7 @@ def test_most_probable_words_are_taken_over_image_parts() -> None:
     image[:, :, 0] = 200
     image[20:, 30:] = 0, 0, 255
     tagger = WordTagger(ByColour(), ("green", "blue", "red"), n_tags=2)
-    # Most of the image is red and three quarters are nothing else; one is blue: both 1, in the order of the list.
+    # Most of the image is red, three quarters entirely; one is blue: both score 1, in the order of the list.
     assert tagger.tags(image) == ("blue", "red")
     assert WordTagger(ByColour(), ("green", "blue", "red"), n_tags=9).tags(image) == ("blue", "red", "green")
     assert tagger.caveat is not None and "RAM++ is not installed" in tagger.caveat
@@ -95,14 +95,12 @@ def test_exported_tagger_uses_names_of_its_list() -> None:
     tagger = OnnxRamTagger(lambda: session, ("bed", "lamp", "room", "sofa"), "digest")
     assert tagger.tags(RGB) == ("lamp", "sofa")
     assert shapes == [(1, 3, RAM_PX, RAM_PX)] and tagger.caveat is None
-    with pytest.raises(DataError, match=r"answers \(1, 4\), ram_tag_list.txt has 3 tags"):
+    with pytest.raises(DataError, match=r"returns \(1, 4\), but ram_tag_list.txt has 3 tags"):
         OnnxRamTagger(lambda: session, ("bed", "lamp", "room"), "digest").tags(RGB)
 
 
-def test_the_published_package_gets_its_weights_as_plain_tensors(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A package ``ram`` with the published interface and a network of one layer stands in for the real one."""
+def test_published_package_gets_its_weights_as_plain_tensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package ``ram`` with the published interface and a one-layer network replaces the real one."""
     import torch
 
     asked: list[dict[str, Any]] = []
@@ -127,7 +125,7 @@ def test_the_published_package_gets_its_weights_as_plain_tensors(
     models.ram_plus = ram_plus
     monkeypatch.setitem(sys.modules, "ram", ModuleType("ram"))
     monkeypatch.setitem(sys.modules, "ram.models", models)
-    # An older name of the head, and a buffer of another window, as the published file has them.
+    # An older name of the head, and a buffer of another window, as in the published file.
     head = {"vision_multi.weight": torch.zeros(2, 3), "vision_multi.bias": torch.tensor([-1.0, 1.0])}
     path, entry = tmp_path / "ram_plus_swin_large_14m.pth", model_entry("ram-plus", "tagger")
     files = ModelFiles(entry, entry.form("original"), tmp_path, path)

@@ -1,4 +1,4 @@
-"""Runs that are refused before any work: folders of others, two things of one name, wrong variants."""
+"""Runs that are rejected before any work: foreign folders, duplicate names, invalid variants."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from su3d_bench.runs.plan import named_method
 pytestmark = pytest.mark.usefixtures("painted_place")
 
 
-def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
+def test_foreign_folder_is_rejected_and_left_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     Path("out").mkdir()
     Path("out/.notes.tmp").write_text("theirs")
     assert run() == 2
@@ -28,16 +28,16 @@ def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("more", "line"),
     [
-        (["--methods", f"{SCENES}/painted.py:SlashCollector"], "'../elsewhere' cannot be the name of a folder"),
-        (["--methods", COLLECTOR, f"{SCENES}/./painted.py:Collector"], "different ones are called 'collector'"),
+        (["--methods", f"{SCENES}/painted.py:SlashCollector"], "'../elsewhere' is not a valid folder name"),
+        (["--methods", COLLECTOR, f"{SCENES}/./painted.py:Collector"], "different ones are named 'collector'"),
         (
             ["--scenes", f"{PAINTED}/a", f"{SCENES}/./painted.py:Painted/b"],
-            "two different ones are called 'pai",
+            "two different ones are named 'pai",
         ),
-        (["--protocols", "one/mine.toml", "two/mine.toml"], "two different ones are called 'mine'"),
+        (["--protocols", "one/mine.toml", "two/mine.toml"], "two different ones are named 'mine'"),
     ],
 )
-def test_two_things_of_one_name_are_refused_before_any_work(
+def test_duplicate_or_invalid_names_are_rejected_before_any_work(
     more: list[str], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folder, voxel in (("one", "0.05"), ("two", "0.06")):
@@ -52,13 +52,13 @@ def test_two_things_of_one_name_are_refused_before_any_work(
 PAINTED_FILE = f"{SCENES}/painted.py"
 
 
-def test_a_preset_sets_what_the_class_says() -> None:
+def test_preset_sets_the_values_of_the_class() -> None:
     method = named_method("opensu3d@scheme3")
     assert (method.base, method.name) == ("opensu3d", "opensu3d@scheme3")
     assert [(one.path[2:], one.value) for one in method.settings] == [(("scheme",), "scheme3")]
 
 
-def test_values_are_toml_and_lists_may_hold_commas() -> None:
+def test_variant_values_are_toml_and_lists_may_contain_commas() -> None:
     method = named_method("opensu3d@top_m=1,crop_ratios=[0.8, 1, 1.2],overlap_rule=as-printed")
     assert {one.path[2]: one.value for one in method.settings} == {
         "top_m": 1,
@@ -75,10 +75,10 @@ def test_values_are_toml_and_lists_may_hold_commas() -> None:
         ("sam3d@x", "sam3d has no preset 'x'"),
         ("opensu3d@", "expected METHOD@PRESET or METHOD@KEY=VALUE"),
         ("opensu3d@a=../b", "expected METHOD@PRESET"),
-        ("opensu3d@top_m=1,", "'' is no KEY=VALUE"),
+        ("opensu3d@top_m=1,", "expected KEY=VALUE, not ''"),
         ("opensu4d@scheme1", "did you mean 'opensu3d'"),
     ],
 )
-def test_a_wrong_variant_is_one_line(text: str, message: str) -> None:
+def test_invalid_variant_is_rejected(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         named_method(text)

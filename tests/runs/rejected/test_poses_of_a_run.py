@@ -1,4 +1,4 @@
-"""What a run says of recordings whose poses and depth contradict each other, before it works on them."""
+"""Recordings whose poses and depth contradict each other are reported before a run starts its work."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(whole: Path, data_to_spoil: Callable[[Path], Path]) -> Path:
-    """A copy of the rooms that a test may spoil."""
+    """A copy of the rooms that a test may damage."""
     return data_to_spoil(whole)
 
 
@@ -46,18 +46,18 @@ def inverted(matrices: Float64Array) -> Float64Array:
     return np.asarray(np.linalg.inv(matrices), np.float64)
 
 
-def test_inverse_poses_end_a_run_before_its_work_and_the_reading_that_agrees_is_named(
+def test_inverse_poses_stop_a_run_early_and_the_correct_convention_is_named(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoil(root, inverted)
     assert main(RUN.split()) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"su3d-bench: {CONTRADICTED}") and "% with the inverse poses" in line
-    assert line.endswith("; --accept-poses runs it all the same")
+    assert line.endswith("; --accept-poses runs it anyway")
     assert not Path("out").exists()
 
 
-def test_accepted_poses_are_a_warning_in_table_log_and_record_and_a_resumed_run_says_it_again(
+def test_accepted_poses_give_a_warning_in_table_log_and_record_also_on_resume(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoil(root, inverted)
@@ -72,7 +72,7 @@ def test_accepted_poses_are_a_warning_in_table_log_and_record_and_a_resumed_run_
     assert capsys.readouterr().out == table and Path("out/metrics.json").read_bytes() == metrics
 
 
-def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_looked_at(
+def test_pose_error_counts_affected_scenes_and_generated_rooms_are_not_checked(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for scene in ("bathroom0", "office0"):
@@ -85,15 +85,15 @@ def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_l
     assert poses.judged(plan.jobs)[0].doubts == ()
 
 
-def test_a_check_that_fails_itself_is_a_warning_not_silence(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_pose_check_is_a_warning(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poses, "judge_scene", lambda *words: 1 / 0)
     plan = make_plan(Settings((Setting(("scenes",), ("replica/bathroom0",), ""),)))
     (line,) = poses.judged(plan.jobs)[0].doubts or ()
     assert line.startswith("replica/bathroom0: poses and depth could not be checked: ") and "ZeroDivisionError" in line
 
 
-def test_a_world_whose_up_is_not_z_is_a_warning_of_a_run(root: Path) -> None:
-    """Of a dataset whose files may have any world."""
+def test_up_axis_other_than_z_gives_a_warning(root: Path) -> None:
+    """For a dataset whose files may use any world frame."""
     folder = root / "rgbd" / "bath"
     folder.mkdir(parents=True)
     shutil.copytree(root / "Replica" / "bathroom0" / "results", folder / "results")

@@ -1,4 +1,4 @@
-"""Bad input on real files: rooms written in Replica's layout, one scene spoilt, the run as a user starts it."""
+"""Bad input in real files: rooms written in Replica's layout, one scene damaged, the run started as by a user."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def clean_scene(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
-    """What the scene that is never spoilt scores."""
+    """The scores of the scene that is never damaged."""
     out = tmp_path_factory.mktemp("clean")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(whole))
@@ -38,7 +38,7 @@ def clean_scene(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 @pytest.fixture
 def root(whole: Path, data_to_spoil: Callable[[Path], Path]) -> Path:
-    """A copy of the rooms that a test may spoil."""
+    """A copy of the rooms that a test may damage."""
     return data_to_spoil(whole)
 
 
@@ -49,7 +49,7 @@ def scores_of_office(out: Path) -> dict[str, float]:
 
 
 def remarks_of(err: str) -> list[str]:
-    """The lines on stderr, but that four frames far from each other do not tell whether the poses are right."""
+    """The lines on stderr, except that the poses could not be checked because the four frames are far apart."""
     return [line for line in err.splitlines() if ": poses and depth could not be checked: " not in line]
 
 
@@ -85,7 +85,7 @@ INFO = "replica_v1/bathroom_0/habitat/info_semantic.json"
         (pose("nan " * 16), "traj.txt line 3: the pose holds 'nan'; mend the trajectory or leave the scene out"),
     ],
 )  # fmt: skip
-def test_a_spoilt_scene_is_one_line_and_the_other_scene_is_unharmed(
+def test_damaged_scene_is_a_one_line_error_and_does_not_affect_others(
     spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoil(root)
@@ -110,11 +110,11 @@ def test_a_spoilt_scene_is_one_line_and_the_other_scene_is_unharmed(
         ),
     ],
 )
-def test_what_the_annotation_does_not_know_is_void_and_said_in_one_line(
+def test_unknown_annotations_become_void_with_a_one_line_warning(
     spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoil(root)
-    for _ in range(2):  # a run that resumes says it again
+    for _ in range(2):  # a resumed run repeats the warning
         assert main([*RUN.split(), "--out", "out"]) == 0
         remarks = remarks_of(capsys.readouterr().err)
         assert all(" su3d-bench " in line for line in remarks[2:])
@@ -123,7 +123,7 @@ def test_what_the_annotation_does_not_know_is_void_and_said_in_one_line(
     assert scores_of_office(Path("out")) == clean_scene
 
 
-def test_a_truth_that_is_missing_leaves_the_scene_unscored(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_ground_truth_leaves_the_scene_unscored(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (root / "replica_v1" / "bathroom_0" / "habitat" / "mesh_semantic.ply").unlink()
     assert main([*RUN.split(), "--out", "out"]) == 0
     answer = capsys.readouterr()

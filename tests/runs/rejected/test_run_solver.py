@@ -1,4 +1,4 @@
-"""A language model as the solver of a run: asked once, kept with the run, named beside its numbers."""
+"""A language model as the solver of a run: asked once, stored with the run, named next to its numbers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def server(chat: ChatServer) -> ChatServer:
 
 
 def geometry(body: Body) -> Answered:
-    """What a language model says that reasons as the built-in solver does, in words alone."""
+    """The reply of a language model that reasons as the built-in solver does, in words only."""
     listed, _, question = body["messages"][-1]["content"].partition("\n\nQuestion: ")
     lines = [json.loads(line) for line in listed.splitlines() if line.startswith("{")]
     scene = SceneMap(
@@ -62,7 +62,7 @@ def result(folder: Path) -> Any:
     return found["result"]
 
 
-def test_a_language_model_answers_in_a_run_and_its_replies_are_asked_for_once(
+def test_language_model_answers_in_a_run_and_each_reply_is_requested_once(
     folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*RUN, *ASKED, "--out", "geometry"]) == 0
@@ -86,9 +86,7 @@ def test_a_language_model_answers_in_a_run_and_its_replies_are_asked_for_once(
     assert table.count("70 questions over Replica and ScanNet together") == 2
 
 
-def test_offline_answers_from_the_kept_replies_alone(
-    folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_offline_uses_only_stored_replies(folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(llm(server, "--offline")) == 2
     assert "no stored reply to this ask request of model 'tiny'" in capsys.readouterr().err
     assert server.n_asked == 0

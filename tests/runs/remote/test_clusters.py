@@ -25,8 +25,8 @@ WHILE_LOADED_S = 300
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """Three machines of one core: the driver's, which takes no job, one with a GPU in name, and one to be killed."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # no test asks the network for anything
+    """Three single-core machines: the driver's, which runs no job, one with a nominal GPU, and one to be killed."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # no test uses the network
     from ray.cluster_utils import Cluster
 
     small = {"object_store_memory": 80_000_000, "include_dashboard": False}
@@ -50,7 +50,7 @@ def run(*more: str, out: str) -> int:
 
 
 def deterministic_files(out: Path) -> dict[str, Any]:
-    """Everything of a run that holds no time and no machine, by name: files, and the keys that jobs are sealed with."""
+    """All parts of a run without times or machine names, by name: files, and the keys of completed jobs."""
     paths = [path for path in out.rglob("*") if path.is_file()]
     kept = [path for path in paths if path.name not in ("run.json", "run.toml", "updates.csv", "done.json")]
     found: dict[str, Any] = {path.relative_to(out).as_posix(): path.read_bytes() for path in kept}
@@ -68,7 +68,7 @@ def assert_equal_runs(one: Path | str, other: Path | str) -> None:
 
 
 def workers_of(node: Any) -> list[psutil.Process]:
-    """Processes of ``node`` that carry out a job, as soon as there are some."""
+    """Processes of ``node`` that run a job, as soon as there are any."""
     raylet = psutil.Process(node.all_processes["raylet"][0].process.pid)
     return wait_until(
         lambda: [child for child in raylet.children(recursive=True) if "ray::_on_node" in " ".join(child.cmdline())],
@@ -78,7 +78,7 @@ def workers_of(node: Any) -> list[psutil.Process]:
 
 
 @pytest.mark.proof
-def test_a_run_on_a_cluster_that_is_asked_to_end_ends_in_order(cluster: Any) -> None:
+def test_run_on_a_cluster_stops_cleanly_on_sigterm(cluster: Any) -> None:
     where = ("--executor", "ray", "--ray-address", cluster.address, "--set", "painted.frame_ms=5000")
     command = [sys.executable, str(SCENES / "painted_cli.py"), *words(*where, out="ended")]
     driver = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
@@ -89,7 +89,7 @@ def test_a_run_on_a_cluster_that_is_asked_to_end_ends_in_order(cluster: Any) -> 
     assert json.loads(Path("ended/run.json").read_text())["status"] == "interrupted"
 
 
-def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any) -> None:
+def test_run_survives_a_machine_that_dies(cluster: Any) -> None:
     assert run("--jobs", "1", out="inline") == 0
     command = [sys.executable, str(SCENES / "painted_cli.py"), *words("--executor", "ray", out="ray")]
     driver = subprocess.Popen([*command, "--ray-address", cluster.address], stdout=subprocess.DEVNULL)
@@ -101,7 +101,7 @@ def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any)
 
 
 @pytest.mark.proof
-def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
+def test_scene_that_kills_every_worker_fails_alone_after_its_retries(
     cluster: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = ("--executor", "ray", "--ray-address", cluster.address, "--scenes", f"{PAINTED}/[ab]")
@@ -111,7 +111,7 @@ def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
     assert json.loads(Path("killed/metrics.json").read_text())["results"][0]["result"]["scenes"] == ["painted/a"]
 
 
-def test_submitit_gives_the_same_bytes_as_inline() -> None:
+def test_submitit_gives_the_same_bytes_as_inline_execution() -> None:
     scenes = ("--scenes", f"{PAINTED}/[ad]")
     assert run(*scenes, "--jobs", "1", out="inline") == 0
     assert run(*scenes, "--executor", "slurm", "--slurm", "cluster=local", "timeout_min=20", out="slurm") == 0
@@ -121,14 +121,14 @@ def test_submitit_gives_the_same_bytes_as_inline() -> None:
 @pytest.mark.parametrize(
     ("more", "named"),
     [
-        (["--retries", "3"], "--retries 3: means nothing to the executor 'auto'"),
-        (["--executor", "inline", "--jobs", "3"], "--jobs 3: the executor 'inline' runs one"),
+        (["--retries", "3"], "--retries 3: has no effect with the executor 'auto'"),
+        (["--executor", "inline", "--jobs", "3"], "--jobs 3: the executor 'inline' runs one job"),
         (["--executor", "slurm", "--gpus-per-job", "0.5"], "--gpus-per-job 0.5"),
         (["--executor", "slurm", "--slurm", "x"], "--slurm x: expected KEY=VALUE"),
-        (["--executor", "slurm", "--slurm", "cluster=local", "timeout_mni=1"], "--slurm: submitit refuses it"),
+        (["--executor", "slurm", "--slurm", "cluster=local", "timeout_mni=1"], "--slurm: submitit rejects the options"),
     ],
 )
-def test_an_option_that_means_nothing_is_one_line(
+def test_option_without_effect_is_a_one_line_error(
     more: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(*more, out="out") == 2
@@ -140,14 +140,14 @@ def test_an_option_that_means_nothing_is_one_line(
 @pytest.mark.parametrize(
     ("executor", "line"),
     [
-        ("ray", "no Ray cluster on this machine takes this run (Could not find any running Ray instance"),
+        ("ray", "no Ray cluster on this machine accepts this run (Could not find any running Ray instance"),
         (
             "slurm",
-            "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster",
+            "no Slurm cluster here (srun not found); run the command on a machine of the cluster, or add --slurm ",
         ),
     ],
 )
-def test_a_cluster_that_is_not_there_is_one_line_that_leaves_nothing(
+def test_missing_cluster_is_a_one_line_error_and_writes_nothing(
     executor: str, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nothing_runs(**_: Any) -> None:
@@ -164,7 +164,7 @@ def test_a_cluster_that_is_not_there_is_one_line_that_leaves_nothing(
 
 
 @pytest.mark.proof
-def test_a_cluster_of_this_machine_alone_is_started_for_the_run(tmp_path: Path) -> None:
+def test_single_machine_cluster_is_started_for_the_run(tmp_path: Path) -> None:
     scenes = ("--scenes", f"{PAINTED}/[ad]")
     assert run(*scenes, "--jobs", "1", out="inline") == 0
     command = [sys.executable, str(SCENES / "painted_cli.py"), *words(*scenes, "--executor", "ray", out="ray")]

@@ -26,7 +26,7 @@ def work(unit: str, report: Report) -> str:
         raise KeyError("a mistake")
     if unit == "wait":
         threading.Event().wait(60)
-    if unit == "deaf":  # as in a library's own code, which comes back to Python much later
+    if unit == "deaf":  # as in native code, which returns to Python much later
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         report(Event(unit, "work", 0, 1))
         threading.Event().wait(60)
@@ -49,23 +49,23 @@ def in_processes(units: list[str], jobs: int = 2) -> list[str]:
 @pytest.mark.parametrize(
     ("unit", "reason"),
     [
-        ("kill", "kill: the worker was killed (signal 9), most often for want of memory; try fewer --jobs"),
+        ("kill", "kill: the worker was killed (signal 9), usually because memory ran out; try fewer --jobs"),
         ("segfault", "segfault: the worker crashed (signal 11, SIGSEGV)"),
         ("exit", "exit: the worker ended early (exit code 7)"),
     ],
 )
-def test_a_unit_that_takes_its_process_down_fails_alone(unit: str, reason: str) -> None:
+def test_unit_that_crashes_its_process_fails_alone(unit: str, reason: str) -> None:
     assert sorted(in_processes(["a", unit, "b"])) == sorted(["A", reason, "B"])
 
 
-def test_an_error_of_the_user_stops_all_at_once() -> None:
+def test_user_error_stops_all_units() -> None:
     start = time.monotonic()
     with pytest.raises(StoreError, match="the disk is full"):
         in_processes(["disk", "wait"])
     assert time.monotonic() - start < 30
 
 
-def test_an_interrupt_ends_workers_that_do_not_hear_of_it_too() -> None:
+def test_interrupt_also_ends_workers_that_ignore_signals() -> None:
     def interrupt(event: Event) -> None:
         pids.extend(child.pid for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
         interrupted.append(time.monotonic())
@@ -78,13 +78,13 @@ def test_an_interrupt_ends_workers_that_do_not_hear_of_it_too() -> None:
     assert len(pids) == 1 and not psutil.pid_exists(pids[0])
 
 
-def test_workers_hold_libraries_to_one_thread_and_the_parent_keeps_its_own() -> None:
+def test_workers_use_one_thread_and_parent_settings_are_unchanged() -> None:
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     assert in_processes(["threads"]) == [" ".join("1" for _ in ONE_THREAD)]
     assert {name: os.environ.get(name) for name in ONE_THREAD} == before
 
 
-def test_a_task_of_ray_that_is_asked_to_end_says_so_and_is_no_failure() -> None:
+def test_ray_task_reports_being_terminated_without_failing() -> None:
     def work(unit: str, report: Report) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()

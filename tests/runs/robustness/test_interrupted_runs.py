@@ -1,4 +1,4 @@
-"""A run that is ended, by whom and however that comes, leaves no program of a user running and no folder behind."""
+"""A run that is ended, in whatever way, leaves no user program running and no temporary folder behind."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ time.sleep(600)
 
 
 class Started:
-    """A run of the command line on two scenes, whose program is running once this is made."""
+    """A command-line run on two scenes, whose programs are running once this object is created."""
 
     def __init__(self, place: Path, executor: str, *, n_programs: int, **how: Any) -> None:
         self.place, self.scratch, self.marks = place, place / "scratch", place / "marks"
@@ -68,12 +68,12 @@ class Started:
         return [process for process in self.mentions() if _words(process, "while :; do")]
 
     def mentions(self) -> list[psutil.Process]:
-        """Every process but the run itself that has the name of this place in its command line."""
+        """Every process, except the run itself, with this folder in its command line."""
         found = [process for process in psutil.process_iter() if _words(process, str(self.place))]
         return [process for process in found if process.pid != self.run.pid]
 
     def workers(self) -> list[psutil.Process]:
-        """The two processes of the run that carry out a scene each."""
+        """The two processes of the run, one per scene."""
         return [process for process in psutil.Process(self.run.pid).children() if _words(process, WORKER)]
 
     def close(self) -> None:
@@ -95,7 +95,7 @@ class Started:
 
 
 def _words(process: psutil.Process, mark: str) -> bool:
-    """Whether ``mark`` is in the command line of a process that runs."""
+    """Whether ``mark`` is in the command line of a running process."""
     try:
         return process.status() != psutil.STATUS_ZOMBIE and any(mark in word for word in process.cmdline())
     except psutil.Error:
@@ -126,7 +126,7 @@ def started(tmp_path: Path) -> Iterator[Any]:
         pytest.param("inline", signal.SIGKILL, marks=pytest.mark.proof),
     ],
 )
-def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
+def test_run_ended_by_a_signal_leaves_no_program_and_no_folder(
     started: Any, executor: str, number: signal.Signals
 ) -> None:
     run = started(executor)
@@ -146,7 +146,7 @@ def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.proof)])
-def test_a_worker_ended_by_a_signal_leaves_no_program_and_its_scene_alone_fails(
+def test_worker_ended_by_a_signal_leaves_no_program_and_only_its_scene_fails(
     started: Any, number: signal.Signals
 ) -> None:
     run = started("processes")
@@ -164,7 +164,7 @@ def test_a_worker_ended_by_a_signal_leaves_no_program_and_its_scene_alone_fails(
 
 @pytest.mark.proof
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=lambda n: n.name)
-def test_a_signal_to_everything_in_a_job_leaves_nothing(started: Any, number: signal.Signals) -> None:
+def test_signal_to_the_process_group_leaves_nothing(started: Any, number: signal.Signals) -> None:
     run = started("processes", start_new_session=True)
     os.killpg(run.run.pid, number)
     assert run.run.wait(60) in {-number, 128 + number}
@@ -172,7 +172,7 @@ def test_a_signal_to_everything_in_a_job_leaves_nothing(started: Any, number: si
 
 
 @pytest.mark.parametrize("executor", ["processes", pytest.param("inline", marks=pytest.mark.proof)])
-def test_a_terminal_that_is_closed_ends_the_run_in_order(started: Any, executor: str) -> None:
+def test_closing_the_terminal_stops_the_run_cleanly(started: Any, executor: str) -> None:
     ours, theirs = pty.openpty()
     run = started(executor, stdin=theirs, stdout=theirs, stderr=theirs, preexec_fn=_own_terminal)
     os.close(theirs)
@@ -191,9 +191,9 @@ def _own_terminal() -> None:
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
-def test_a_process_that_was_told_to_outlive_its_terminal_does_and_hears_of_two_signals_at_once_the_first() -> None:
+def test_ignored_sighup_stays_ignored_and_only_the_first_of_two_signals_is_raised() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    term_before = signal.getsignal(signal.SIGTERM)  # a cluster of another test in this process may have its own
+    term_before = signal.getsignal(signal.SIGTERM)  # a cluster of another test in this process may have set its own
     heard = []
     try:
         with ending_in_order():

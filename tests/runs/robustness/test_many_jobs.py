@@ -1,4 +1,4 @@
-"""What a run of many jobs rests on: each file is read a bounded number of times."""
+"""Runs of many jobs: each file is read a bounded number of times."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures",
 
 @pytest.fixture
 def finished(painted_place: Path) -> Path:
-    """A run that is done, in the folder ``out`` below the current one."""
+    """A finished run, in the folder ``out`` below the current one."""
     assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
     return painted_place / "out"
 
 
-def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(
+def test_finished_run_starts_no_worker_and_reads_each_completion_record_at_most_twice(
     finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = (finished / "metrics.json").read_bytes()
@@ -41,7 +41,7 @@ def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(
     assert len(reads) <= 2 * n_jobs
 
 
-def test_a_scene_with_a_damaged_file_is_run_again_to_the_same_numbers(
+def test_scene_with_a_damaged_file_is_run_again_with_the_same_numbers(
     finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -61,7 +61,7 @@ def test_a_scene_with_a_damaged_file_is_run_again_to_the_same_numbers(
 
 
 def count_seals_read(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Grows by the path of every ``done.json`` that is read."""
+    """A list that grows by the path of every ``done.json`` that is read."""
     reads: list[Path] = []
     read_json = atomic.read_json
 

@@ -1,4 +1,4 @@
-"""What a run does when it is killed, when a disk is full or closed, when memory ends, when a clock jumps."""
+"""Runs that are killed, or meet a full disk, a disk without locks, exhausted memory or a clock that jumps."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def job(scene: str = "a", out: str = "out") -> Path:
 
 
 def results(out: str = "out") -> dict[str, bytes]:
-    """Every file of a run that holds no time."""
+    """Every file of a run that contains no times."""
     paths = [path for path in Path(out).rglob("*") if path.is_file() and path.name not in ("updates.csv", "done.json")]
     return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
 
 
 @pytest.mark.proof
-def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_jumps_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run() == 0
     before = results()
     (job() / "counts.npz").unlink()
@@ -65,13 +65,13 @@ def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(scene_run, "score_scene", score)
     assert run() == 0
     assert results() == before
-    assert score.call_count == 1, "the step that lacks a file is done again, and no other"
+    assert score.call_count == 1, "only the step with a missing file is done again"
     rows = [line.split(",") for line in (job() / "updates.csv").read_text().splitlines()]
     assert all(float(row[rows[0].index("total_ms")]) >= 0 for row in rows[1:])
 
 
 @pytest.mark.proof
-def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undisturbed_one() -> None:
+def test_commands_killed_at_random_give_the_same_bytes_as_undisturbed_ones() -> None:
     seed = "116"  # its first kill is a power cut
     program = [sys.executable, str(ROOT / "benchmarks"), "kill_at_random", "--kills", "10", "--seed", seed]
     words = ["--only", "inline", "export", "sheets-score", "report-html", "--json", "found.json"]
@@ -87,7 +87,7 @@ def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undi
     assert sum(int(row["files corrupted"]) for row in rows) > 0
 
 
-def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
+def test_full_disk_is_a_one_line_error_and_the_run_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(out="whole", scenes="a") == 0
@@ -115,7 +115,7 @@ def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
         assert results() == results("whole")
 
 
-def test_killed_at_any_moment_and_resumed_by_several_workers_it_gives_the_bytes_of_one() -> None:
+def test_killed_run_resumed_by_several_workers_gives_the_same_bytes() -> None:
     slow = ("--scenes", f"{PAINTED}/[ab]", "--set", "painted.frame_ms=20", "--set", "collector.noise_m=0.01")
     started = time.monotonic()
     subprocess.run(in_process(*slow, out="whole"), check=True, capture_output=True)
@@ -135,14 +135,14 @@ def test_killed_at_any_moment_and_resumed_by_several_workers_it_gives_the_bytes_
     assert not list(Path("out").rglob("*.unfinished"))
 
 
-def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_out_of_memory_fails_only_its_scene_and_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--set", "painted.fault=memory") == 3
     line = "painted/b: out of memory (Unable to allocate 512. PiB for an array with shape (72057594037927936,) and data"
     assert f"{line} type float64); try fewer --jobs, or a machine with more\n" in capsys.readouterr().err
     assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
 
 
-def test_a_disk_without_locks_is_no_place_for_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disk_without_locks_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_locks(handle: int, operation: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
@@ -151,7 +151,7 @@ def test_a_disk_without_locks_is_no_place_for_a_run(tmp_path: Path, monkeypatch:
         pass
 
 
-def test_any_damage_to_an_entry_of_the_cache_counts_as_absent(tmp_path: Path) -> None:
+def test_damaged_cache_entry_counts_as_absent(tmp_path: Path) -> None:
     cache = FrameCache(tmp_path)
     key = "ab" * 32
     arrays: dict[str, Any] = {"rows": np.arange(12, dtype=np.float32), "names": np.array(["chair"])}
@@ -173,7 +173,7 @@ def test_any_damage_to_an_entry_of_the_cache_counts_as_absent(tmp_path: Path) ->
     assert n_absent > 400
 
 
-def test_a_cache_file_is_whole_or_absent_and_a_killed_writer_leaves_nothing_to_pile_up(tmp_path: Path) -> None:
+def test_cache_file_is_complete_or_absent_and_leftovers_are_removed(tmp_path: Path) -> None:
     path = tmp_path / "entry.npz"
     (tmp_path / ".entry.npz.000000000000.unfinished").write_bytes(b"left by a killed process, and longer")
     with filling(path) as stream:
@@ -187,7 +187,7 @@ def test_a_cache_file_is_whole_or_absent_and_a_killed_writer_leaves_nothing_to_p
     assert [child.name for child in tmp_path.iterdir()] == ["entry.npz"]
 
 
-def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
+def test_temporary_folder_of_a_killed_process_is_removed_by_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -207,7 +207,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
 
 
 def abandoned(folder: Path) -> Path:
-    """The temporary folder of a process that was killed."""
+    """The temporary folder of a killed process."""
     code = (
         "import os, signal; from su3d_bench.core.files.atomic import TemporaryFolder\n"
         "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
@@ -232,7 +232,7 @@ print(double(21), sum(double.stats.cache_hits.values()))
 
 
 @pytest.mark.proof
-def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path: Path) -> None:
+def test_damaged_cached_kernel_is_compiled_again(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text(KERNEL)
 
     def imported() -> str:
@@ -248,7 +248,7 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
     assert imported() == "42 1\n"
 
 
-def test_a_compiled_kernel_is_compiled_again_when_a_function_that_it_imports_has_changed(tmp_path: Path) -> None:
+def test_kernel_is_compiled_again_when_an_imported_function_changes(tmp_path: Path) -> None:
     head = "from su3d_bench.core.compiled import njit\n"
     inner = head + "@njit(cache=True)\ndef factor():\n    return {}\n"
     middle = head + "from inner import factor\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("painted_place")
 
 @pytest.fixture
 def store() -> Any:
-    """The memory of this process as a store, empty."""
+    """An empty store in the memory of this process."""
     driver = fsspec.filesystem("memory")
     driver.store.clear()
     driver.pseudo_dirs[:] = [""]
@@ -33,13 +33,13 @@ def store() -> Any:
 
 
 def brought(url: str, to: Path) -> Path:
-    """A copy of all that is in the store."""
+    """A copy of all files in the store."""
     folder = RemoteFolder(url)
     folder.fetch(folder.files(), to)
     return to
 
 
-def test_a_run_in_a_store_has_the_bytes_of_a_run_in_a_folder(store: Any, tmp_path: Path) -> None:
+def test_run_in_a_store_equals_a_run_in_a_folder(store: Any, tmp_path: Path) -> None:
     assert run(*TWO, out="local") == 0
     assert run(*TWO, out=URL) == 0
     assert_equal_runs("local", brought(URL, tmp_path / "came"))
@@ -49,7 +49,7 @@ def test_a_run_in_a_store_has_the_bytes_of_a_run_in_a_folder(store: Any, tmp_pat
     assert main(["report", "tables", str(mirror)]) == 0
 
 
-def test_a_run_in_a_store_is_taken_up_again_without_the_folder_here(
+def test_run_in_a_store_resumes_without_the_local_mirror(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(*TWO, out=URL) == 0
@@ -61,7 +61,7 @@ def test_a_run_in_a_store_is_taken_up_again_without_the_folder_here(
     assert_equal_runs(before, brought(URL, tmp_path / "after"))
 
 
-def test_a_job_that_was_sent_in_part_or_cut_short_is_run_again(
+def test_partially_sent_or_truncated_job_is_run_again(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(*TWO, out="local") == 0
@@ -82,17 +82,17 @@ def test_a_job_that_was_sent_in_part_or_cut_short_is_run_again(
     assert_equal_runs("local", brought(URL, tmp_path / "came"))
 
 
-def test_a_run_in_a_store_is_extended_and_replaced_from_any_machine(
+def test_run_in_a_store_is_extended_and_replaced_from_any_machine(
     store: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(*TWO, out="local") == 0
     assert run("--scenes", f"{PAINTED}/a", "--jobs", "1", out=URL) == 0
     before = brought(URL, tmp_path / "before")
     for mirror in (tmp_path / "cache" / "runs").iterdir():
-        shutil.rmtree(mirror)  # as on a machine that never saw the run
+        shutil.rmtree(mirror)  # as on a machine that has never seen the run
     capsys.readouterr()
     assert run("--scenes", f"{PAINTED}/d", "--jobs", "1", out=URL) == 2
-    assert "(scene painted/a is not asked for now, scene painted/d is new); --extend adds" in capsys.readouterr().err
+    assert "(scene painted/a is not requested now, scene painted/d is new); --extend adds" in capsys.readouterr().err
     assert_equal_files(before, brought(URL, tmp_path / "refused"))
     assert main(["run", f"{PAINTED}/d", "--extend", "--jobs", "1", "--quiet", "--out", URL]) == 0
     assert_equal_runs("local", brought(URL, tmp_path / "extended"))
@@ -108,7 +108,7 @@ def assert_equal_files(one: Path, other: Path) -> None:
     assert first == second
 
 
-def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
+def test_scenes_in_a_remote_data_root_are_fetched_per_job(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data"
@@ -132,7 +132,7 @@ def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
 
     monkeypatch.setenv("SU3D_DATA", "memory://lake/data")
     monkeypatch.setattr(RemoteFolder, "fetch", noting)
-    with pytest.raises(ConfigError, match="only su3d-bench run and ablate read a store"):
+    with pytest.raises(ConfigError, match="only su3d-bench run and ablate can read a store"):
         data_root()
     assert main([*words, "--out", "far"]) == 0
     assert Path("far/metrics.json").read_bytes() == Path("local/metrics.json").read_bytes()
@@ -142,9 +142,9 @@ def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
 
 
 @pytest.mark.parametrize("name", ["scenes/../../evil", "scenes/a\\b", "scenes/a\x1b[2J", "scenes//x"])
-def test_a_name_that_leads_out_of_the_store_is_refused(
+def test_name_that_leads_out_of_the_store_is_rejected(
     name: str, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(type(store), "find", lambda *_, **__: {f"/bucket/runs/one/{name}": {"size": 1}})
-    with pytest.raises(StoreError, match="which is no name of a file; remove it"):
+    with pytest.raises(StoreError, match="which is not a valid file name; remove it"):
         RemoteFolder(URL).files()

@@ -1,7 +1,7 @@
-"""Encoders made of two towers: CLIP and SigLIP through transformers, open_clip where it is installed, or exported.
+"""Encoders with two towers: CLIP and SigLIP through transformers, open_clip if it is installed, or exported.
 
-Preparation, batches, normalisation and what is remembered are the same for all. A folder of an exported encoder holds
-``image.onnx``, ``text.onnx`` (and ``.data`` files beside large ones), the tokenizer's files and ``manifest.json`` with
+Preprocessing, batching, normalisation and caching are the same for all. The folder of an exported encoder contains
+``image.onnx``, ``text.onnx`` (and ``.data`` files next to large ones), the tokenizer's files and ``manifest.json`` with
 the spec and the SHA-256 of every file.
 """
 
@@ -37,7 +37,7 @@ LARGEST_MEMORY_OF_TEXTS = 65_536
 
 @dataclass(frozen=True)
 class EncoderSpec:
-    """What is known of an encoder without its weights: ``dim`` of the space, and what its towers take."""
+    """The properties of an encoder without its weights: ``dim`` of the space, and the inputs of its towers."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
@@ -52,7 +52,7 @@ class EncoderSpec:
 class Towers(Protocol):
     """Two networks: ``image_features`` of pixels (N, 3, S, S), ``text_features`` of tokens (N, T), not normalised.
 
-    ``batch`` is how many the device takes at once.
+    ``batch`` is the batch size for the device.
     """
 
     batch: int
@@ -63,7 +63,7 @@ class Towers(Protocol):
 
 
 class FoundationEncoder:
-    """``Encoder`` over two towers; the towers are loaded at the first image or text that is not remembered."""
+    """``Encoder`` with two towers, which are loaded at the first image or text that is not cached."""
 
     def __init__(
         self,
@@ -87,13 +87,13 @@ class FoundationEncoder:
 
     @cached_property
     def digest(self) -> str:
-        """Moves with the weights, the tokenizer, the preparation, the precision, the device's kind and the runtime."""
+        """A digest of the weights, tokenizer, preprocessing, precision, kind of device and runtime."""
         return self._digest_of(self._identity())
 
     def is_same_space(self, digest: str) -> bool:
-        """Whether ``digest`` is of these weights and this preparation, be it on another device or in another precision.
+        """Whether ``digest`` is of the same weights and preprocessing, on any device and in any precision.
 
-        Features then differ by rounding alone, and texts of the one may be compared with images of the other.
+        Features then differ only by rounding, and texts of one may be compared with images of the other.
         """
         known = dict(self._identity())
         if "provider" in known:
@@ -166,7 +166,7 @@ class FoundationEncoder:
 
 
 def unit_rows(rows: Float32Array, where: str) -> Float32Array:
-    """``rows`` (N, D) at length 1; a row without a direction means that the weights or the precision are at fault."""
+    """``rows`` (N, D) scaled to length 1; a zero or non-finite row indicates wrong weights or precision."""
     lengths = np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True)
     if not np.isfinite(lengths).all() or (lengths == 0).any():
         raise DataError(
@@ -180,9 +180,9 @@ def unit_rows(rows: Float32Array, where: str) -> Float32Array:
 
 
 class TorchTowers:
-    """``Towers`` of a torch model on one device in one precision; a subclass says what encodes images and texts.
+    """``Towers`` of a torch model on one device in one precision; subclasses set how images and texts are encoded.
 
-    ``n_values``: about how many numbers an image takes on its way, which rules the first batch on a GPU.
+    ``n_values``: the approximate number of values per image in memory, which determines the first batch on a GPU.
     """
 
     encode_image: Callable[[Any], Any]
@@ -226,7 +226,7 @@ _LIMITS = {
 
 
 def transformers_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """What ``config.json`` and ``preprocessor_config.json`` say of an encoder; raises ``DataError`` for nonsense."""
+    """The spec of an encoder from ``config.json`` and ``preprocessor_config.json``; ``DataError`` if invalid."""
     path = files.folder / "config.json"
     config = read_settings(path)
     kind = config.get("model_type")
@@ -234,7 +234,7 @@ def transformers_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
         raise DataError(f"{path}: model_type is {str(kind)[:40]!r}; an encoder is 'clip' or 'siglip'")
     if "quantization_config" in config:
         raise DataError(
-            f"{path}: the weights are quantised, which is not the published encoder; download the folder again"
+            f"{path}: the weights are quantised, so this is not the published encoder; download the folder again"
         )
     text, vision = (_table(path, config, key) for key in ("text_config", "vision_config"))
     for table in (config, text, vision):
@@ -243,9 +243,9 @@ def transformers_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     size = vision.get("image_size", 224)
     if transform.size != size:
         raise DataError(
-            f"{files.folder}: the image tower takes {size} px, preprocessor_config.json makes {transform.size}"
+            f"{files.folder}: the image tower needs {size} px, but preprocessor_config.json gives {transform.size}"
         )
-    # The defaults are what transformers takes for a configuration that does not say it.
+    # The defaults are those of transformers for missing settings.
     if kind == "clip":
         dim = config.get("projection_dim", 512)
         n_tokens, n_words, pad_id = text.get("max_position_embeddings", 77), text.get("vocab_size", 49408), None
@@ -259,7 +259,7 @@ def transformers_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
 
 def _table(path: Path, config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     table: dict[str, Any] = {}
-    for name in (key, f"{key}_dict"):  # older files, LAION's among them, repeat a part there, and that counts
+    for name in (key, f"{key}_dict"):  # older files, such as LAION's, repeat a part there, which takes precedence
         part = config.get(name)
         if not isinstance(part, dict | None):
             raise DataError(f"{path}: {name} is not a table; download the file again")
@@ -268,7 +268,7 @@ def _table(path: Path, config: Mapping[str, Any], key: str) -> Mapping[str, Any]
 
 
 def _check_limits(path: Path, table: Mapping[str, Any]) -> None:
-    """Refuse sizes that no encoder has before anything of that size is made."""
+    """Reject sizes that no encoder has before anything of that size is allocated."""
     for key, limit in _LIMITS.items():
         value = table.get(key, 1)
         if not isinstance(value, int) or not 1 <= value <= limit:
@@ -276,7 +276,7 @@ def _check_limits(path: Path, table: Mapping[str, Any]) -> None:
 
 
 def load_transformers(files: ModelFiles) -> Any:
-    """The model in evaluation mode and float32 on the CPU; weights that are missing are an error, never random."""
+    """The model in evaluation mode and float32 on the CPU; missing weights are an error, never random."""
     transformers = require_transformers(f"encoder '{files.entry.name}'")
     kind = read_settings(files.folder / "config.json").get("model_type")
     model_class = {"clip": transformers.CLIPModel, "siglip": transformers.SiglipModel}[str(kind)]
@@ -289,12 +289,12 @@ class TransformersTowers(TorchTowers):
     def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
         super().__init__(model, device, precision, batch, _image_values(model))
         self.encode_image = lambda pixels: model.get_image_features(pixel_values=pixels).pooler_output
-        # No mask: in CLIP a token sees those before it alone, and SigLIP was trained without one.
+        # No mask: in CLIP a token only sees those before it, and SigLIP was trained without one.
         self.encode_text = lambda ids: model.get_text_features(input_ids=ids).pooler_output
 
 
 def _image_values(model: Any) -> int:
-    """About how many numbers one image takes on its way: the widest layer's four times over, and the attention's."""
+    """The approximate number of values per image in memory: four times the widest layer, plus the attention."""
     vision = model.config.vision_config
     n_tokens = (vision.image_size // vision.patch_size) ** 2 + 1
     return int(4 * n_tokens * vision.intermediate_size + vision.num_attention_heads * n_tokens**2)
@@ -317,7 +317,7 @@ def require_open_clip(name: str) -> Any:
 
 
 def open_clip_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """What open_clip knows of the architecture."""
+    """The spec of the architecture in open_clip."""
     open_clip = require_open_clip(files.entry.name)
     config = open_clip.get_model_config(files.form.architecture)
     if config is None:
@@ -329,10 +329,10 @@ def open_clip_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
 
 
 def load_open_clip(files: ModelFiles) -> Any:
-    """The model in evaluation mode and float32 on the CPU, with every weight out of the file."""
+    """The model in evaluation mode and float32 on the CPU, with every weight from the file."""
     open_clip = require_open_clip(files.entry.name)
     before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # of random weights, which are replaced below
+    logging.disable(logging.WARNING)  # hides the warning about random weights, which are replaced below
     try:
         model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
     finally:
@@ -345,7 +345,7 @@ def load_open_clip(files: ModelFiles) -> Any:
 
 
 def open_clip_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:
-    """open_clip's own tokenizer, whose words come with the package."""
+    """open_clip's own tokenizer, whose vocabulary is in the package."""
     tokenizer = require_open_clip(files.entry.name).get_tokenizer(files.form.architecture)
 
     def tokens(texts: Sequence[str]) -> Int64Array:
@@ -360,7 +360,7 @@ class OpenClipTowers(TorchTowers):
     """The towers of an open_clip model on one device in one precision."""
 
     def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
-        # 30 MB an image in float32: about ViT-H-14's widest layer four times over
+        # 30 MB per image in float32: about four times ViT-H-14's widest layer
         super().__init__(model, device, precision, batch, 7_500_000)
         self.encode_image, self.encode_text = model.encode_image, model.encode_text
 
@@ -381,7 +381,7 @@ class EncoderManifest(OnnxManifest):
 
 
 def onnx_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """The spec in the manifest, images prepared as ``convention`` says."""
+    """The spec in the manifest, with images prepared according to ``convention``."""
     spec = EncoderManifest.read(files.weights).spec
     return replace(spec, transform=replace(spec.transform, convention=convention))
 

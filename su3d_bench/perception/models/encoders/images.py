@@ -1,8 +1,8 @@
-"""Images as foundation models take them: encoders by their own recipe, segmenter, detector and tagger by one.
+"""Image preprocessing for foundation models: per encoder, and one for segmenter, detector and tagger.
 
-Two conventions exist for the recipe of an encoder. ``original`` is what open_clip and OpenAI's CLIP do, through
-torchvision on PIL images; ``transformers`` is what that library's PIL image processors do. They differ in the centre
-crop alone: where the surplus is 3, 7, 11 ... pixels, the windows lie one pixel apart.
+Two conventions exist for encoders. ``original`` is what open_clip and OpenAI's CLIP do, through torchvision on PIL
+images; ``transformers`` is what that library's PIL image processors do. They only differ in the centre crop: if the
+surplus is 3, 7, 11 ... pixels, the windows are one pixel apart.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from su3d_bench.perception.models.files import checked, read_settings
 
 Convention = Literal["original", "transformers"]
 Triple = tuple[float, float, float]
-# Of a mean or a deviation; real ones lie between 0 and 255.
+# Bounds of a mean or a deviation; real ones are between 0 and 255.
 Mean = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 
-# OpenAI's CLIP, clip.py, and everything that was trained after it.
+# OpenAI's CLIP, clip.py, and all models based on it.
 CLIP_MEAN: Triple = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD: Triple = (0.26862954, 0.26130258, 0.27577711)
 BICUBIC = 3  # PIL.Image.Resampling.BICUBIC, and ``resample`` in transformers' files
@@ -35,10 +35,10 @@ LARGEST_SIZE = 2048
 
 @dataclass(frozen=True)
 class ImageTransform:
-    """The recipe of an encoder: resize, centre crop, mean and standard deviation of the channels.
+    """The preprocessing of an encoder: resize, centre crop, mean and standard deviation of the channels.
 
-    ``fit`` ``shortest``: the shorter side becomes ``size`` and the middle square is cut out; ``squash``: both sides
-    become ``size``, whatever the aspect. ``resample`` is PIL's number of the filter.
+    ``fit`` ``shortest``: the shorter side becomes ``size`` and the middle square is cropped; ``squash``: both sides
+    become ``size``, regardless of the aspect ratio. ``resample`` is PIL's number of the filter.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -51,7 +51,7 @@ class ImageTransform:
     convention: Convention = "original"
 
     def settings(self) -> dict[str, Any]:
-        """All that moves a pixel, as JSON-like values."""
+        """Everything that affects a pixel, as JSON-like values."""
         return {**asdict(self), "version": TRANSFORM_VERSION}
 
     def pixels(self, images: Sequence[UInt8Array]) -> Float32Array:
@@ -68,33 +68,33 @@ class ImageTransform:
         if self.fit == "squash":
             new_height = new_width = self.size
         else:
-            # the longer side is cut to whole pixels, as torchvision's Resize and transformers both have it
+            # the longer side is truncated to whole pixels, as in torchvision's Resize and transformers
             long = int(self.size * max(height, width) / min(height, width))
             new_height, new_width = (self.size, long) if height <= width else (long, self.size)
-        # PIL's filter widens where the image shrinks, which is what "antialias" means in torchvision
+        # PIL's filter widens if the image shrinks, which is "antialias" in torchvision
         resized = np.asarray(Image.fromarray(image).resize((new_width, new_height), Image.Resampling(self.resample)))
         top, left = self._offset(new_height - self.size), self._offset(new_width - self.size)
         return np.asarray(resized[top : top + self.size, left : left + self.size], np.uint8)
 
     def _offset(self, surplus: int) -> int:
-        # torchvision's CenterCrop rounds the half, to the even neighbour; transformers cuts it off
+        # torchvision's CenterCrop rounds halves to even; transformers truncates
         return round(surplus / 2.0) if self.convention == "original" else surplus // 2
 
     def _values(self, square: UInt8Array) -> Float32Array:
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
-        # transformers multiplies by 1/255 in float64 instead, which gives the same float32 for all 256 values
+        # transformers multiplies by 1/255 in float64 instead, with the same float32 results for all 256 values
         return np.asarray((square.astype(np.float32) / np.float32(255) - mean) / std, np.float32)
 
 
 def check_image(image: UInt8Array, row: int) -> UInt8Array:
-    """``image`` itself, contiguous; raises ``DataError`` where it is no RGB image with pixels."""
+    """``image`` itself, contiguous; raises ``DataError`` if it is not an RGB image with pixels."""
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
         raise DataError(f"image {row}: {image.shape} {image.dtype}; expected (height, width, 3) uint8, not empty")
     return np.ascontiguousarray(image)
 
 
 def read_transform(path: Path, convention: Convention) -> ImageTransform:
-    """The transform in a ``preprocessor_config.json``; a step that is not the usual one is refused, never skipped."""
+    """The transform in a ``preprocessor_config.json``; an unusual step is rejected, never skipped."""
     content = read_settings(path)
     for step in ("do_resize", "do_rescale", "do_normalize"):
         if content.get(step, True) is not True:
@@ -134,17 +134,17 @@ def _is_size(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_SIZE
 
 
-# ImageNet's mean and standard deviation of red, green and blue in 0..1, which all three models were trained with.
+# ImageNet's mean and standard deviation of red, green and blue in 0..1, used in training all three models.
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
-# The same in 0..255 as SAM has them (segment-anything dca509f, build_sam.py).
+# The same in 0..255 as in SAM (segment-anything dca509f, build_sam.py).
 MEAN_OF_BYTES = (123.675, 116.28, 103.53)
 STD_OF_BYTES = (58.395, 57.12, 57.375)
 Resample = Literal["bilinear", "bicubic"]
 
 
 def resized(rgb: UInt8Array, height: int, width: int, resample: Resample = "bilinear") -> UInt8Array:
-    """``rgb`` (h, w, 3) at another size, with Pillow's antialiasing: the originals' transform."""
+    """``rgb`` (h, w, 3) resized with Pillow's antialiasing, as in the originals."""
     from PIL import Image
 
     if rgb.shape[:2] == (height, width):
@@ -153,15 +153,15 @@ def resized(rgb: UInt8Array, height: int, width: int, resample: Resample = "bili
 
 
 def normalised(rgb: UInt8Array) -> Float32Array:
-    """``rgb`` (h, w, 3) as channels first (3, h, w) float32 with ImageNet's mean taken off, in its deviations.
+    """``rgb`` (h, w, 3) as channels first (3, h, w) float32, standardised with ImageNet's mean and deviation.
 
-    Divided by 255 first, as torchvision's ToTensor and Normalize do: the detector's and the tagger's order.
+    Divided by 255 first, as in torchvision's ToTensor and Normalize: the order for the detector and the tagger.
     """
     return _standardised(rgb.astype(np.float32) / np.float32(255), MEAN, STD)
 
 
 def normalised_bytes(rgb: UInt8Array) -> Float32Array:
-    """The same without the division by 255, SAM's order (``Sam.preprocess``): other last bits."""
+    """The same without the division by 255, as in SAM (``Sam.preprocess``), which changes the last bits."""
     return _standardised(rgb.astype(np.float32), MEAN_OF_BYTES, STD_OF_BYTES)
 
 
@@ -173,17 +173,17 @@ def _standardised(
 
 
 def size_with_longest_side(height: int, width: int, longest_px: int) -> tuple[int, int]:
-    """Height and width at which the longer side is ``longest_px``, each rounded, halves upwards: SAM's rule."""
+    """Height and width with the longer side at ``longest_px``, each rounded, halves upwards: SAM's rule."""
     scale = longest_px * 1.0 / max(height, width)
     return int(height * scale + 0.5), int(width * scale + 0.5)
 
 
 def size_with_shortest_side(height: int, width: int, shortest_px: int, longest_px: int) -> tuple[int, int]:
-    """Height and width with the shorter side at ``shortest_px``, or less where the longer would pass ``longest_px``.
+    """Height and width with the shorter side at ``shortest_px``, or less if the longer would exceed ``longest_px``.
 
     GroundingDINO's rule (856dde2, datasets/transforms.py, ``resize``): the shorter side is rounded first and the longer
-    one follows from it, cut to whole pixels. Where ``longest_px`` binds, transformers' longer side is off from that by
-    up to half a pixel times the sides' ratio.
+    one computed from it, truncated to whole pixels. If ``longest_px`` is the limit, transformers' longer side differs
+    from that by up to half a pixel times the aspect ratio.
 
     >>> size_with_shortest_side(680, 1200, 800, 1333)
     (755, 1332)

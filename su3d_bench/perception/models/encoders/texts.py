@@ -1,7 +1,7 @@
-"""Texts as text towers take them: cleaned as open_clip or SigLIP cleans them, and turned into rows of tokens.
+"""Text preprocessing for text towers: cleaned as in open_clip or SigLIP, and converted to rows of tokens.
 
 Cleaning is what ``SimpleTokenizer`` of open_clip 3.3 does with ``ftfy.fix_text`` (ftfy 6.3), ``html.unescape`` and
-``str.lower``, but for broken encodings ("cafÃ©"), which ftfy guesses from how likely letters are.
+``str.lower``, except for broken encodings ("cafÃ©"), which ftfy repairs by letter statistics.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Int64Array
 from su3d_bench.perception.models.files import bounded, check_settings_size, read_settings
 
-# Two letters in one character, by ftfy's table; ſ and ʼ stay what they are.
+# Two letters in one character, by ftfy's table; ſ and ʼ are unchanged.
 _LIGATURES = {
     "Ĳ": "IJ", "ĳ": "ij", "ŉ": "ʼn", "Ǳ": "DZ", "ǲ": "Dz", "ǳ": "dz", "Ǆ": "DŽ", "ǅ": "Dž", "ǆ": "dž",
     "Ǉ": "LJ", "ǈ": "Lj", "ǉ": "lj", "Ǌ": "NJ", "ǋ": "Nj", "ǌ": "nj",
     "ﬀ": "ff", "ﬁ": "fi", "ﬂ": "fl", "ﬃ": "ffi", "ﬄ": "ffl", "ﬅ": "ſt", "ﬆ": "st",
 }  # fmt: skip
-# What bytes of Windows' code page mean that were read as Latin-1; five of them mean nothing.
+# Characters of bytes of Windows' code page that were read as Latin-1; five of them are undefined.
 _WINDOWS = {code: bytes([code]).decode("cp1252", "ignore") or chr(code) for code in range(0x80, 0xA0)}
 _QUOTES = {**dict.fromkeys("\u02bc\u2018\u2019\u201a\u201b", "'"), **dict.fromkeys("\u201c\u201d\u201e\u201f", '"')}
 _FULL_AND_HALF_WIDTH = {chr(code): unicodedata.normalize("NFKC", chr(code)) for code in range(0xFF01, 0xFFF0)}
-# One after the other, for what the first makes the next may straighten.
+# Applied in this order, because a later one may change the result of an earlier one.
 _STRAIGHT = tuple(
     str.maketrans(table) for table in (_WINDOWS, _LIGATURES, {**_FULL_AND_HALF_WIDTH, "\u3000": " "}, _QUOTES)
 )
@@ -45,14 +45,14 @@ _MARK = re.compile(r"<\|(startoftext|endoftext)\|>")
 
 
 def plain_text(text: str) -> str:
-    """``text`` as open_clip's ``_clean_lower`` gives it.
+    """``text`` as returned by open_clip's ``_clean_lower``.
 
     >>> plain_text("  The “Caﬀè”  &amp; bar\\x07 ")
     'the "caffè" & bar'
     """
     may_unescape, lines = True, []
     for line in text.split("\n"):
-        # ftfy takes what holds a "<" for a page, from that line on, and leaves its entities alone.
+        # ftfy treats a text with a "<" as HTML from that line on, and does not unescape its entities.
         may_unescape = may_unescape and "<" not in line
         lines.append(_straightened(line, may_unescape))
     plain = html.unescape(html.unescape("\n".join(lines)))
@@ -60,10 +60,10 @@ def plain_text(text: str) -> str:
 
 
 def without_marks(text: str) -> str:
-    """Lower-case ``text`` in which no word is one of CLIP's marks of a text's ends: they are words like any other.
+    """Lower-case ``text`` in which CLIP's start and end marks are split into ordinary words.
 
-    The blanks stand where open_clip's tokenizer parts these texts anyway. Its own ``<start_of_text>`` and
-    ``<end_of_text>``, which begin and end a text there wherever they stand, are words here too: no text ends another.
+    The spaces are where open_clip's tokenizer splits these texts anyway. Its own ``<start_of_text>`` and
+    ``<end_of_text>``, which begin and end a text there at any position, are words here too: no text can end another.
 
     >>> without_marks("a chair<|endoftext|>")
     'a chair<| endoftext |>'
@@ -72,7 +72,7 @@ def without_marks(text: str) -> str:
 
 
 def _straightened(line: str, may_unescape: bool) -> str:
-    """What ``ftfy.fix_text`` makes of a line: its steps in its order until nothing changes any more."""
+    """A line as in ``ftfy.fix_text``: its steps in its order until nothing changes any more."""
     while True:
         before = line
         if may_unescape:
@@ -86,7 +86,7 @@ def _straightened(line: str, may_unescape: bool) -> str:
 
 
 def _character(entity: str) -> str:
-    """The character of an HTML ``entity``; of ``&EACUTE;``, which is none, the capital of ``&eacute;``."""
+    """The character of an HTML ``entity``; for ``&EACUTE;``, which does not exist, the capital of ``&eacute;``."""
     name = entity[1:]
     if name in html5:
         return html5[name]
@@ -99,7 +99,7 @@ def _character(entity: str) -> str:
 
 
 def _without_surrogates(line: str) -> str:
-    """``line`` with pairs of surrogates as the characters they stand for, and with U+FFFD for single ones."""
+    """``line`` with pairs of surrogates replaced by their characters, and single ones by U+FFFD."""
     if not any("\ud800" <= character <= "\udfff" for character in line):
         return line
     return line.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
@@ -112,10 +112,10 @@ TOKENS_VERSION = "2"
 
 
 def read_tokeniser(folder: Path, kind: TokensKind, n_tokens: int, pad_id: int | None, n_words: int) -> Tokeniser:
-    """What turns texts into rows (N, n_tokens) of ids below ``n_words``; longer texts are cut, the end token stays.
+    """A function from texts to rows (N, n_tokens) of ids below ``n_words``; longer texts keep their end token.
 
-    ``clip``: transformers' ``CLIPTokenizer`` on texts cleaned as open_clip cleans them. ``siglip``: the folder's
-    ``tokenizer.json`` on texts without punctuation and capitals, padded with ``pad_id`` as the towers were trained.
+    ``clip``: transformers' ``CLIPTokenizer`` on texts cleaned as in open_clip. ``siglip``: the folder's
+    ``tokenizer.json`` on lower-case texts without punctuation, padded with ``pad_id`` as in training.
     """
     encode = _clip(folder, n_tokens) if kind == "clip" else _siglip(folder, n_tokens, pad_id or 0)
 
@@ -125,8 +125,8 @@ def read_tokeniser(folder: Path, kind: TokensKind, n_tokens: int, pad_id: int | 
         ids = np.array(encode(list(texts)), np.int64).reshape(len(texts), n_tokens)
         if ids.max() >= n_words or ids.min() < 0:
             raise DataError(
-                f"{folder}: its tokenizer gives the id {int(ids.max())} and the text tower knows {n_words} words; "
-                "the files are of different models, fetch them anew"
+                f"{folder}: the tokenizer returns id {int(ids.max())}, but the text tower has only {n_words} words; "
+                "the files belong to different models, download them again"
             )
         return ids
 
@@ -148,7 +148,7 @@ def _clip(folder: Path, n_tokens: int) -> Callable[[list[str]], Any]:
 
 def _siglip(folder: Path, n_tokens: int, pad_id: int) -> Callable[[list[str]], Any]:
     tokenizers = require("tokenizers", "the tokenizer of SigLIP")
-    read_settings(folder / "tokenizer.json")  # bounds its size and says what is wrong with it
+    read_settings(folder / "tokenizer.json")  # checks its size and reports an invalid file
     tokenizer = _load(folder, lambda: tokenizers.Tokenizer.from_file(str(folder / "tokenizer.json")))
     tokenizer.enable_truncation(n_tokens)
     tokenizer.enable_padding(length=n_tokens, pad_id=pad_id)
@@ -156,7 +156,7 @@ def _siglip(folder: Path, n_tokens: int, pad_id: int) -> Callable[[list[str]], A
 
 
 def canonical_text(text: str) -> str:
-    """``text`` in lower case without punctuation, its words apart by one space, as SigLIP was trained."""
+    """``text`` in lower case without punctuation, words separated by one space, as in SigLIP's training."""
     bare = text.translate(str.maketrans("", "", string.punctuation))
     return " ".join(bare.lower().split())
 
@@ -164,9 +164,9 @@ def canonical_text(text: str) -> str:
 def _load(folder: Path, load: Callable[[], Any]) -> Any:
     try:
         return load()
-    except Exception as error:  # tokenizers raises plain Exception for any fault of a file; others are raised again
+    except Exception as error:  # tokenizers raises plain Exception for an invalid file; others are re-raised
         if type(error) is Exception or isinstance(error, OSError | ValueError | KeyError | TypeError | AttributeError):
             raise DataError(
-                f"{folder}: its tokenizer cannot be read: {bounded(error)}; download its files again"
+                f"{folder}: cannot read its tokenizer: {bounded(error)}; download its files again"
             ) from error
         raise

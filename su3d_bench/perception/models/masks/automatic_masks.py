@@ -1,7 +1,7 @@
-"""SAM's automatic masks: a grid of points over the image and over crops of it, the good masks kept once each.
+"""SAM's automatic masks: a grid of points over the image and over crops of it, with filtering and deduplication.
 
-The order of steps, the filters and their ties are those of the original's ``SamAutomaticMaskGenerator``, whose names
-the settings keep.
+The order of steps, the filters and their tie-breaking are those of the original's ``SamAutomaticMaskGenerator``, whose
+setting names are used.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from su3d_bench.perception.models.masks.sam import (
     SeenImage,
 )
 
-CROP_EDGE_PX = 20.0  # a box so near to a crop's edge is taken as cut by it
+CROP_EDGE_PX = 20.0  # a box within this of a crop's edge counts as cut by it
 Share = float
 
 
 class AutomaticMaskConfig(BaseModel):
-    """How automatic masks are made; the defaults are the original's. Thresholds of 0 filter nothing."""
+    """Settings of automatic masks; the defaults are the original's. Thresholds of 0 filter nothing."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,13 +50,13 @@ class AutomaticMaskConfig(BaseModel):
     min_mask_region_area: int = Field(default=0, ge=0)
 
 
-# What each method's own program asks SAM for; "sam" is SAM3D's, the defaults.
+# The SAM settings of each method's own program; "sam" is SAM3D's, the defaults.
 AUTOMATIC_MASKS: Mapping[str, AutomaticMaskConfig] = MappingProxyType(
     {
         "sam": AutomaticMaskConfig(),
         # ConceptGraphs, generate_gsa_results.py, class set "none"
         "conceptgraphs": AutomaticMaskConfig(points_per_side=12, points_per_batch=144, min_mask_region_area=100),
-        # ConceptFusion, extract_conceptfusion_features.py; its command line's points and area are not used there
+        # ConceptFusion, extract_conceptfusion_features.py, which ignores its command line's points and area
         "conceptfusion": AutomaticMaskConfig(
             points_per_side=8, pred_iou_thresh=0.92, crop_n_layers=1, crop_n_points_downscale_factor=2
         ),
@@ -73,15 +73,15 @@ class Crop:
 
 
 def point_grid(n_per_side: int) -> Float64Array:
-    """Points (n * n, 2), x y in shares of a crop, row by row, half a step from its edges."""
+    """Points (n * n, 2), x y as fractions of a crop, row by row, half a step from its edges."""
     offset = 1 / (2 * n_per_side)
     steps = np.linspace(offset, 1 - offset, n_per_side)
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
 
 def crops_of(height: int, width: int, n_layers: int, overlap_ratio: float) -> list[Crop]:
-    """The whole image, then 4, 16, ... crops a layer, column by column; neighbours share ``overlap_ratio`` of its
-    shorter side, halved from layer to layer."""
+    """The whole image, then 4, 16, ... crops per layer, column by column; neighbours overlap by ``overlap_ratio`` of
+    the shorter side, halved from layer to layer."""
     crops = [Crop((0, 0, width, height), 0)]
     for layer in range(1, n_layers + 1):
         n_side = 2**layer
@@ -98,9 +98,9 @@ def crops_of(height: int, width: int, n_layers: int, overlap_ratio: float) -> li
 
 
 def stability(logits: Any, offset: float) -> Any:
-    """How little masks (N, H, W) move with the threshold: IoU (N,) of those at threshold + and - ``offset``.
+    """Stability of masks (N, H, W) under the threshold: IoU (N,) of the masks at threshold + and - ``offset``.
 
-    NaN where both are empty.
+    NaN if both are empty.
     """
     inner, outer = (_area(logits > MASK_THRESHOLD + step) for step in (offset, -offset))
     return inner / outer
@@ -109,20 +109,20 @@ def stability(logits: Any, offset: float) -> Any:
 def _area(masks: Any) -> Any:
     import torch
 
-    return masks.flatten(-2).sum(-1, dtype=torch.int32)  # of two axes at once, and in int64, it takes thrice as long
+    return masks.flatten(-2).sum(-1, dtype=torch.int32)  # two axes at once, or int64, take three times as long
 
 
 def is_cut_by_crop(boxes: Float32Array, crop: Crop, height: int, width: int) -> BoolArray:
-    """Which boxes (K, 4), in pixels of the image, reach an edge of ``crop`` that is no edge of the image."""
+    """Which boxes (K, 4), in image pixels, touch an edge of ``crop`` that is not an edge of the image."""
     near_crop = np.abs(boxes - np.array(crop.box, np.float32)) <= CROP_EDGE_PX
     near_image = np.abs(boxes - np.array([0, 0, width, height], np.float32)) <= CROP_EDGE_PX
     return np.asarray((near_crop & ~near_image).any(axis=1), np.bool_)
 
 
 def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes", "islands"]) -> tuple[BoolArray, bool]:
-    """``mask`` with its small holes filled, or without its small islands but for the largest where all are small.
+    """``mask`` with its small holes filled, or without its small islands, except the largest if all are small.
 
-    Parts are 8-connected; small is below ``min_area_px``. Second, whether there was any small part.
+    Parts are 8-connected; small is below ``min_area_px``. Also returns whether there was any small part.
     """
     import cv2
 
@@ -139,9 +139,9 @@ def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes"
 
 
 def to_last_pixel(boxes: Float32Array | Int64Array) -> Float32Array:
-    """Tight ``boxes`` (K, 4), right and bottom exclusive, as the original's, which end at the last pixel.
+    """Tight ``boxes`` (K, 4), right and bottom exclusive, converted to the original's, which end at the last pixel.
 
-    ``batched_mask_to_box`` of segment-anything; a mask without pixels has zeros there and here.
+    ``batched_mask_to_box`` of segment-anything; a mask without pixels has zeros in both.
     """
     ends = np.maximum(boxes[:, 2:] - 1, boxes[:, :2])
     return np.concatenate([boxes[:, :2], ends], axis=1).astype(np.float32)
@@ -149,7 +149,7 @@ def to_last_pixel(boxes: Float32Array | Int64Array) -> Float32Array:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Masks cut to their windows (K, 4) in the image, right and bottom exclusive, with predicted IoU (K,)."""
+    """Masks cropped to their windows (K, 4) in the image, right and bottom exclusive, with predicted IoU (K,)."""
 
     cuts: list[BoolArray]
     windows: Int64Array
@@ -174,7 +174,7 @@ class _Candidates:
 
 
 class AutomaticMasks:
-    """Every region that SAM finds in an image without being told where to look."""
+    """Every region that SAM finds in an image without prompts."""
 
     def __init__(self, sam: Sam, config: AutomaticMaskConfig) -> None:
         self._sam = sam
@@ -182,10 +182,10 @@ class AutomaticMasks:
         self._batches = Batches(config.points_per_batch)
 
     def regions(self, rgb: UInt8Array) -> Regions:
-        """The masks of ``rgb`` in the original's order: best predicted IoU first, those of small crops before.
+        """The masks of ``rgb`` in the original's order: best predicted IoU first, masks of smaller crops before others.
 
-        Boxes are the original's, from the first to the last pixel: a mask one pixel wide has a box without a width.
-        Scores are the predicted IoU, which the network may put a little above 1 and which is cut there.
+        Boxes are the original's, from the first to the last pixel: a mask one pixel wide has a box of zero width.
+        Scores are the predicted IoU, clipped to 1, because the network may return slightly more.
         """
         config = self._config
         height, width = rgb.shape[:2]
@@ -200,7 +200,7 @@ class AutomaticMasks:
         if config.min_mask_region_area:
             masks, kept = self._cleaned(masks)
             scores = scores[kept]
-        # A mask without pixels passes where the filters are off; a region has some.
+        # A mask without pixels passes if the filters are off, but a region must have some.
         is_something = masks.any(axis=(1, 2))
         masks = masks[is_something]
         return Regions(masks, to_last_pixel(mask_boxes(masks)), np.clip(scores[is_something], 0, 1).astype(np.float32))
@@ -215,12 +215,12 @@ class AutomaticMasks:
         return candidates.at(suppress(candidates.boxes, candidates.scores, self._config.box_nms_thresh))
 
     def _from_points(self, image: SeenImage, points: Float64Array, crop: Crop, rgb: UInt8Array) -> _Candidates:
-        """The three masks at each point that pass the filters, which look at one mask alone, whatever the batch."""
+        """Those of the three masks per point that pass the filters, which treat each mask independently."""
         labels = np.full((len(points), 1), OBJECT_POINT, np.int64)
         logits, predicted = self._sam.decode(image, Prompts(points[:, None], labels), is_single=False)
         logits, predicted = logits.flatten(0, 1), predicted.flatten(0, 1)
         if self._config.pred_iou_thresh > 0:
-            # Before the masks grow to full size, which changes nothing and saves most of the work.
+            # Filtering before resizing masks to full size changes nothing and saves most of the work.
             is_good = predicted > self._config.pred_iou_thresh
             logits, predicted = logits[is_good], predicted[is_good]
         parts = [
@@ -230,7 +230,7 @@ class AutomaticMasks:
         return _Candidates.joined(parts)
 
     def _large(self, image: SeenImage, logits: Any, predicted: Any, crop: Crop, rgb: UInt8Array) -> _Candidates:
-        """Those of some masks that are stable and not cut by the crop."""
+        """Those of the masks that are stable and not cut by the crop."""
         if len(logits):
             logits = self._sam.full_size(image, logits)
             if self._config.stability_score_thresh > 0:
@@ -247,9 +247,9 @@ class AutomaticMasks:
         return candidates.at(np.flatnonzero(~is_cut_by_crop(candidates.boxes, crop, *rgb.shape[:2])))
 
     def _cleaned(self, masks: BoolArray) -> tuple[BoolArray, Int64Array]:
-        """``masks`` without small holes and islands, duplicates that this makes taken out; which of them are left.
+        """``masks`` without small holes and islands and without resulting duplicates, and the indices of those left.
 
-        Masks that needed no cleaning come first and win over those that did.
+        Masks that needed no cleaning take precedence over those that did.
         """
         smallest = self._config.min_mask_region_area
         cleaned, is_unchanged = masks.copy(), np.zeros(len(masks), np.float32)

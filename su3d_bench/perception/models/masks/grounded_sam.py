@@ -1,6 +1,6 @@
-"""GroundedSAM: tags of the image, boxes of what they name, masks in the boxes; and SAM without any tag.
+"""GroundedSAM: tags of the image, boxes of the tagged objects, masks in the boxes; and SAM without tags.
 
-Tags come from RAM++, or are the words of a list that an encoder finds likeliest.
+Tags come from RAM++, or are the words of a list that are most likely according to an encoder.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 
 RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
-# Of its tensors: made by the network itself from its window size; the authors' loader drops them too.
+# Tensors that the network computes itself from its window size; the authors' loader drops them too.
 RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
 WORDS_CAVEAT = "tags: RAM++ is not installed; using the most probable words of a list by the encoder instead"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
-# Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70): a tag
-# that contains one of these is left out.
+# Words of taggers that name no object, as listed by ConceptGraphs (generate_gsa_results.py, 5c4da70): a tag that
+# contains one of these is dropped.
 STOP_WORDS = (
     "room", "kitchen", "office", "house", "home", "building", "corner", "shadow", "carpet", "photo", "shade", "stall",
     "space", "aquarium", "apartment", "image", "city", "blue", "skylight", "hallway", "bureau", "modern", "salon",
     "doorway", "wall lamp", "wood floor",
 )  # fmt: skip
-# Asked for in every image besides its tags.
+# Added to the tags of every image.
 ADDED_TAGS = ("other item",)
 # Added with --add_bg_classes.
 BACKGROUND_TAGS = ("wall", "floor", "ceiling")
 
 
 class Tagger(Protocol):
-    """Words for what an image shows; ``caveat`` says what must be said of them.
+    """Words for what an image shows; ``caveat`` is a note to be shown with them.
 
-    ``resample``: how a tagger that takes a small picture of the whole image makes it.
+    ``resample``: the filter of a tagger that downscales the whole image.
     """
 
     name: str
@@ -86,9 +86,9 @@ class RamTagger:
 
 
 class OnnxRamTagger:
-    """RAM++ exported: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, its first answer.
+    """Exported RAM++: ``image`` (1, 3, 384, 384) to its first output ``tag`` (1, T), 1 for present tags.
 
-    ``tools/export_onnx.py`` writes it so, and the script of recognize-anything's pull request 204.
+    As written by ``tools/export_onnx.py`` and by the script of recognize-anything's pull request 204.
     """
 
     name = "ram-onnx"
@@ -105,8 +105,8 @@ class OnnxRamTagger:
         is_there = session.run(None, {session.get_inputs()[0].name: ram_pixels(rgb, resample)[None]})[0]
         if is_there.shape != (1, len(self._tag_list)):
             raise DataError(
-                f"tagger 'ram-onnx': the model answers {is_there.shape}, {RAM_TAG_LIST} has {len(self._tag_list)} "
-                "tags; both must come from one version of the package"
+                f"tagger 'ram-onnx': the model returns {is_there.shape}, but {RAM_TAG_LIST} has {len(self._tag_list)} "
+                "tags; both must come from the same version of the package"
             )
         return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
 
@@ -119,15 +119,15 @@ class RamManifest(OnnxManifest):
 
 
 def wrong_tagger(files: ModelFiles) -> list[str]:
-    """A line for each fault of an exported RAM++; one without a manifest, as others export it, has none to be found."""
+    """One line per invalid file of an exported RAM++; an export without a manifest cannot be checked."""
     path = files.folder / ONNX_MANIFEST
     return wrong_files(RamManifest.read(path), files.folder) if is_file(path) else []
 
 
 class WordTagger:
-    """The ``n_tags`` words of a list that are likeliest somewhere in the image, the likeliest first.
+    """The ``n_tags`` words of a list that are most likely in the image, in decreasing order.
 
-    A word counts as much as its similarity in the best of six views: the image, its quarters, and its middle.
+    The score of a word is its similarity in the best of six views: the image, its quarters, and its middle.
     """
 
     name = "words"
@@ -140,7 +140,7 @@ class WordTagger:
         self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words.words)
 
     def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
-        """At most ``n_tags`` words for ``rgb`` (H, W, 3), each of whose views the encoder prepares in its own way."""
+        """At most ``n_tags`` words for ``rgb`` (H, W, 3); the encoder preprocesses each view itself."""
         similarity = self._words.similarity(self._encoder.encode_images(_views(rgb)))
         order = np.argsort(-similarity.max(axis=0), kind="stable")
         return tuple(self._words.words[index] for index in order[: self._n_tags])
@@ -156,7 +156,7 @@ def _views(rgb: UInt8Array) -> list[UInt8Array]:
 
 
 def ram_pixels(rgb: UInt8Array, resample: Resample = "bilinear") -> Float32Array:
-    """``rgb`` (H, W, 3) as RAM++ takes it, (3, 384, 384): squeezed to a square, whatever its shape.
+    """``rgb`` (H, W, 3) as input for RAM++, (3, 384, 384): resized to a square regardless of the aspect ratio.
 
     Its own transform is bilinear (recognize-anything 7cb804a, ram/transform.py).
     """
@@ -164,7 +164,7 @@ def ram_pixels(rgb: UInt8Array, resample: Resample = "bilinear") -> Float32Array
 
 
 def chosen_tags(tags: Iterable[str], stop_words: Sequence[str], added: Sequence[str]) -> tuple[str, ...]:
-    """``tags`` once each and ``added``, without those that contain a stop word; ConceptGraphs' order of steps.
+    """Distinct ``tags`` and ``added``, without those that contain a stop word; ConceptGraphs' order of steps.
 
     >>> chosen_tags(["bed", "bedroom", "lamp"], ["room"], ["other item"])
     ('bed', 'lamp', 'other item')
@@ -174,7 +174,7 @@ def chosen_tags(tags: Iterable[str], stop_words: Sequence[str], added: Sequence[
 
 
 def read_word_list(path: Path | None) -> tuple[str, ...]:
-    """The words of a text file, one a line, empty lines and those that begin with # aside; None: our own list."""
+    """The words of a text file, one per line, ignoring empty lines and those that begin with #; None: our own list."""
     if path is None:
         return vocabulary()
     try:
@@ -194,7 +194,7 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
 
 
 def load_ram(files: ModelFiles, device: str) -> Any:
-    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` where it is not there."""
+    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` if it is not installed."""
     try:
         models = require("ram.models", "tagger 'ram-plus'")
     except ModelMissing as error:
@@ -204,9 +204,9 @@ def load_ram(files: ModelFiles, device: str) -> Any:
         ) from error
     make_deterministic(device)
     try:
-        # Without a file: the package would read it in full, and weights are read as plain tensors alone.
+        # Without a file: the package would unpickle it, but weights are only read as plain tensors.
         model = models.ram_plus(pretrained="", image_size=RAM_PX, vit="swin_l")
-    except OSError as error:  # the package makes its tokenizer from bert-base-uncased
+    except OSError as error:  # the package creates its tokenizer from bert-base-uncased
         raise ModelMissing(
             f"tagger 'ram-plus': its package cannot be set up ({bounded(error)}); it needs the tokenizer of "
             "bert-base-uncased in the Hugging Face cache"
@@ -216,7 +216,7 @@ def load_ram(files: ModelFiles, device: str) -> Any:
 
 
 def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
-    """Give ``model`` its weights under the names of the authors' own loader; ``DataError`` where some do not fit."""
+    """Load the weights into ``model`` under the names of the authors' loader; ``DataError`` if some do not fit."""
     advice = what_to_fetch(files.entry, (files.form,))
     named = {
         name.replace("vision_multi", "tagging_head"): tensor
@@ -233,19 +233,19 @@ def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
 
 # ---- named regions
 
-# Moves the digest when what lies between the networks changes.
+# Part of the digest: increment it when the code between the networks changes.
 FRONT_END_VERSION = "2"
-# ConceptGraphs calls every region so that no text named; a method that needs better names asks for grounded masks.
+# ConceptGraphs' name for regions without one; a method that needs better names requests grounded masks.
 UNNAMED = "item"
 
 
 class GroundedConfig(BaseModel):
-    """How named regions come about; the defaults are OpenSU3D's.
+    """Settings of named regions; the defaults are OpenSU3D's.
 
-    ``masks``: SAM's best of three in each box by predicted IoU, or the one that it gives when asked for one, as in the
-    Grounded-SAM demonstrations. ``region_boxes``: the mask's, or the detector's, which may reach beyond the image. Tags
-    that contain one of ``stop_words`` are left out, ``added_tags`` are asked for in every image. ``ram_resample``: how
-    RAM++'s picture is made small; its own package does it bilinear.
+    ``masks``: SAM's best of three in each box by predicted IoU, or its single mask, as in the Grounded-SAM
+    demonstrations. ``region_boxes``: the mask's, or the detector's, which may extend beyond the image. Tags that
+    contain one of ``stop_words`` are dropped, ``added_tags`` are added for every image. ``ram_resample``: the filter
+    for downscaling RAM++'s input; its own package uses bilinear.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -258,9 +258,9 @@ class GroundedConfig(BaseModel):
     ram_resample: Resample = "bilinear"
 
 
-# generate_gsa_results.py --class_set ram --add_bg_classes (5c4da70); its --accumu_classes carries tags on from frame to
-# frame in an order that changes from run to run, and is left out. Its picture for RAM is Pillow's resize, whose default
-# is bicubic. The tagger is the run's: its README names RAM (ram_swin_large_14m.pth), not RAM++.
+# generate_gsa_results.py --class_set ram --add_bg_classes (5c4da70); its --accumu_classes carries tags over from frame
+# to frame in an order that changes from run to run, and is not used. Its input for RAM is Pillow's resize, whose
+# default is bicubic. The tagger is the run's: its README names RAM (ram_swin_large_14m.pth), not RAM++.
 _CONCEPTGRAPHS = GroundedConfig(
     boxes=CONCEPTGRAPHS_BOXES,
     stop_words=STOP_WORDS,
@@ -268,7 +268,7 @@ _CONCEPTGRAPHS = GroundedConfig(
     region_boxes="detector",
     ram_resample="bicubic",
 )
-# What methods ask for by PerceptionNeeds.grounding; "paper" is configured.
+# Values of PerceptionNeeds.grounding; "paper" is configured.
 GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
     {
         "conceptgraphs": _CONCEPTGRAPHS,
@@ -281,7 +281,7 @@ GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Networks:
-    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision."""
+    """The networks of the segmenters, read from disk at first use; ``digest`` covers weights and precision."""
 
     tagger: Tagger
     load_detector: Callable[[], GroundingDino]
@@ -301,7 +301,7 @@ class GroundedSam:
         self.digest = content_key(self.name, FRONT_END_VERSION, settings, networks.tagger.digest, networks.digest)
 
     def segment(self, frame: Frame) -> Regions:
-        """Named regions, the detector's best first; empty where no tag is found."""
+        """Named regions, the detector's best first; empty if no tag is found."""
         config = self._config
         found = self._networks.tagger.tags(frame.rgb, config.ram_resample)
         tags = chosen_tags(found, config.stop_words, config.added_tags)
@@ -319,7 +319,7 @@ class GroundedSam:
 
 
 class SamRegions(CropsOnDemand):
-    """``RegionPerception``: one mask at points that a method chooses; SAM looks at each frame once."""
+    """``RegionPerception``: one mask at points chosen by a method; SAM embeds each frame once."""
 
     def __init__(self, networks: Networks, encoder: Encoder) -> None:
         super().__init__(encoder)
@@ -327,14 +327,14 @@ class SamRegions(CropsOnDemand):
         self._seen = LastFrameCache(lambda frame: networks.load_sam().look(frame.rgb))
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
-        """SAM's single mask (H, W) of what all ``points`` lie on and its predicted IoU; empty and 0 for no points."""
+        """SAM's single mask (H, W) of the object at all ``points`` and its predicted IoU; empty and 0 for no points."""
         if not len(points):
             return np.zeros(frame.depth_m.shape, np.bool_), 0.0
         return self._networks.load_sam().from_points(self._seen(frame), points.astype(np.float32))
 
 
 class AutomaticSam:
-    """``Segmenter`` of every region, none of them named."""
+    """``Segmenter`` of every region, without names."""
 
     name = "sam-automatic"
 
@@ -344,6 +344,6 @@ class AutomaticSam:
         self.digest = content_key(self.name, FRONT_END_VERSION, config.model_dump_json(), networks.digest)
 
     def segment(self, frame: Frame) -> Regions:
-        """Regions as SAM finds them by itself, every one called an item."""
+        """The regions that SAM finds without prompts, each named "item"."""
         regions = AutomaticMasks(self._networks.load_sam(), self._config).regions(frame.rgb)
         return Regions(regions.masks, regions.boxes, regions.scores, (UNNAMED,) * len(regions.scores))

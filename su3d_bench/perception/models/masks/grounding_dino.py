@@ -1,6 +1,6 @@
-"""GroundingDINO: boxes of the things that a text names, each with the words that it was found by.
+"""GroundingDINO: boxes of the objects named in a text, each with the matching words.
 
-The network is ``transformers``' GroundingDinoForObjectDetection; what goes in and how its answer is read is here.
+The network is ``transformers``' GroundingDinoForObjectDetection; pre- and postprocessing are here.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ SHORTEST_PX, LONGEST_PX = 800, 1333
 class BoxConfig(BaseModel):
     """Which boxes count; the defaults are the paper's (section IV-A: box and text 0.25, IoU 0.4).
 
-    ``names``: a box is called by the ``phrase`` that it was found by, as in the Grounded-SAM demonstrations; by the
-    first tag that holds the phrase's ``first-word``, else by the first of all tags, as in ConceptGraphs; or by the
-    whole ``tag`` that the phrase is or holds, and left out where it holds none.
+    ``names``: a box is named by its matching ``phrase``, as in the Grounded-SAM demonstrations; by the first tag that
+    contains the phrase's ``first-word``, otherwise by the first of all tags, as in ConceptGraphs; or by the whole
+    ``tag`` that the phrase is or contains, and dropped if it contains none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,7 +47,7 @@ CONCEPTGRAPHS_BOXES = BoxConfig(box_threshold=0.2, text_threshold=0.2, nms_iou=0
 class NamedBoxes:
     """Boxes (K, 4) x0 y0 x1 y1 in pixels, their scores (K,) and one name each, the best first.
 
-    A box may reach beyond the image, as the network has it; the originals cut none.
+    A box may extend beyond the image, as the network returns it; the originals do not clip either.
     """
 
     boxes: Float32Array
@@ -60,7 +60,7 @@ class NamedBoxes:
 
 
 def clean_tag(tag: str) -> str:
-    """``tag`` as it goes into a prompt: lower case, single blanks, none of the marks that part tags for the network.
+    """``tag`` as used in a prompt: lower case, single spaces, without the separators of the network.
 
     >>> clean_tag("  T.V.  Screen?")
     't v screen'
@@ -69,7 +69,7 @@ def clean_tag(tag: str) -> str:
 
 
 def text_prompt(tags: Sequence[str]) -> str:
-    """One text of all ``tags``, each closed by a full stop.
+    """One text of all ``tags``, each followed by a full stop.
 
     >>> text_prompt(["Cat", "coffee  table"])
     'cat. coffee table.'
@@ -78,17 +78,17 @@ def text_prompt(tags: Sequence[str]) -> str:
 
 
 def tag_of(phrase: str, tags: Sequence[str]) -> str | None:
-    """The tag that ``phrase`` stands for: itself, else the first that it contains; None for no tag."""
+    """The tag of ``phrase``: itself, otherwise the first that it contains; None for no tag."""
     if phrase in tags:
         return phrase
     return next((tag for tag in tags if tag in phrase), None)
 
 
 def tag_of_first_word(phrase: str, tags: Sequence[str]) -> str:
-    """The first of ``tags`` that holds the first word of ``phrase``, be it inside a word; else the first tag.
+    """The first of ``tags`` that contains the first word of ``phrase``, even inside a word; otherwise the first tag.
 
     ConceptGraphs' rule: ``Model.find_index`` of Grounded-Segment-Anything at a4d76a2, GroundingDINO's inference.py. A
-    phrase without words, at which that program ends, gets the first tag too.
+    phrase without words, for which that program crashes, gets the first tag too.
 
     >>> tag_of_first_word("table lamp", ["cat", "coffee table", "lamp"])
     'coffee table'
@@ -98,10 +98,10 @@ def tag_of_first_word(phrase: str, tags: Sequence[str]) -> str:
 
 
 def is_in_phrase(probabilities: Float32Array, text_threshold: float, n_tokens: int) -> BoolArray:
-    """Which tokens (K, T) each of K boxes is found by: those above the threshold but for the text's first and last.
+    """Which tokens (K, T) match each of K boxes: those above the threshold except the text's first and last.
 
-    These two mark its ends; GroundingDINO (856dde2) leaves out its first, and the last place of the longest text. At
-    the commit that ConceptGraphs names it leaves out none, see ``GroundingDino.detect``.
+    These two mark its ends; GroundingDINO (856dde2) excludes the first, and the last position of the longest text. At
+    the commit named by ConceptGraphs it excludes none, see ``GroundingDino.detect``.
     """
     chosen: BoolArray = probabilities > text_threshold
     chosen[:, 0] = False
@@ -121,9 +121,9 @@ class GroundingDino:
         self._max_tokens: int = model.config.max_text_len
 
     def detect(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
-        """The things in ``rgb`` (H, W, 3) that ``tags`` name, the best first; empty for no tags.
+        """The objects in ``rgb`` (H, W, 3) named by ``tags``, the best first; empty for no tags.
 
-        Tags that the network's text is too short for are asked for in a text of their own; the original cuts them off.
+        Tags that do not fit into the network's text go into further texts; the original truncates them.
         """
         tags = [tag for tag in dict.fromkeys(clean_tag(tag) for tag in tags) if tag]
         parts = [self._candidates(rgb, part, config) for part in self._texts(tags)]
@@ -136,15 +136,15 @@ class GroundingDino:
         if config.names == "first-word":
             names = tuple(tag_of_first_word(phrase, tags) for phrase in candidates.names)
             return NamedBoxes(candidates.boxes, candidates.scores, names)
-        # A box found by marks alone has no name; it goes.
+        # A box that matches only marks has no name and is dropped.
         named = [tag_of(name, tags) if config.names == "tag" else name or None for name in candidates.names]
         kept = np.flatnonzero([name is not None for name in named])
         names = tuple(name for name in named if name is not None)
         return NamedBoxes(candidates.boxes[kept], candidates.scores[kept], names)
 
     def answer(self, pixels: Float32Array, text: str) -> tuple[Float32Array, Float32Array, list[int]]:
-        """Token probabilities (Q, T) and boxes (Q, 4), centre and size in shares, for pixels (3, H, W), and the text's
-        tokens."""
+        """Token probabilities (Q, T) and boxes (Q, 4), centre and size as fractions, for pixels (3, H, W), and the
+        text's tokens."""
         import torch
 
         tokens = self.tokenizer(text, return_tensors="pt", return_token_type_ids=True).to(self.model.device)
@@ -161,7 +161,7 @@ class GroundingDino:
         return probabilities.cpu().numpy(), answer.pred_boxes[0].float().cpu().numpy(), tokens["input_ids"][0].tolist()
 
     def pixels(self, rgb: UInt8Array) -> Float32Array:
-        """``rgb`` (H, W, 3) as the network takes it, (3, h, w)."""
+        """``rgb`` (H, W, 3) as input for the network, (3, h, w)."""
         height, width = rgb.shape[:2]
         return normalised(resized(rgb, *size_with_shortest_side(height, width, *self._sides_px)))
 
@@ -171,7 +171,7 @@ class GroundingDino:
         scores = probabilities.max(axis=1)
         kept = np.flatnonzero(scores > config.box_threshold)
         if config.names == "first-word":
-            # There the marks of the text's ends name boxes too: no tag holds "[cls]", so these get the first.
+            # In ConceptGraphs the end marks match boxes too: no tag contains "[cls]", so these get the first tag.
             chosen = probabilities[kept] > config.text_threshold
         else:
             chosen = is_in_phrase(probabilities[kept], config.text_threshold, len(tokens))
@@ -180,11 +180,11 @@ class GroundingDino:
         return NamedBoxes(corners_of(boxes[kept], height, width), scores[kept], names)
 
     def _phrase(self, tokens: list[int]) -> str:
-        """Tokens as words; full stops between them go, as in the original."""
+        """Tokens as words, without the full stops between them, as in the original."""
         return " ".join(self.tokenizer.decode(tokens).replace(".", "").split())
 
     def _texts(self, tags: Sequence[str]) -> list[list[str]]:
-        """``tags`` in order in as few parts as the network's longest text allows."""
+        """``tags`` in order, in as few parts as the network's maximum text length allows."""
         parts: list[list[str]] = []
         for tag in tags:
             longer = [*parts[-1], tag] if parts else []
@@ -214,7 +214,7 @@ def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> Groun
 
 
 def corners_of(boxes: Float32Array, height: int, width: int) -> Float32Array:
-    """Boxes (K, 4) x0 y0 x1 y1 in pixels from boxes centre x, centre y, width, height in shares of the image.
+    """Boxes (K, 4) x0 y0 x1 y1 in pixels from boxes centre x, centre y, width, height as fractions of the image.
 
     Each product and sum is float32 and in the original's order: to pixels first, then from centres to corners
     (``Model.post_process_result`` of GroundingDINO's inference.py, with torchvision's ``box_convert``).
@@ -243,9 +243,9 @@ def box_overlaps(box: Float32Array, others: Float32Array) -> Float32Array:
 def suppress(boxes: Float32Array, scores: NDArray[np.floating[Any]], most_overlap: float) -> Int64Array:
     """Indices of the boxes that no better box overlaps by more than ``most_overlap``, the best first.
 
-    Non-maximum suppression whatever the class; of equal scores the first counts as better. As torchvision has it, the
-    float32 overlap is held against the threshold as it was written: an overlap of 0.4 is float32's 0.4, which is more
-    than 0.4, and suppresses; one of 0.5 is 0.5 and does not.
+    Class-agnostic non-maximum suppression; of equal scores the first counts as better. As in torchvision, the float32
+    overlap is compared with the float64 threshold: an overlap of 0.4 is float32's 0.4, which is more than 0.4, and
+    suppresses; one of 0.5 is 0.5 and does not.
 
     >>> square = np.array([[0, 0, 10, 10], [0, 0, 10, 5], [20, 0, 30, 10]], np.float32)
     >>> suppress(square, np.array([0.5, 0.9, 0.1], np.float32), 0.4).tolist()
@@ -260,6 +260,6 @@ def suppress(boxes: Float32Array, scores: NDArray[np.floating[Any]], most_overla
         kept.append(index)
         rest = place + 1 + np.flatnonzero(is_open[place + 1 :])
         overlaps = box_overlaps(boxes[index], boxes[order[rest]]).astype(np.float64)
-        # NaN, two boxes without area, is no overlap.
+        # NaN (two boxes without area) is not an overlap.
         is_open[rest[overlaps > most_overlap]] = False
     return np.array(kept, np.int64)

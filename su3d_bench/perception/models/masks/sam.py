@@ -1,7 +1,7 @@
-"""Segment Anything: one look at an image, then masks from boxes and points in it.
+"""Segment Anything: an image is embedded once, then masks are decoded from boxes and points in it.
 
-A network that says what it sees is separate from the geometry around it: ``TorchSam`` runs ``transformers``' SamModel,
-``OnnxSam`` the same network exported. Prompts are in pixels of the image; masks come back at its size.
+The network is separate from the geometry around it: ``TorchSam`` runs ``transformers``' SamModel, ``OnnxSam`` the same
+network exported. Prompts are in pixels of the image; masks have its size.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ FULL_SIZE_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Prompts:
-    """One prompt a mask: ``points`` (B, P, 2) x y with ``labels`` (B, P), 1 on the object, or ``boxes`` (B, 4).
+    """One prompt per mask: ``points`` (B, P, 2) x y with ``labels`` (B, P), 1 on the object, or ``boxes`` (B, 4).
 
-    ``points`` are float32 where somebody chose them, as in the original's predictor, and float64 where they are a grid,
-    as in its generator of automatic masks.
+    ``points`` are float32 if they are chosen, as in the original's predictor, and float64 if they are a grid, as in its
+    generator of automatic masks.
     """
 
     points: Float32Array | Float64Array | None = None
@@ -60,7 +60,7 @@ class SamNetwork(Protocol):
         ...
 
     def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
-        """Logits (B, M, h, w) of M masks a prompt and their predicted IoU (B, M), float32; M is 1 or 3.
+        """Logits (B, M, h, w) of M masks per prompt and their predicted IoU (B, M), float32; M is 1 or 3.
 
         ``prompts`` are in pixels of the network's own image.
         """
@@ -69,7 +69,7 @@ class SamNetwork(Protocol):
 
 @dataclass(frozen=True)
 class SeenImage:
-    """An image that SAM has looked at: its ``size`` and the size at which SAM saw it, height first."""
+    """An embedded image: its ``size`` and the ``seen_size`` at which SAM embedded it, height first."""
 
     embedding: Any
     size: tuple[int, int]
@@ -77,10 +77,10 @@ class SeenImage:
 
 
 class Sam:
-    """Masks of one image after another; ``batch`` prompts are decoded at once, fewer after a GPU's memory ran out.
+    """Masks of images; ``batch`` prompts are decoded at once, fewer after a GPU ran out of memory.
 
-    Another batch may move the last digits of a logit, so a mask by single pixels; on the CPU, where no batch is ever
-    halved, the same image gives the same bytes.
+    A different batch may change the last digits of a logit and thus single pixels of a mask; on the CPU, where no batch
+    is ever halved, the same image gives the same bytes.
     """
 
     def __init__(self, network: SamNetwork, batch: int = 64) -> None:
@@ -92,7 +92,7 @@ class Sam:
         height, width = rgb.shape[:2]
         seen = size_with_longest_side(height, width, self.network.image_px)
         pixels = np.zeros((3, self.network.image_px, self.network.image_px), np.float32)
-        # The border is 0 after the mean is taken off, which is the original's order.
+        # The padding is 0 after the mean is subtracted, which is the original's order.
         pixels[:, : seen[0], : seen[1]] = normalised_bytes(resized(rgb, *seen))
         return SeenImage(self.network.embed(pixels), (height, width), seen)
 
@@ -101,7 +101,7 @@ class Sam:
         return self.network.decode(image.embedding, _at_seen_size(prompts, image), is_single)
 
     def full_size(self, image: SeenImage, logits: Any) -> Any:
-        """``logits`` (N, h, w) at the size of the image (N, H, W): up to the network's image, cut, then to the image.
+        """``logits`` (N, h, w) resized to the image (N, H, W): to the network's image, cropped, then to the image.
 
         Both steps are bilinear without antialiasing, as in the original.
         """
@@ -115,7 +115,7 @@ class Sam:
     def from_boxes(self, image: SeenImage, boxes: Float32Array, is_single: bool) -> tuple[BoolArray, Float32Array]:
         """A mask (B, H, W) for each box (B, 4) and its predicted IoU (B,).
 
-        ``is_single``: the one mask that SAM gives when asked for one; else the best of its three by predicted IoU.
+        ``is_single``: SAM's single-mask output; otherwise the best of its three masks by predicted IoU.
         """
         masks = np.zeros((len(boxes), *image.size), bool)
         scores = np.zeros(len(boxes), np.float32)
@@ -131,7 +131,7 @@ class Sam:
         return masks, scores
 
     def from_points(self, image: SeenImage, points: Float32Array) -> tuple[BoolArray, float]:
-        """The one mask (H, W) of the object that all ``points`` (P, 2), x y, lie on, and its predicted IoU."""
+        """The mask (H, W) of the object at all ``points`` (P, 2), x y, and its predicted IoU."""
         labels = np.full((1, len(points)), OBJECT_POINT, np.int64)
         logits, predicted = self.decode(image, Prompts(points.astype(np.float32)[None], labels), is_single=True)
         return self._masks(image, logits[:, 0])[0], float(predicted[0, 0])
@@ -154,10 +154,10 @@ def _at_seen_size(prompts: Prompts, image: SeenImage) -> Prompts:
 
 
 def as_shares_of_float32(points: Float32Array | Float64Array, image_px: int) -> Float32Array | Float64Array:
-    """``points`` moved so little that their shares of the image are float32 numbers, where they are float64.
+    """``points`` in float64 rounded so that their fractions of the image are float32 numbers; float32 is unchanged.
 
-    The original rounds the share and then takes 2 x - 1 (``PositionEmbeddingRandom.forward_with_coords``); transformers
-    takes it first, in float64. After this both give the same bits.
+    The original rounds the fraction and then computes 2 x - 1 (``PositionEmbeddingRandom.forward_with_coords``);
+    transformers computes that first, in float64. After this rounding both give the same bits.
     """
     if points.dtype == np.float32:
         return points
@@ -202,7 +202,7 @@ class TorchSam:
 
 _CHECKPOINTS: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("sam_checkpoints.toml")))
 _SAM_POSITIONS = "shared_image_embedding.positional_embedding"
-_SAM_NO_WEIGHTS = ("pixel_mean", "pixel_std")  # of the image, which some copies of the checkpoint hold
+_SAM_NO_WEIGHTS = ("pixel_mean", "pixel_std")  # image statistics included in some copies of the checkpoint
 
 
 def load_sam(files: ModelFiles, device: str, precision: str) -> TorchSam:
@@ -231,17 +231,17 @@ def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
 
 
 def sam_config(name: str) -> Any:
-    """``transformers``' configuration of the published SAM called ``name``."""
+    """``transformers``' configuration of the published SAM ``name``."""
     transformers = require_transformers(f"segmenter '{name}'")
     return transformers.SamConfig(vision_config=dict(_CHECKPOINTS["towers"][name]))
 
 
 def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
-    """``model`` with the weights of an original checkpoint, every one of them; raises ``DataError``."""
+    """``model`` with all weights of an original checkpoint; raises ``DataError``."""
     try:
         model.load_state_dict(sam_names(tensors), strict=True)
     except RuntimeError as error:
-        raise DataError(f"{where}: is not a checkpoint of this SAM: {bounded(error)}; download it again") from error
+        raise DataError(f"{where}: not a checkpoint of this SAM: {bounded(error)}; download it again") from error
     return model
 
 
@@ -251,10 +251,10 @@ def _original_sam(files: ModelFiles) -> Any:
     return fill_sam(model, read_weights(files.weights), str(files.weights))
 
 
-# ---- exported to ONNX: a folder with encoder.onnx, decoder.onnx (and .data files beside large ones) and manifest.json
+# ---- exported to ONNX: a folder with encoder.onnx, decoder.onnx (and .data files for large ones) and manifest.json
 
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"
-# Labels of points in the exported decoder, those of the original's own export: 0 background, 1 object, and these.
+# Labels of points in the exported decoder, as in the original's own export: 0 background, 1 object, and these.
 NO_POINT, TOP_LEFT, BOTTOM_RIGHT = -1, 2, 3
 
 
@@ -268,7 +268,7 @@ class SamManifest(OnnxManifest):
 
 
 class OnnxSam:
-    """``SamNetwork`` of the exported encoder and decoder; what follows them is computed in torch on the CPU."""
+    """``SamNetwork`` of the exported encoder and decoder; the following steps are computed in torch on the CPU."""
 
     def __init__(self, encoder: Any, decoder: Any, image_px: int) -> None:
         self._encoder = encoder
@@ -289,9 +289,9 @@ class OnnxSam:
 
 
 def exported_points(prompts: Prompts) -> tuple[Float32Array, Int64Array]:
-    """Points (B, P, 2) and labels (B, P) as the exported decoder takes them: a box is its corners.
+    """Points (B, P, 2) and labels (B, P) for the exported decoder: a box is given by its corners.
 
-    Points without a box are followed by one that is no point, as the network was trained.
+    Points without a box are followed by a padding point, as in the network's training.
     """
     if prompts.boxes is not None:
         labels = np.tile(np.array([TOP_LEFT, BOTTOM_RIGHT], np.int64), (len(prompts), 1))
@@ -302,7 +302,7 @@ def exported_points(prompts: Prompts) -> tuple[Float32Array, Int64Array]:
 
 
 def load_onnx_sam(files: ModelFiles, provider: Provider = "cpu", device_index: int = 0) -> OnnxSam:
-    """An exported SAM ready to run; raises ``DataError`` where a file is not the one that was written."""
+    """An exported SAM ready to run; raises ``DataError`` if a file differs from the exported one."""
     manifest = SamManifest.read(files.weights)
     if wrong := wrong_files(manifest, files.folder):
         raise DataError(wrong[0])
