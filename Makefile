@@ -1,4 +1,4 @@
-# `make demo` and `make test` do all set-up themselves; both need only Python 3.11 or 3.12 and make.
+# `make demo` and `make test` include all set-up; both need only Python 3.11 or 3.12 and make.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,12 +14,12 @@ demo: $(VENV)/core
 test: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto
 
-# What guards the numbers (what the original evaluators answer, to the last bit), and each verb once.
+# Tests of the metrics (against the original evaluators, to the last bit), and each verb once.
 QUICK := tests/metrics tests/evaluation/test_evaluate_cases.py tests/cli/test_each_verb.py tests/test_suite_rules.py
 test-quick: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto $(QUICK)
 
-# What docs/running/reliability.md claims, at length: half an hour on two cores, the disks as root alone.
+# Long tests of docs/running/reliability.md: half an hour on two cores; the disks only as root.
 proofs: $(VENV)/test
 	@mkdir -p build/measured
 	$(BIN)/python -m pytest -q -n auto -m proof
@@ -30,7 +30,7 @@ proofs: $(VENV)/test
 	$(BIN)/python benchmarks kill_at_random --kills 200 --json build/measured/kills.json
 	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks full_disk --disks 20; fi
 
-# Faults planted in metrics, statistics, comparison and gate, one at a time: which do the tests not notice? Hours.
+# Mutation testing of metrics, statistics, comparison and regression check: lists undetected faults. Takes hours.
 mutants: $(VENV)/test
 	@mkdir -p build/measured
 	$(BIN)/python benchmarks mutants --mutants 600 --json build/measured/mutants.json
@@ -40,7 +40,7 @@ bench: $(VENV)/test
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks write_performance build/bench.json
 
-# All methods on the demo rooms, and along corridors so long that every map reaches 5 million points: on two cores three
+# All methods on the demo rooms, and on corridors long enough for maps of 5 million points: on two cores three
 # quarters of an hour for the rooms and half an hour for the corridors.
 CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
 CORRIDOR := benchmarks/scale/corridor.py:Corridor
@@ -51,8 +51,8 @@ bench-methods: $(VENV)/test
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans
 	$(BIN)/python benchmarks write_performance build/bench.json --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
 
-# Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers. Wide
-# limits where machines differ: CI runs on whatever there is, beside whatever else runs there.
+# Creates the reference for the regression check in .ci/run; commit it with the change that affects results. The limits
+# are wide because CI machines and their load vary.
 reference: demo
 	$(BIN)/su3d-bench check --build-from runs/demo --out .ci/reference.json --machine-tolerance 5 --cost-limit 3
 
@@ -60,8 +60,8 @@ reference: demo
 architecture: $(VENV)/test
 	$(BIN)/python tools/docs/architecture.py
 
-# The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
-# and --strict would end nothing.
+# The documentation site, which works from disk: open build/site/index.html. Not --quiet: mkdocs would not count
+# warnings, and --strict would have no effect.
 docs: $(VENV)/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 

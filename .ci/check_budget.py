@@ -1,7 +1,7 @@
-"""Whether the code keeps to its budget: ``check_budget.py [--write]``.
+"""Check that the code stays within its budget: ``check_budget.py [--write]``.
 
-``.ci/budget.toml`` holds the most lines of code of each package, of product, tests and test support together, and the
-most files. Lines count that hold something other than a comment or a docstring. ``--write`` sets the present counts,
+``.ci/budget.toml`` has the maximum lines of code of each package, of product, tests and test support together, and the
+maximum number of files. Lines with only comments or docstrings do not count. ``--write`` stores the current counts,
 rounded up to the next ten.
 """
 
@@ -24,7 +24,7 @@ NO_CODE = {getattr(tokenize, name) for name in ("COMMENT", "NL", "NEWLINE", "IND
 
 
 def code_lines(text: str) -> int:
-    """The lines of a module that hold a token other than a comment or a docstring.
+    """The lines of a module that contain a token other than a comment or docstring.
 
     >>> code_lines('\"\"\"Words.\"\"\"\\n\\n# a remark\\nx = (1,\\n  2)\\n')
     2
@@ -39,7 +39,7 @@ def code_lines(text: str) -> int:
 
 
 def counts() -> Counter[str]:
-    """The lines of each package and of the whole, and the number of files."""
+    """The lines of each package and in total, and the number of files."""
     found: Counter[str] = Counter()
     for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
         place = path.relative_to(ROOT).parts

@@ -1,9 +1,9 @@
-"""Is the table in the README what the tool writes?  ``--write`` puts it there.
+"""Check that the README's table is what the tool prints.  ``--write`` updates it.
 
 Words, rows and columns must be equal; values may differ by ``TOLERANCE`` points, because ONNX Runtime, Embree and BLAS
-round differently on other processors and a region that falls on the other side of a threshold moves a metric a little.
-The ends of an interval over four scenes are the value and 3.18 standard errors: where each scene moves by
-``TOLERANCE``, they move by up to ``TOLERANCE * (1 + 3.18 / 2)``.
+round differently on other processors, and a region on the other side of a threshold changes a metric slightly.
+The ends of an interval over four scenes are the value and 3.18 standard errors: if each scene changes by
+``TOLERANCE``, they change by up to ``TOLERANCE * (1 + 3.18 / 2)``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def shape_of(table: str) -> str:
 
 def differences(shown: str, written: str) -> list[str]:
     if shape_of(shown) != shape_of(written):
-        return ["the README's table has other rows, columns or words than the one that the tool writes:", written]
+        return ["the README's table differs in rows, columns or words from the tool's output:", written]
     return [
         *_over_tolerance(INTERVAL.sub("", shown), INTERVAL.sub("", written), TOLERANCE),
         *_over_tolerance(" ".join(INTERVAL.findall(shown)), " ".join(INTERVAL.findall(written)), END_TOLERANCE),
@@ -44,7 +44,7 @@ def differences(shown: str, written: str) -> list[str]:
 
 def _over_tolerance(shown: str, written: str, tolerance: float) -> list[str]:
     pairs = zip(NUMBER.findall(shown), NUMBER.findall(written), strict=True)
-    return [f"README says {a}, the run {b}" for a, b in pairs if abs(float(a) - float(b)) > tolerance]
+    return [f"README has {a}, the run {b}" for a, b in pairs if abs(float(a) - float(b)) > tolerance]
 
 
 def main(arguments: list[str]) -> int:
@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> int:
         README.write_text(readme.replace(table_in(readme) or END, written if table_in(readme) else f"{written}\n{END}"))
         return 0
     found = differences(table_in(readme), written)
-    print("\n".join(found) or "the README's table is what the tool writes")
+    print("\n".join(found) or "the README's table matches the tool's output")
     return int(bool(found))
 
 

@@ -1,4 +1,4 @@
-"""Build the wheel and compare what it holds with what git tracks: nothing missing, nothing besides."""
+"""Build the wheel and compare its content with the files tracked by git: nothing missing, nothing extra."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LINKED = ("datasets", "baselines", "reports")
 
 
 def tracked() -> set[str]:
-    """Paths inside the wheel that the tracked files stand for."""
+    """Paths inside the wheel of the tracked files."""
     listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     expected = set()
     for path in filter(None, listing.split("\0")):
@@ -35,9 +35,9 @@ def built_wheel(folder: Path) -> Path:
 
 
 def copy_kernels(installed: Path) -> None:
-    """Numba's compiled kernels go with sources that are the same: to compile them again takes a minute.
+    """Reuse Numba's compiled kernels for unchanged sources: compiling them again takes a minute.
 
-    Numba takes what it kept for a source of the same size and time.
+    Numba identifies a source by its size and time.
     """
     for source in installed.rglob("*.py"):
         original = ROOT / "su3d_bench" / source.relative_to(installed)

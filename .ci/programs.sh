@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A browser, an office and LaTeX for the tests that drive them, where they can be installed; without them those tests skip.
+# Install a browser, an office suite and LaTeX for the tests that use them, if possible; without them those tests skip.
 set -u
 
 has() { for name in "$@"; do command -v "$name" >/dev/null && return 0; done; return 1; }
@@ -10,11 +10,11 @@ install() {
     if as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$@" >"$log" 2>&1 </dev/null; then
         echo "installed $*"
     else
-        echo "$* cannot be installed here ($(tail -n 1 "$log")); the tests that need it skip"
+        echo "$* cannot be installed ($(tail -n 1 "$log")); the tests that need it skip"
     fi
 }
 
-browsers=(chromium chromium-browser google-chrome google-chrome-stable chrome)  # as tests/support/programs/chromium.py
+browsers=(chromium chromium-browser google-chrome google-chrome-stable chrome)  # as in tests/support/programs/chromium.py
 offices=(soffice libreoffice)
 missing=()
 has "${browsers[@]}" || missing+=("chromium")
@@ -22,7 +22,7 @@ has "${offices[@]}" || missing+=("libreoffice-calc python3-uno")
 has pdflatex || missing+=("texlive-latex-base texlive-latex-recommended")
 [ ${#missing[@]} = 0 ] || as_root apt-get update -qq >/dev/null 2>&1 </dev/null
 for packages in "${missing[@]}"; do
-    # shellcheck disable=SC2086 - one word a package
+    # shellcheck disable=SC2086 - one word per package
     install $packages
 done
 exit 0

@@ -1,9 +1,9 @@
-"""Is the built documentation site whole, and does it work from a disk without a network?
+"""Check that the built documentation site is complete and works from disk without a network.
 
-``python .ci/site.py [build/site]`` looks at every page: each link and anchor inside the site leads somewhere, nothing
-is loaded from elsewhere, each protocol, method and public name is there. Then Chromium, where one is installed, opens
-pages as files, at a desk and on a phone, light and dark: is text easy to read, does a search find, does anything ask
-the network. Exit code 1 with a line a fault.
+``python .ci/site.py [build/site]`` checks every page: all links and anchors inside the site resolve, nothing
+is loaded from elsewhere, every protocol, method and public name has a page. Then Chromium, if installed, opens
+pages as files, on a desktop and a phone, in light and dark mode: readable text, working search, no network
+access. Exit code 1 with one line per fault.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ LOADED = {("script", "src"), ("img", "src"), ("iframe", "src"), ("source", "src"
 ELSEWHERE = re.compile(r"@import|url\(\s*[\"']?(?:https?:)?//")
 SEARCHED, FOUND = "HOV-SG", "reference/protocols/replica-hovsg"
 WIDTHS = {"desk": 1280, "phone": 390}
-# Text whose contrast with what is behind it is below 4.5, or 3 where it is large: WCAG 2, 1.4.3. Colours are drawn to
-# be read: a style may write them in any of its forms.
+# Text with a contrast to its background below 4.5, or 3 if it is large: WCAG 2, 1.4.3. Colours are drawn to
+# a canvas because styles may use any notation.
 FAINT = """(() => {
   const pen = document.createElement('canvas').getContext('2d', {willReadFrequently: true})
   const rgba = text => { pen.clearRect(0, 0, 1, 1); pen.fillStyle = text; pen.fillRect(0, 0, 1, 1)
@@ -70,7 +70,7 @@ RESULTS = "[...document.querySelectorAll('.md-search-result__link')].map(one => 
 
 
 class _Page(HTMLParser):
-    """What a page links to, what it loads, and the places in it that can be linked to."""
+    """A page's links, loaded resources, and anchors."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class _Page(HTMLParser):
 
 
 def faults_of(site: Path) -> Iterator[str]:
-    """A line for each link that leads nowhere, thing that is loaded from elsewhere, and page that is missing."""
+    """One line per broken link, external resource, and missing page."""
     pages = {path: _Page(path.read_text()) for path in sorted(site.rglob("*.html"))}
     for path, page in pages.items():
         where = path.relative_to(site)
@@ -110,9 +110,9 @@ def faults_of(site: Path) -> Iterator[str]:
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             target = target / "index.html" if target.is_dir() else target
             if not target.is_file():
-                yield f"{where}: {address} is not there"
+                yield f"{where}: {address} does not exist"
             elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].places:
-                yield f"{where}: {address}: the page has no such place"
+                yield f"{where}: {address}: the page has no such anchor"
         if ELSEWHERE.search(page.styles):
             yield f"{where}: a style loads from elsewhere"
     for path in sorted(site.rglob("*.css")):
@@ -127,7 +127,7 @@ def faults_of(site: Path) -> Iterator[str]:
 
 
 def faults_in_browser(site: Path) -> Iterator[str]:
-    """A line for each thing that a person who opens the start page from a disk would miss, or see badly."""
+    """One line per fault seen when opening the start page from disk: missing content or bad layout."""
     from chromium import Chromium
 
     opened = [
@@ -150,7 +150,7 @@ def faults_in_browser(site: Path) -> Iterator[str]:
                     browser.open(site / name)
                     is_dark = browser.run("document.body.dataset.mdColorScheme") == "slate"
                     if is_dark != (colours == "dark"):
-                        yield f"{who}: {name} has other colours"
+                        yield f"{who}: {name} has wrong colours"
                     if (seen := browser.run("document.documentElement.scrollWidth")) > width:
                         yield f"{who}: {name} is {seen} pixels wide"
                     yield from (f"{who}: {name}: faint: {one}" for one in browser.run(FAINT))
@@ -169,14 +169,14 @@ def main(arguments: list[str]) -> int:
 
     site = Path(arguments[0] if arguments else ROOT / "build/site").resolve()
     if not (site / "index.html").is_file():
-        print(f"site: {site} holds no site; run: make docs")
+        print(f"site: {site} has no site; run: make docs")
         return 2
     faults = list(faults_of(site))
     if find_chromium() is None:
-        print("site: no Chromium here; nobody has opened the pages")
+        print("site: no Chromium; the pages were not opened")
     else:
         faults += faults_in_browser(site)
-    print("\n".join(faults) or f"site: {len(list(site.rglob('*.html')))} pages, every link leads somewhere")
+    print("\n".join(faults) or f"site: {len(list(site.rglob('*.html')))} pages, all links resolve")
     return int(bool(faults))
 
 

@@ -1,8 +1,8 @@
-"""Do the tutorials work as they are written, and show what one sees?  Each is typed in an empty folder, with the wheel.
+"""Check that the tutorials work as written and show the real output. Each is run in an empty folder with the wheel.
 
-What stands in the ``sh`` blocks of a page of ``docs/tutorials`` is typed, block by block; the first that fails ends the
-tutorial. Of a ``text`` block behind one every line must have been printed, but for its numbers, which may be of another
-processor or code, and for ``...``, which stands for lines that are left out.
+The ``sh`` blocks of a page of ``docs/tutorials`` are run one by one; the first failure ends the
+tutorial. Every line of a following ``text`` block must have been printed, except for numbers (which may differ on
+other processors or versions) and ``...``, which stands for omitted lines.
 
 ``python .ci/tutorials.py [NAME ...]``, or all.
 """
@@ -18,19 +18,19 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))  # a test runs this by its path
+sys.path.insert(0, str(Path(__file__).resolve().parent))  # a test runs this by path
 
 from check_wheel import built_wheel, copy_kernels
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {page.stem: page for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))}
 BLOCK = re.compile(r"^```(sh|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-NUMBER = re.compile(r"\b[0-9a-f]{16}\b|[-+]?\d+(?:[.,]\d+)*")  # digests of code too
+NUMBER = re.compile(r"\b[0-9a-f]{16}\b|[-+]?\d+(?:[.,]\d+)*")  # including digests of code
 LEFT_OUT = "..."
 
 
 def steps_of(page: str) -> list[tuple[str, str]]:
-    """What is typed, block by block, and what the page shows that it prints.
+    """The commands of each block, and the output that the page shows.
 
     >>> steps_of("# P\\n```sh\\ntrue\\n```\\nthen\\n```sh\\nls\\n```\\nshows\\n```text\\na.txt\\n```\\n")
     [('true\\n', ''), ('ls\\n', 'a.txt\\n')]
@@ -45,7 +45,7 @@ def steps_of(page: str) -> list[tuple[str, str]]:
 
 
 def shape_of(line: str) -> str:
-    """A line without its numbers and without the spaces and rules that align it.
+    """A line without numbers, and without the spaces and rules that align it.
 
     >>> shape_of("| mine   | 54.8 [25.0, 84.6] | +1,204 |") == shape_of("| mine | 9.1 [0, 100.0] | 3 |")
     True
@@ -54,7 +54,7 @@ def shape_of(line: str) -> str:
 
 
 def not_printed(shown: str, printed: str) -> list[str]:
-    """The lines that a page shows and that were not printed.
+    """The lines that a page shows but that were not printed.
 
     >>> not_printed("2 scenes\\n...\\nwritten: a.tex\\n", "7 scenes\\nsomething\\nwritten: b.tex\\n")
     ['written: a.tex']
@@ -64,7 +64,7 @@ def not_printed(shown: str, printed: str) -> list[str]:
 
 
 def install(place: Path) -> dict[str, str]:
-    """The environment in which ``su3d-bench`` is the wheel's, unpacked in ``place``."""
+    """The environment in which ``su3d-bench`` is that of the wheel, unpacked in ``place``."""
     wheel = built_wheel(place / "wheel")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", str(place / "installed"), str(wheel)], check=True)
@@ -78,7 +78,7 @@ def install(place: Path) -> dict[str, str]:
 
 
 def follow(page: str, folder: Path, environment: Mapping[str, str]) -> list[str]:
-    """What is wrong with a page that is typed in ``folder``; everything that is printed is printed here too."""
+    """Faults of a page run in ``folder``; its output is printed."""
     wrong: list[str] = []
     for typed, shown in steps_of(page):
         print(f"$ {typed.rstrip()}", flush=True)

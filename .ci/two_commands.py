@@ -1,9 +1,9 @@
-"""A paper's tables from the wheel alone: fetched from servers on loopback, reproduced, and verified by another process.
+"""Reproduce a paper's tables from the wheel only: fetched from loopback servers, reproduced, verified separately.
 
-``.ci/two_commands.py`` builds the wheel, installs it beside the packages of the project's environment, and there, with
-an empty home, does what a user does: ``fetch models --for paper``, ``fetch replica``, ``reproduce opensu3d --table II
-III``, ``report verify``. The servers give tiny networks and rooms in the published layouts, first damaged in each way
-that has a name; nothing damaged may be taken for whole.
+``.ci/two_commands.py`` builds the wheel, installs it next to the packages of the project's environment and, with
+an empty home, runs a user's commands: ``fetch models --for paper``, ``fetch replica``, ``reproduce opensu3d --table II
+III``, ``report verify``. The servers provide tiny networks and rooms in the published layouts, first damaged in every
+named way; damaged files must never be accepted as complete.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ LARGEST = "grounding-dino"
 SAM, RAM = "sam_vit_h_4b8939.pth", "ram_plus_swin_large_14m.pth"
 REPLICA = "Replica.zip"
 TABLES = ("II", "III")
-MAX_SMALL_FILE = 100_000  # bytes that a file may have where the disk is full
+MAX_SMALL_FILE = 100_000  # maximum file size in bytes for the full disk test
 
 
 @dataclass(frozen=True)
 class Place:
-    """A home of its own with the program in it, and nothing else."""
+    """A separate home with the program in it, and nothing else."""
 
     folder: Path
     python: Path
@@ -67,7 +67,7 @@ class Place:
         return self.folder / "data"
 
     def run(self, *words: object, cwd: Path | None = None, max_bytes: int | None = None) -> tuple[int, str, str]:
-        """``su3d-bench`` with ``words``: its code, stdout and stderr."""
+        """``su3d-bench`` with ``words``: exit code, stdout and stderr."""
         program = self.python.parent / "su3d-bench"
         return self._run([program, *words], cwd, max_bytes)
 
@@ -91,7 +91,7 @@ class Place:
 
 
 def installed(folder: Path) -> Place:
-    """The wheel in a virtual environment of its own, with the packages of the project's environment on its path."""
+    """The wheel in a new virtual environment, with the packages of the project's environment on its path."""
     wheel = built_wheel(folder / "wheel")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
     python = folder / "venv/bin/python"
@@ -99,7 +99,7 @@ def installed(folder: Path) -> Place:
     subprocess.run([sys.executable, *words], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
     copy_kernels(packages / "su3d_bench")
-    # A folder that a .pth file names is searched; the .pth files in it, that of the project's sources, are not read.
+    # Folders in .pth files are searched, but .pth files inside them (such as the one of the sources) are not read.
     (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for name in ("home", "elsewhere"):
         (folder / name).mkdir()
@@ -110,13 +110,13 @@ def installed(folder: Path) -> Place:
 
 
 def serve_models(server: FileServer, place: Place) -> list[dict[str, Any]]:
-    """Tiny networks served as hub and Meta's server have the published ones; rows of the table."""
+    """Serve tiny networks like the hub and Meta's server; rows of the table."""
     made = place.folder / "made/models"
     code = "import sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]); import tiny_models\n"
     place.python_says(code + "tiny_models.write_fetched(Path(sys.argv[1]))", made, ROOT / "tests/support/models")
     rows = [serve_model(server, name, repository, made / name) for name, repository in HUB.items()]
     sam = serve_file(server, f"sam/{SAM}", b"tensors of a checkpoint" * 10_000)
-    # Where the table says it lies there is nobody: it comes from a mirror.
+    # The address in the table is dead: the file comes from a mirror.
     rows.append(entry("sam-vit-h", "models", {SAM: sam | {"address": f"http://127.0.0.1:9/{SAM}"}}))
     serve_repository(server, "xinyu1205/recognize-anything-plus-model", {RAM: b"of its own package alone" * 100})
     hub = {"repository": "xinyu1205/recognize-anything-plus-model", "files": [RAM], "optional": [], "read_at": "here"}
@@ -124,7 +124,7 @@ def serve_models(server: FileServer, place: Place) -> list[dict[str, Any]]:
 
 
 def serve_rooms(server: FileServer, place: Place) -> list[dict[str, Any]]:
-    """One made room under the names of Replica's eight scenes, in the two published archives; rows of the table."""
+    """Serve one generated room as Replica's eight scenes, in the two published archives; rows of the table."""
     made = place.folder / "made/replica"
     rc, _, err = place.run("datasets", "make", "rooms", "--layout", "replica", "--out", made, *ROOM)
     assert rc == 0, err
@@ -141,17 +141,17 @@ def serve_rooms(server: FileServer, place: Place) -> list[dict[str, Any]]:
 
 
 def expect(what: str, answer: tuple[int, str, str], code: int, said: str) -> None:
-    """``answer`` has ``code`` and says ``said`` in the one line that it ends with, without a traceback."""
+    """Check that ``answer`` has ``code`` and ``said`` in its final line, without a traceback."""
     rc, out, err = answer
     lines = err.strip().splitlines()
-    assert rc == code, f"{what}: code {rc} in place of {code}\n{out}\n{err}"
+    assert rc == code, f"{what}: code {rc} instead of {code}\n{out}\n{err}"
     assert "Traceback" not in err, err
-    assert said in (lines[-1] if code else out + err), f"{what}: {said!r} is not said\n{out}\n{err}"
+    assert said in (lines[-1] if code else out + err), f"{what}: {said!r} is missing\n{out}\n{err}"
     print(f"{what}: {(lines[-1] if code else said)[:160]}", flush=True)
 
 
 def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tuple[int, str, str]]) -> None:
-    """Each named damage gives its line, and no model is seen before it is whole."""
+    """Each kind of damage gives its message, and no incomplete model is found."""
     once = ("--accept", "models", "--retries", "0", "--quiet")
     before = len(server.asked)
     expect("licence not accepted", fetch("models", "--for", "paper"), 2, "not accepted")
@@ -168,11 +168,11 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     expect("full disk", fetch("models", "sam-vit-h", *once, max_bytes=MAX_SMALL_FILE), 2, SAM)
     server.files[f"/sam/{SAM}"] = Served(sam.content, breaks_after=[50_000])
     expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "run the same command again to resume")
-    assert not here(place), "something damaged is taken for whole"
+    assert not here(place), "a damaged file was accepted as complete"
     expect(
         "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
     )
-    assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was taken up"
+    assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was resumed"
     assert here(place) == {*HUB, "sam-vit-h", "ram-plus"}
 
 
@@ -196,22 +196,22 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
 
 
 def reproduced(place: Place) -> Path:
-    """Tables II and III of OpenSU3D's paper on what was fetched; the archive."""
+    """Tables II and III of OpenSU3D's paper from the fetched data; the archive."""
     words = ("reproduce", "opensu3d", "--table", *TABLES, "--limit", "1", "--out", place.folder / "out")
     expect("preflight", place.run(*words, "--dry-run"), 0, "everything that is required is here")
-    # What was fetched are tiny networks with random weights: the numbers come from embedded perception.
+    # The fetched networks are tiny, with random weights: the numbers come from embedded perception.
     rc, out, err = place.run(*words, "--profile", "embedded", "--encoder", "embedded", "--quiet")
     assert rc == 0, err
     for name in TABLES:
         assert f"**{name}**" in out or f"{name}: " in out, out
     cells = json.loads((place.folder / "out/compared.json").read_text())["cells"]
     assert cells and all(cell["measured"] is not None for cell in cells)
-    print(f"reproduce: {len(cells)} printed cells beside measured ones", flush=True)
+    print(f"reproduce: {len(cells)} printed cells compared with measured ones", flush=True)
     return place.folder / "out/bundle.zip"
 
 
 def verified(place: Place, bundle: Path) -> None:
-    """The archive holds, moved into another folder and scored by another process."""
+    """The archive is valid after moving it, scored by another process."""
     moved = shutil.copy(bundle, place.folder / "elsewhere/b.zip")
     rc, out, err = place.run("report", "verify", Path(moved).name, "--json", cwd=place.folder / "elsewhere")
     assert rc == 0, out + err
@@ -237,7 +237,7 @@ def main() -> int:
         assert rc == 1 and "missing, about" in out, out + err
         damages_of_models(server, place, fetch)
         damages_of_replica(server, place, fetch)
-        # RAM++ runs as its export, which is made in an environment of its own.
+        # RAM++ runs as its export, which is created in a separate environment.
         shutil.copytree(place.folder / "made/models/ram-plus-onnx", place.models / "ram-plus-onnx")
         verified(place, reproduced(place))
     spent = sum(resource.getrusage(who).ru_utime + resource.getrusage(who).ru_stime for who in WHOSE)

@@ -1,4 +1,4 @@
-"""The ground truth as a prediction: it gives the ground-truth ceiling of every protocol."""
+"""The ground truth as a prediction: it yields the ground-truth ceiling of every protocol."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from su3d_bench.perception.embedded.lexicon import scene_caption
 
 
 class Oracle:
-    """Hands back the ground truth as a map: one mask an instance, labelled with its class, scored 1."""
+    """Returns the ground truth as a map: one mask per instance, labelled with its class, score 1."""
 
     name = "oracle"
     is_system = False
@@ -23,7 +23,7 @@ class Oracle:
         source="",
         licence="that of this project",
         needs=("ground truth",),
-        status="scores 1 where a protocol allows it; where it does not, less, which a method may exceed",
+        status="scores 1 if a protocol allows it; otherwise less, which a method may exceed",
     )
 
     class Config(BaseModel):
@@ -35,21 +35,21 @@ class Oracle:
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Nothing: no frame is looked at."""
+        """Nothing: frames are not used."""
         return PerceptionNeeds(frames=False)
 
     def receive_ground_truth(self, truth: GroundTruth) -> None:
-        """Take the truth; only the runner calls this, and only for this method."""
+        """Take the ground truth; only the runner calls this, and only for this method."""
         self._truth = truth
 
     def start(self, scene: SceneInfo) -> None:
-        assert self._truth is not None, f"{scene.dataset}/{scene.scene}: the oracle was started without the truth"
+        assert self._truth is not None, f"{scene.dataset}/{scene.scene}: the oracle was started without ground truth"
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Frames tell the oracle nothing."""
+        """Does nothing: the oracle does not use frames."""
 
     def finish(self) -> Instances:
-        """The points of the truth; those of no instance stay in the map, in no mask."""
+        """The points of the ground truth; those of no instance stay in the map, outside all masks."""
         truth = self._truth
         assert truth is not None
         masks = {key: mask for key, mask in _masks_of(truth).items() if truth.semantic[mask[0]] > 0}
@@ -67,7 +67,7 @@ class Oracle:
 
 
 def _with_graph(instances: Instances, graph: TrueGraph) -> Instances:
-    """The map with the annotated relations of its objects as edges; of several between two the first alone counts."""
+    """The map with the annotated relations of its objects as edges; only the first of several between two counts."""
     row_of = {int(key): row for row, key in enumerate(instances.ids)}
     kept = [one for one in graph.relations if one[0] in row_of and one[2] in row_of]
     names = tuple(dict.fromkeys(predicate for _, predicate, _ in kept)) or ("none",)
@@ -77,9 +77,9 @@ def _with_graph(instances: Instances, graph: TrueGraph) -> Instances:
 
 
 def _masks_of(truth: GroundTruth) -> dict[int, Int32Array]:
-    """Instance id -> indices of its points, ascending; an instance has one class, so any point tells it.
+    """Instance id -> indices of its points, ascending; all points of an instance have one class.
 
-    Points that evaluations leave out (class -1) are in none.
+    Points excluded from evaluation (class -1) are omitted.
     """
     order = np.argsort(truth.instance, kind="stable")
     order = order[truth.semantic[order] >= 0]

@@ -1,4 +1,4 @@
-"""Benchmarks use each other and what tests share."""
+"""Benchmarks use each other and the tests' support."""
 
 from __future__ import annotations
 

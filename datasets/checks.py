@@ -1,7 +1,7 @@
-"""What a scene holds and what is wrong with it: every file, every frame, and whether frames and truth meet.
+"""Check of a scene: counts and faults of every file and every frame, and whether frames and ground truth align.
 
-Where a reader gives up at the first fault, the check goes on: a dataset that has ``problems(scene)`` names its faults
-itself, one line each, and the files that it lists are looked at one by one.
+Readers stop at the first fault, the check continues: a dataset that has ``problems(scene)`` lists its faults
+itself, one line each, and every file that it lists is checked.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class DepthStatistics:
-    """Over the frames that were read: least 1st percentile, median of medians, greatest 99th percentile, mean share of
-    the pixels that have a depth."""
+    """Over the frames read: minimum 1st percentile, median of medians, maximum 99th percentile, mean share of
+    pixels with a depth."""
 
     near_m: float
     median_m: float
@@ -61,7 +61,7 @@ class DepthStatistics:
 
 @dataclass(frozen=True)
 class TruthVariant:
-    """One form of ground truth: its counts, or the ``reason`` why it is not here."""
+    """One form of ground truth: its counts, or the ``reason`` why it is missing."""
 
     variant: str
     reason: str | None
@@ -72,10 +72,10 @@ class TruthVariant:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is known of a scene after a check; ``digest`` is the data key that results of this scene carry.
+    """Result of checking a scene; ``digest`` is the data key that results of this scene carry.
 
-    ``n_frames`` is None where the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None where
-    there is no truth or no frame; ``up``, which axis of the files points up, where no frame was read.
+    ``n_frames`` is None if the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None without
+    ground truth or frames; ``up`` (the axis of the files that points up) is None if no frame was read.
     """
 
     scene: str
@@ -106,10 +106,10 @@ def inspect(
     n_threads: int = 1,
     progress: Progress = lambda n_done, n_frames: None,
 ) -> Inspection:
-    """Look at everything of ``scene`` and go on after each fault; ``progress`` gets (frames read, frames to read).
+    """Check all of ``scene``, continuing after each fault; ``progress`` gets (frames read, frames to read).
 
-    All frames are read, from ``n_threads`` threads, or ``SAMPLED_FRAMES`` evenly spaced ones where ``is_quick`` or
-    where the scene is made on demand and has no file that could be damaged.
+    All frames are read, by ``n_threads`` threads; only ``SAMPLED_FRAMES`` evenly spaced ones if ``is_quick`` or
+    if the scene is generated on demand and has no file that could be damaged.
     """
     started, findings = time.perf_counter(), _Findings(f"{dataset.name}/{scene}")
     with _warnings_as_findings(findings):
@@ -152,7 +152,7 @@ def inspect(
 
 
 class _Findings:
-    """Collects what is found of one scene, each fault once though several steps come upon it, at its gravest."""
+    """Collects the findings of one scene; a fault found by several steps is kept once, at its highest severity."""
 
     def __init__(self, scene: str) -> None:
         self.scene = scene
@@ -172,16 +172,16 @@ class _Findings:
                 self._findings[keys[0]] = Finding(finding.severity, finding.check, keys[0][0], text)
 
     def add_fault(self, check: str, where: str, error: Exception) -> None:
-        """A finding of what was raised, unless it is about a file whose fault is known."""
+        """Add a finding for an exception, unless it is about a file whose fault is known."""
         text = str(error) if isinstance(error, OSError) else error_line(error)
         text = printable(text.removeprefix(f"{self.scene}: "))
         first = text.partition(" ")[0].rstrip(":")
-        is_of_a_file = "." in first and not FILE_FRAME.search(text)  # of a recording, another frame may be broken
+        is_of_a_file = "." in first and not FILE_FRAME.search(text)  # in a recording, other frames may be broken
         if not (is_of_a_file and self.mentions(Path(first))):
             self.add(Finding("error", check, where, text))
 
     def attempt(self, check: str, work: Callable[[], Any]) -> Any:
-        """What ``work`` gives; None where it fails, which is a finding unless only ground truth is missing."""
+        """Result of ``work``; None if it fails, which is a finding unless only ground truth is missing."""
         try:
             return work()
         except GroundTruthMissing:
@@ -193,7 +193,7 @@ class _Findings:
             return None
 
     def mentions(self, path: Path) -> bool:
-        """Whether a fault of this file is known; several steps find it and say it in their own words."""
+        """Whether a fault of this file is known; several steps find the same fault and word it differently."""
         parent, name = re.escape(path.parent.name), re.escape(path.name)
         named = re.compile(rf"(?:(?<![\w.-]){parent}/|(?<![\w./-])){name}(?!\w)")
         return any(path.name in text and named.search(text) for _, text in self._findings)
@@ -202,13 +202,13 @@ class _Findings:
         return any(finding.severity == "error" and finding.check in checks for finding in self._findings.values())
 
     def sorted(self) -> tuple[Finding, ...]:
-        """Errors first, then warnings, then notes, each in the order found."""
+        """Errors first, then warnings, then notes, each in the order they were found."""
         return tuple(sorted(self._findings.values(), key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 @contextmanager
 def _warnings_as_findings(findings: _Findings) -> Iterator[None]:
-    """What readers warn of in the block becomes findings, as it becomes part of a run's record."""
+    """Turn warnings that readers log in the block into findings, as runs put them on record."""
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
@@ -223,14 +223,14 @@ def _warnings_as_findings(findings: _Findings) -> Iterator[None]:
 
 
 def _counted_frames(dataset: Dataset, scene: str, findings: _Findings) -> Sequence[Frame] | None:
-    """The frames; None, which is a finding, where they are not as many as the dataset says, or none."""
+    """The frames; None (a finding) if there are none or not as many as the dataset states."""
     try:
         info, frames = dataset.info(scene, 1), dataset.frames(scene, 1)
         if len(frames) != info.n_frames:
-            raise DataError(f"the dataset counts {info.n_frames} frames and gives {len(frames)}")
+            raise DataError(f"the dataset states {info.n_frames} frames but returns {len(frames)}")
         if not len(frames):
             raise DataError("the scene has no frames")
-    except FramesMissing as error:  # nothing that is here is at fault
+    except FramesMissing as error:  # missing, but not faulty
         findings.add(Finding("warning", "frame", "", str(error)))
     except PlugInError:
         raise
@@ -250,7 +250,7 @@ def _positions(n_frames: int, is_sampled: bool) -> Sequence[int]:
 def _read_frames(
     frames: Sequence[Frame], positions: Sequence[int], findings: _Findings, n_threads: int, progress: Progress
 ) -> list[FrameFacts]:
-    """Facts of the frames that can be read; each of the others is named."""
+    """Facts of the readable frames; each unreadable one becomes a finding."""
 
     def read(position: int) -> FrameFacts | Exception:
         try:
@@ -274,7 +274,7 @@ def _read_frames(
 
 
 def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
-    """Take over what the dataset itself names, and count it."""
+    """Add the faults that the dataset itself reports; return how many."""
 
     def ask() -> None:
         for line in dataset.problems(scene) if isinstance(dataset, ReportsProblems) else ():
@@ -285,7 +285,7 @@ def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
 
 
 def _check_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], findings: _Findings) -> None:
-    """Whether depth and poses agree between frames; asked only where each of them is usable by itself."""
+    """Check whether depth and poses agree between frames, if each is usable by itself."""
     if findings.has_error(("pose", "intrinsics", "size")):
         return
     verdict = findings.attempt("convention", lambda: judge_scene(dataset, scene, frames))
@@ -296,7 +296,7 @@ def _check_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], fin
 def _check_up_axis(
     dataset: Dataset, scene: str, facts: Sequence[FrameFacts], frames: Sequence[Frame], findings: _Findings
 ) -> WorldUp | None:
-    """Which axis points up; a warning where z is taken to, and the frames show another."""
+    """Which axis points up; a warning if z is assumed but the frames show another axis."""
     poses = np.array([frame.camera_to_world for frame in facts])
     up: WorldUp | None = findings.attempt(
         "up", lambda: dataset.up(scene) if isinstance(dataset, ProvidesUpAxis) else guess_up(poses, frames)
@@ -307,7 +307,7 @@ def _check_up_axis(
 
 
 def _check_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:
-    """Name every file that is missing, empty or unreadable, and with ``decode`` every damaged image."""
+    """Report every file that is missing, empty or unreadable and, with ``decode``, every damaged image."""
     for path in files:
         name = f"{path.parent.name}/{path.name}"
         reason = _fault_of_file(path, name, decode)
@@ -319,7 +319,7 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
     try:
         if decode and path.suffix.lower() in IMAGE_SUFFIXES:
             content = read_bytes(path, name)
-            is_depth = path.suffix.lower() == ".pgm" or content[24:26] == b"\x10\x00"  # a PNG of one channel, 16 bits
+            is_depth = path.suffix.lower() == ".pgm" or content[24:26] == b"\x10\x00"  # a 16-bit PNG with one channel
             (decode_depth if is_depth else decode_colour)(content, name)
             return None
         with opened(path) as stream:
@@ -335,7 +335,7 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
 def _check_ground_truth(
     dataset: Dataset, scene: str, findings: _Findings
 ) -> tuple[tuple[TruthVariant, ...], GroundTruth | None]:
-    """What there is of every variant, and the first one that is here."""
+    """Counts of every ground-truth variant, and the first one available."""
     rows: list[TruthVariant] = []
     known = None
     for variant in getattr(dataset, "variants", ()):

@@ -1,6 +1,6 @@
-"""What can be wrong with the frames of a scene and with how they lie to its ground truth, as findings.
+"""Checks of a scene's frames and of their alignment with its ground truth, as findings.
 
-The checks know no dataset: they take what was measured of each frame, and the points of the truth.
+The checks know no dataset: they use the measurements of each frame, and the points of the ground truth.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from su3d_bench.core.geometry import RIGID_TOLERANCE
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, ObjectBoxes
 
 Severity = Literal["error", "warning", "note"]
-DEPTH_STEP = 4  # statistics look at every 4th row and column
-SEEN_POINTS = 300  # points kept of a frame, to be held against the truth
+DEPTH_STEP = 4  # statistics use every 4th row and column
+SEEN_POINTS = 300  # points kept per frame, to compare with the ground truth
 PLAUSIBLE_MEDIAN_DEPTH_M = (0.2, 20.0)  # indoors; depth sensors begin at about 0.2 m
-PLAUSIBLE_FAR_DEPTH_M = 20.0  # of 99 of 100 pixels; halls aside, rooms end before
-LITTLE_DEPTH, LITTLE_DEPTH_OF_SCENE = 0.05, 0.3  # shares of pixels with a depth
-BLACK_BELOW = 8  # of 255; a covered lens and the noise of its sensor stay below
+PLAUSIBLE_FAR_DEPTH_M = 20.0  # 99th percentile; rooms are smaller, except halls
+LITTLE_DEPTH, LITTLE_DEPTH_OF_SCENE = 0.05, 0.3  # shares of pixels with a depth, of a frame and of a scene
+BLACK_BELOW = 8  # of 255; sensor noise under a covered lens stays below
 PLAUSIBLE_WALK_M = 100.0
-CAMERA_SLACK_M = 1.0  # scans end below the ceiling, and whoever scans stands in a doorway
-CAMERAS_OUTSIDE = (0.05, 0.5)  # shares that are a warning and an error
+CAMERA_SLACK_M = 1.0  # scans end below the ceiling, and the operator may stand in a doorway
+CAMERAS_OUTSIDE = (0.05, 0.5)  # shares at which to warn and to fail
 MEETING_DISTANCE_M = 0.05
-# Shares of seen points near the truth. A right scene has 0.8 and more (a truth may leave out windows and what lies
-# behind a door), a wrong unit or frame of reference 0.0 to 0.2, because a room is crowded.
+# Shares of seen points near the ground truth. A correct scene has at least 0.8 (ground truth may lack windows and what
+# is behind a door), a wrong unit or frame of reference 0.0 to 0.2, because a room is crowded.
 POINTS_MEETING = (0.6, 0.3)
 SEARCHED_TRUTH_POINTS, SEARCHED_SEEN_POINTS = 1_000_000, 20_000
-# Ratios between the units that depth images are written in: 1000, 5000, 4000, 6553.5 and 256 a metre.
+# Ratios between common depth units: 1000, 5000, 4000, 6553.5 and 256 per metre.
 UNITS_PER_METRE = (1000.0, 5000.0, 4000.0, 6553.5, 256.0)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found: ``check`` says which kind, ``where`` which frame or file (empty: the scene)."""
+    """A finding of a check: ``check`` is its kind, ``where`` the frame or file (empty: the scene)."""
 
     severity: Severity
     check: str
@@ -49,8 +49,8 @@ class Finding:
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """What is kept of a frame: depth at its 1st, 50th and 99th percentile (0 where it has none), ``seen`` (n, 3) m in
-    the camera's own frame of reference, and a key that repeated images share."""
+    """Statistics of a frame: depth at its 1st, 50th and 99th percentile (0 if it has none), ``seen`` (n, 3) m in
+    camera coordinates, and a key that repeated images share."""
 
     index: int
     width: int
@@ -69,7 +69,7 @@ class FrameFacts:
 
 @dataclass(frozen=True)
 class Meeting:
-    """How many of the seen points lie within ``distance_m`` of the truth, and what would bring them there."""
+    """Number of seen points within ``distance_m`` of the ground truth, and a hint on what would align them."""
 
     share: float
     distance_m: float
@@ -77,7 +77,7 @@ class Meeting:
 
 
 def facts_of(frame: Frame) -> FrameFacts:
-    """What the checks need of ``frame``, small enough to keep for every frame of a scene."""
+    """Measurements of ``frame`` for the checks, small enough to keep for every frame of a scene."""
     depth = frame.depth_m
     is_valid = np.isfinite(depth) & (depth > 0)
     sample = depth[::DEPTH_STEP, ::DEPTH_STEP]
@@ -116,7 +116,7 @@ def _seen_points(frame: Frame, is_valid: Any) -> Float32Array:
 
 
 def check_frames(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    """Findings of the frames by themselves: poses, sizes, intrinsics, depth, colour, motion."""
+    """Findings on the frames alone: poses, sizes, intrinsics, depth, colour, motion."""
     if not frames:
         return
     size = Counter((frame.width, frame.height) for frame in frames).most_common(1)[0][0]
@@ -125,11 +125,11 @@ def check_frames(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
             yield from (Finding("error", kind, f"frame {frame.index}", text) for kind, text in check(frame))
     n_odd = sum(not np.allclose(frame.intrinsics, frames[0].intrinsics) for frame in frames)
     if n_odd:
-        yield Finding("note", "intrinsics", "", f"{n_odd} of {len(frames)} frames have intrinsics of their own")
+        yield Finding("note", "intrinsics", "", f"{n_odd} of {len(frames)} frames have different intrinsics")
     yield from _depth(frames)
     for frame in frames:
         if frame.is_black:
-            yield Finding("warning", "colour", f"frame {frame.index}", "colour is black; the frame shows nothing")
+            yield Finding("warning", "colour", f"frame {frame.index}", "the colour image is black")
     yield from _motion(frames)
 
 
@@ -137,7 +137,7 @@ def _pose(frame: FrameFacts) -> Iterator[tuple[str, str]]:
     if not np.isfinite(frame.camera_to_world).all():
         yield "pose", "the pose is not finite; fix the trajectory"
     elif (reason := _not_rigid_reason(frame.camera_to_world)) is not None:
-        yield "pose", f"the pose is no rigid motion: {reason}; expected camera-to-world with last row 0 0 0 1"
+        yield "pose", f"the pose is not a rigid motion: {reason}; expected camera-to-world with last row 0 0 0 1"
 
 
 def _not_rigid_reason(pose: Float64Array) -> str | None:
@@ -145,7 +145,7 @@ def _not_rigid_reason(pose: Float64Array) -> str | None:
     with np.errstate(over="ignore", invalid="ignore"):
         off = float(np.abs(np.einsum("ij,kj->ik", rotation, rotation) - np.eye(3)).max())
         if not off < RIGID_TOLERANCE:
-            return f"its rows are off the unit length or the right angle by {off:.2g}"
+            return f"its rows deviate from orthonormal by {off:.2g}"
         if np.linalg.det(rotation) < 0:
             return "it mirrors"
         if not np.abs(pose[3] - (0, 0, 0, 1)).max() < RIGID_TOLERANCE:
@@ -156,7 +156,7 @@ def _not_rigid_reason(pose: Float64Array) -> str | None:
 def _size(frame: FrameFacts, common: tuple[int, int]) -> Iterator[tuple[str, str]]:
     if (frame.width, frame.height) != common:
         sizes = f"{frame.width}x{frame.height}, most frames are {common[0]}x{common[1]}"
-        yield "size", f"is {sizes}; all must have one size"
+        yield "size", f"is {sizes}; all frames must have one size"
 
 
 def _intrinsics(frame: FrameFacts) -> Iterator[tuple[str, str]]:
@@ -172,39 +172,39 @@ def _depth(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     for frame in frames:
         where = f"frame {frame.index}"
         if frame.has_odd_depth:
-            yield Finding("error", "depth", where, "depth holds values that are negative or not finite; 0 is invalid")
+            yield Finding("error", "depth", where, "depth has negative or non-finite values; use 0 for invalid depth")
         if frame.valid_share == 0:
             yield Finding("error", "depth", where, "depth is empty, no pixel is above 0 m; drop the frame")
         elif frame.valid_share < LITTLE_DEPTH:
-            yield Finding("warning", "depth", where, f"only {frame.valid_share:.1%} of the pixels have a depth")
+            yield Finding("warning", "depth", where, f"only {frame.valid_share:.1%} of the pixels have depth")
     with_depth = [frame for frame in frames if frame.valid_share > 0]
     if not with_depth:
         return
     share = float(np.median([frame.valid_share for frame in with_depth]))
     if share < LITTLE_DEPTH_OF_SCENE:
-        yield Finding("warning", "depth", "", f"in most frames less than {share:.0%} of the pixels have a depth")
+        yield Finding("warning", "depth", "", f"in most frames less than {share:.0%} of the pixels have depth")
     median, (low, high) = float(np.median([frame.median_m for frame in with_depth])), PLAUSIBLE_MEDIAN_DEPTH_M
     if not low <= median <= high:
-        text = f"the median depth is {median:.3g} m, indoors it is {low:g} to {high:g} m; is the depth scale right?"
+        text = f"the median depth is {median:.3g} m, expected {low:g} to {high:g} m indoors; check the depth scale"
         yield Finding("error", "depth-scale", "", text)
         return
     far = [frame for frame in with_depth if frame.far_m > PLAUSIBLE_FAR_DEPTH_M]
     if far:
         text = (
             f"in {len(far)} of {len(frames)} frames depth reaches {max(frame.far_m for frame in far):.3g} m, first "
-            f"frame {far[0].index}; indoors such a value stands for no depth (rgbd.toml names it in depth_invalid)"
+            f"frame {far[0].index}; indoors such a value usually means no depth (set depth_invalid in rgbd.toml)"
         )
         yield Finding("warning", "depth", "", text)
 
 
 def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    """Cameras that do not move, images that repeat, walks of a length that no room has."""
+    """Cameras that do not move, repeated images, trajectories too long for a room."""
     poses = np.array([frame.camera_to_world for frame in frames if np.isfinite(frame.camera_to_world).all()])
     if len(poses) > 1 and (poses == poses[0]).all():
-        yield Finding("warning", "motion", "", f"all {len(poses)} frames have one pose; the camera stands still")
+        yield Finding("warning", "motion", "", f"all {len(poses)} frames have the same pose; the camera does not move")
     repeats = [b.index for a, b in itertools.pairwise(frames) if a.image_key == b.image_key]
     if repeats:
-        text = f"{len(repeats)} frames repeat the images of the frame before, first frame {repeats[0]}"
+        text = f"{len(repeats)} frames repeat the images of the previous frame, first frame {repeats[0]}"
         yield Finding("warning", "motion", "", text)
     extent = float(np.ptp(poses[:, :3, 3], axis=0).max()) if len(poses) else 0.0
     if extent > PLAUSIBLE_WALK_M:
@@ -214,15 +214,15 @@ def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
 def check_truth(
     frames: Sequence[FrameFacts], truth_points: Float32Array, boxes: ObjectBoxes | None = None
 ) -> tuple[Meeting | None, list[Finding]]:
-    """How far frames and truth meet, and what does not; nothing is held against a truth without points.
+    """How well frames and ground truth align, and the findings; ground truth without points is only reported.
 
-    Of objects known by their ``boxes`` alone what is inside one of them is near, not what is near a point.
+    For objects known only by their ``boxes``, points inside a box count as near, not points near a point.
     """
     usable = [frame for frame in frames if np.isfinite(frame.camera_to_world).all()]
     if not len(truth_points):
         return None, [Finding("error", "truth", "", "the ground truth has no points")]
     if not np.isfinite(truth_points).all():
-        return None, [Finding("error", "truth", "", "the ground truth holds points that are not finite")]
+        return None, [Finding("error", "truth", "", "the ground truth has non-finite points")]
     seeing = [frame for frame in usable if len(frame.seen)]
     meeting = _meeting(seeing, _nearness_to_points(truth_points) if boxes is None else _nearness_to_boxes(boxes))
     do_meet = meeting is not None and meeting.share >= POINTS_MEETING[0]
@@ -238,7 +238,7 @@ def check_truth(
 
 
 def _cameras(frames: Sequence[FrameFacts], truth_points: Float32Array, do_meet: bool) -> Iterator[Finding]:
-    """Cameras outside the truth's box; where all the same what they see is the truth, that is no error."""
+    """Cameras outside the ground truth's box; not an error if what they see still matches the ground truth."""
     if not frames:
         return
     low = truth_points.min(axis=0).astype(np.float64) - CAMERA_SLACK_M
@@ -263,7 +263,7 @@ def _box_text(low: Float64Array, high: Float64Array) -> str:
 
 
 def _apart(frames: Sequence[FrameFacts], truth_points: Float32Array) -> str:
-    """A clause where the boxes of both clouds do not even touch."""
+    """A clause if the boxes of both clouds do not overlap."""
     seen = _placed(frames, lambda facts: facts.camera_to_world, np.ones(3))
     if (seen.min(axis=0) <= truth_points.max(axis=0)).all() and (seen.max(axis=0) >= truth_points.min(axis=0)).all():
         return ""
@@ -300,8 +300,8 @@ def _meeting(frames: Sequence[FrameFacts], truth: Nearness) -> Meeting | None:
 
 
 def _spacing(tree: Any) -> float:
-    """Usual distance of a vertex to the next one: seen points between those of a coarse mesh are near its surface,
-    though not near a vertex. Vertices at one place, as faces that share none have, are one."""
+    """Typical distance from a vertex to the next: points seen between those of a coarse mesh are near its surface
+    but not near a vertex. Vertices at the same position (faces that share none) count once."""
     distance, _ = tree.query(tree.data[:: max(1, tree.n // 500)], k=min(9, tree.n))
     distance = np.reshape(distance, (-1, min(9, tree.n)))
     nearest = np.where(distance > 1e-6, distance, np.inf).min(axis=1)
@@ -309,14 +309,14 @@ def _spacing(tree: Any) -> float:
 
 
 def _hint(share: Any, as_given: float) -> str:
-    """The usual mistakes turned round: a clause on the one that brings the points to the truth, or nothing."""
+    """Try to undo common mistakes: a clause on the one that aligns the points with the ground truth, or nothing."""
     tries = {
         "with the poses inverted": share(lambda facts: _inverse(facts.camera_to_world), np.ones(3)),
         "with camera axes of OpenGL": share(lambda facts: facts.camera_to_world, np.array([1.0, -1.0, -1.0])),
     }
     factors = {a / b for a in UNITS_PER_METRE for b in UNITS_PER_METRE if a != b}
     for factor in sorted(factors):
-        tries[f"with the depth times {factor:.4g}"] = share(lambda facts: facts.camera_to_world, np.full(3, factor))
+        tries[f"with depth times {factor:.4g}"] = share(lambda facts: facts.camera_to_world, np.full(3, factor))
     best = max(tries, key=lambda name: tries[name])
     is_better = tries[best] >= max(POINTS_MEETING[0], 2 * as_given)
     return f"; {best} it is {tries[best]:.0%}" if is_better else ""
@@ -330,7 +330,7 @@ def _inverse(pose: Float64Array) -> Float64Array:
 
 
 def _placed(frames: Sequence[FrameFacts], pose_of: Any, factors: Float64Array) -> Float64Array:
-    """World points (n, 3) of what the frames see, their camera coordinates multiplied by ``factors``."""
+    """World points (n, 3) that the frames see, with camera coordinates multiplied by ``factors``."""
     frames = [frame for frame in frames if len(frame.seen)]
     if not frames:
         return np.zeros((1, 3))

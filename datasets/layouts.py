@@ -1,4 +1,4 @@
-"""The layouts in which a scanned dataset can be written as files, by the names of ``--layout``."""
+"""Layouts in which scenes can be written as files, by the names of ``--layout``."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Made rooms, written as files in another dataset's layout: resumed after a kill, whole or not at all.
+"""Generated rooms, written as files in another dataset's layout: atomic, and resumable after a kill.
 
-A scene is built in a hidden folder beside its place and moved there when it is whole; a killed process leaves frames
-that the next one takes over, and no scene that looks finished. ``rooms.json`` in the folder of the scenes names those
-that were made here, each with the key of what it was made from.
+A scene is built in a hidden folder next to its destination and moved there when complete; a killed process leaves
+frames that the next one reuses, and no incomplete scene. ``rooms.json`` in the folder of the scenes lists those
+that were generated here, each with the key of its inputs.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneTarget:
-    """One scene to be made, under the ``key`` of what it is made from.
+    """A scene to generate, under the ``key`` of its inputs.
 
-    ``folder`` bears the scene's name in the layout. ``frames`` is the name in it of what holds the frames; where that
-    is one file, it is written whole. ``truth`` are the other files without which the scene is not whole. ``apart`` are
-    files and folders with a place outside ``folder``, each with its name while the scene is built.
+    ``folder`` is named after the scene. ``frames`` is the path in it that contains the frames; if that
+    is a single file, it is written atomically. ``truth``: other files required for completeness. ``apart``:
+    files and folders with a destination outside ``folder``, each with its name while the scene is built.
     """
 
     scene: str
@@ -45,7 +45,7 @@ class SceneTarget:
 
     @property
     def partial(self) -> Path:
-        """Where the scene is built; it bears the key, so that frames of another making are never taken over."""
+        """Where the scene is built; named by the key, so that frames from other inputs are never reused."""
         return self.folder.with_name(f".{self.folder.name}.{self.key[:12]}.partial")
 
     @property
@@ -58,10 +58,10 @@ class SceneTarget:
 
 
 class Layout(ABC):
-    """How the scenes of one dataset are named, and how their frames and their truth are written.
+    """How the scenes of one dataset are named, and how their frames and ground truth are written.
 
-    ``name`` is that of ``--layout``, ``reader`` the dataset that reads it. ``settings`` is what moves a byte of a scene
-    besides the scene itself, the layout's version first.
+    ``name`` is the value of ``--layout``, ``reader`` the dataset that reads it. ``settings`` affect the bytes written
+    for a scene; the layout's version comes first.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Layout(ABC):
     def scenes_folder(self, out: Path) -> Path: ...
 
     def scene_name(self, scene: str) -> str:
-        """What the scene is called in the layout; a ``DataError`` where it has no name for it."""
+        """The scene's name in the layout; a ``DataError`` if it has none."""
         return scene
 
     @abstractmethod
@@ -80,11 +80,11 @@ class Layout(ABC):
 
     @abstractmethod
     def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
-        """Write what all scenes share; a ``StoreError`` where there is another."""
+        """Write the files shared by all scenes; a ``StoreError`` if they exist with other content."""
 
     @abstractmethod
     def frame_names(self, index: int) -> Sequence[str]:
-        """The files of a frame, by their names in the folder in which the scene is built."""
+        """The files of a frame, relative to the folder in which the scene is built."""
 
     @abstractmethod
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
@@ -92,17 +92,17 @@ class Layout(ABC):
 
     @abstractmethod
     def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
-        """Write all files but those of the frames into ``target.partial``."""
+        """Write all files except those of the frames into ``target.partial``."""
 
-    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have a file a frame
-        """Make in ``target.partial`` what takes all frames at once; called when the rest is written."""
+    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have one file per frame
+        """Create in ``target.partial`` the file for all frames; called after everything else is written."""
 
 
 def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
-    """The scenes that are not yet whole below ``out``, which is made ready for them; one caller at a time.
+    """The incomplete scenes below ``out``, which is prepared for them; one caller at a time.
 
-    Raises ``StoreError`` where ``out`` cannot be written or holds one of the scenes, or what they share, from
-    elsewhere.
+    Raises ``StoreError`` if ``out`` is not writable or contains one of the scenes, or a shared file, from
+    another source.
     """
     folder = layout.scenes_folder(out)
     make_folder(folder)
@@ -111,14 +111,14 @@ def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path
     for target in targets:
         if target.folder.exists() and marked.get(target.folder.name) != target.key:
             raise StoreError(
-                f"{target.folder}: holds another '{target.folder.name}', made elsewhere or with other options; delete "
+                f"{target.folder}: is another '{target.folder.name}', created elsewhere or with other options; delete "
                 "it or choose another folder with --out"
             )
         strange = next(
             (place for _, place in target.apart if place.exists() and target.folder.name not in marked), None
         )
         if strange is not None:
-            raise StoreError(f"{strange}: is there already and was made elsewhere; choose another folder with --out")
+            raise StoreError(f"{strange}: exists already and was created elsewhere; choose another folder with --out")
     pending = [target for target in targets if not target.is_whole]
     if not pending:
         return []
@@ -133,9 +133,9 @@ def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path
 
 
 def write_shared_text(path: Path, text: str, complaint: str) -> None:
-    """Write a file that all scenes share; where it is there with another content, a ``StoreError`` that says so."""
+    """Write a file shared by all scenes; a ``StoreError`` if it exists with other content."""
     if path.exists() and file_text(path, errors="replace") != text:
-        raise StoreError(f"{path}: {complaint}, and all scenes of a folder share one; choose another folder with --out")
+        raise StoreError(f"{path}: {complaint}, but all scenes of a folder share it; choose another folder with --out")
     write_text(path, text)
 
 
@@ -146,7 +146,7 @@ def write_frames(
     indices: range,
     report: Callable[[int], None] = lambda n_done: None,
 ) -> None:
-    """The files of the frames at ``indices``; those that an earlier process has written are kept."""
+    """The files of the frames at ``indices``; those written by an earlier process are kept."""
     if target.has_frames:
         return
     for folder in {(target.partial / name).parent: None for name in layout.frame_names(0)}:
@@ -161,7 +161,7 @@ def write_frames(
 
 
 def finish_scene(layout: Layout, dataset: Rooms, target: SceneTarget) -> None:
-    """Move everything to its place, the scene's folder last: only then is there a scene."""
+    """Move everything to its destination, the scene's folder last, so that only complete scenes appear."""
     try:
         layout.join(dataset, target)
         for name, place in target.apart:

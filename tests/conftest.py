@@ -1,4 +1,4 @@
-"""Where the tests keep their files, and what they share."""
+"""Folders and fixtures shared by the tests."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ TESTS = Path(__file__).resolve().parent
 MEMORY = Path("/dev/shm")
 MAX_KEPT_BYTES = 4 << 30
 
-# The table of readers to damage takes its samples from the tests of those readers.
+# The table of readers to damage uses samples from the tests of those readers.
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 from chat_server import ChatServer  # noqa: E402 (it is found by the line above)
 from painted_runs import see_painted  # noqa: E402
 from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
 
-# Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
+# Tables wrap if a terminal width is set, as pytest-xdist does for its workers.
 os.environ.pop("COLUMNS", None)
 
-# Every file of a run is brought to the disk before it counts; thousands of small runs would wait for nothing else.
+# Every file of a run is flushed to disk before it counts; thousands of small runs would wait only for this.
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MAX_KEPT_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
@@ -33,14 +33,14 @@ if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# No test fails because the machine was slow, be it in the test or in drawing what it is given.
+# Tests never fail because of a slow machine, including the generation of examples.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")
 def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data root for the whole session, of all its processes: a room that one test renders is there for the others."""
+    """A data root for the session, shared by all its processes: a room rendered by one test is available to others."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms-data"
     folder.mkdir(exist_ok=True)
@@ -49,7 +49,7 @@ def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def painted_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, where this process sees painted scenes."""
+    """A working folder in which this process finds painted scenes."""
     see_painted(monkeypatch)
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
@@ -58,7 +58,7 @@ def painted_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def data_to_spoil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], Path]:
-    """Copies a folder of data to ``data``, where a test may spoil it, and makes it the data root; its path."""
+    """Copies a folder of data to ``data``, where a test may damage it, and makes it the data root; its path."""
 
     def copied(whole: Path) -> Path:
         shutil.copytree(whole, tmp_path / "data")
@@ -78,20 +78,20 @@ def chat_of_module() -> Iterator[ChatServer]:
 
 @pytest.fixture
 def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
-    """A language model's server as it was before any question; the test says what it answers."""
+    """A language model's server without recorded requests; the test sets its answers."""
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
     chat_of_module.forget()
     return chat_of_module
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than cores: tests wait for processes, browsers and servers."""
+    """One more than the cores: tests wait for processes, browsers and servers."""
     return len(os.sched_getaffinity(0)) + 1
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Where several processes share the work, each takes whole files: what the tests of a file share is made once."""
+    """If several processes share the work, each takes whole files: fixtures of a file are created once."""
     if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
         config.option.dist = "loadfile"
-        config.option.loadscopereorder = False  # files of few tests, which may be slow ones, would come last
+        config.option.loadscopereorder = False  # files with few, possibly slow tests would come last

@@ -1,4 +1,4 @@
-"""The shape of the code base: who may import whom, what stays light, what the package holds."""
+"""The structure of the code base: import rules, lightweight modules, content of the package."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from places import ROOT
 
 CODE = [path for module, path in code_files().items() if module.startswith("su3d_bench")]
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
-LATE = ("compiled.py", "torch_towers.py")  # they are imported late as a whole, as kernels are
+LATE = ("compiled.py", "torch_towers.py")  # imported lazily as a whole, like kernels
 
 
-def test_folders_stand_on_at_most_ten_layers_without_a_cycle() -> None:
+def test_folders_form_at_most_ten_layers_without_a_cycle() -> None:
     found = layers(folder_imports())
     assert len(found) <= 10, found
     assert found[0] == {"core"}
 
 
-def test_no_files_import_each_other_in_a_circle() -> None:
+def test_no_files_import_each_other_in_a_cycle() -> None:
     layers(imports())
 
 
-def test_every_folder_has_its_purpose() -> None:
+def test_every_folder_has_a_purpose() -> None:
     assert set(PURPOSE) == folder_imports().keys() - {"su3d_bench", "__main__", "benchmarks", ".ci"}
     assert len(PURPOSE) <= 20
 
 
-def test_every_import_counts() -> None:
+def test_every_kind_of_import_counts() -> None:
     for line in (
         "from su3d_bench.cli import main",
         "import su3d_bench.cli.main",
@@ -59,7 +59,7 @@ def test_every_import_counts() -> None:
         layers({"a": set(), "b": {"a", "c"}, "c": {"b"}})
 
 
-def test_heavy_packages_are_imported_where_they_are_used() -> None:
+def test_heavy_packages_are_imported_only_where_used() -> None:
     for path in CODE:
         if "training" in path.parts or "kernels" in (path.stem, path.parent.name) or path.name in LATE:
             continue
@@ -71,7 +71,7 @@ def test_heavy_packages_are_imported_where_they_are_used() -> None:
 
 
 @pytest.mark.parametrize("name", LINKED)
-def test_root_folders_are_reached_through_links_only(name: str) -> None:
+def test_root_folders_are_reached_only_through_links(name: str) -> None:
     link = PACKAGE / name
     assert link.is_symlink()
     assert link.readlink() == Path("..") / name
@@ -94,7 +94,7 @@ def test_every_folder_with_code_or_data_is_packaged() -> None:
     assert [name for name in data if not any(fnmatch(name, pattern) for pattern in patterns)] == []
 
 
-def test_the_harness_names_no_dataset_and_no_baseline() -> None:
+def test_harness_names_no_dataset_and_no_baseline() -> None:
     """A metric may be named after its origin (``F1-conceptgraphs``)."""
     names = re.compile(
         r"replica|scannet|rgbd|\btum\b|conceptfusion|(?<!F1-)conceptgraphs|openmask3d|sam3d", re.IGNORECASE
@@ -104,6 +104,6 @@ def test_the_harness_names_no_dataset_and_no_baseline() -> None:
     assert [path for path in files if names.search(path.read_text())] == [PACKAGE / "core" / "registry.py"]
 
 
-def test_the_page_of_the_architecture_is_what_the_code_is() -> None:
+def test_architecture_page_matches_the_code() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert page_with(drawn(), page) == page, "run: make architecture"

@@ -1,4 +1,4 @@
-"""The check of the code's size."""
+"""The check of code size."""
 
 from __future__ import annotations
 

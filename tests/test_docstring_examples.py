@@ -1,4 +1,4 @@
-"""The examples in the docstrings hold."""
+"""The examples in the docstrings are correct."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import importlib
 import pytest
 from places import ROOT
 
-RUN_OPTIONS = {"su3d_bench.analysis.comparison"}  # their examples name a run that a user has
+RUN_OPTIONS = {"su3d_bench.analysis.comparison"}  # their examples use a user's run
 PACKAGES = ("analysis", "evaluation", "metrics", "reports")
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_the_examples_in_the_docstrings_hold(package: str) -> None:
+def test_examples_in_docstrings_are_correct(package: str) -> None:
     files = sorted((ROOT / "su3d_bench" / package).rglob("*.py"))
     with_examples = [file for file in files if ">>> " in file.read_text(encoding="utf-8")]
     names = {".".join(file.relative_to(ROOT).with_suffix("").parts) for file in with_examples} - RUN_OPTIONS

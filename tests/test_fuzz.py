@@ -1,4 +1,4 @@
-"""Damage for the readers of the table of targets; ``python benchmarks fuzz`` is the long mode of the same."""
+"""Damaged input for all readers in the table of targets; ``python benchmarks fuzz`` is the long version."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from su3d_bench.core.files.atomic import DAMAGE, read_arrays, read_json
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.store.predictions import read_prediction
 
-N_INPUTS = 10  # of each reader, beside a pipe and the like; python benchmarks fuzz draws many more
+N_INPUTS = 10  # per reader, besides pipes and the like; python benchmarks fuzz uses many more
 USUAL = (
     *("prediction scannet-text", "prediction openmask3d", "prediction conceptgraphs", "prediction hovsg"),
     *("prediction su3d-bench", "file ascii.ply", "file binary_compressed.pcd", "file a.png", "file a.npz"),
     *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.xlsx", "archive a.tar.gz"),
 )
-N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of words behind each verb
-# A verb whose work could begin with nothing more than its name ends with words that keep it from that.
+N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of random arguments per verb
+# A verb that could start work with its name only gets arguments that prevent this.
 HELD_BACK = {"run": ["--scenes", "replica/none", "--dry-run"], "ablate": ["--scenes", "replica/none", "--dry-run"]}
 HELD_BACK |= {"questions": ["--scenes", "replica/none"], "make": ["--scenes", "none/none", "--out", "folder/out"]}
 
@@ -45,10 +45,8 @@ def _own_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.proof) for name in TARGETS]
 )
-def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_memory(
-    name: str, tmp_path: Path
-) -> None:
-    """So it does where a pipe or a device stands in place of the file."""
+def test_reader_meets_damage_only_with_typed_errors_quickly_in_little_memory(name: str, tmp_path: Path) -> None:
+    """This also applies to a pipe or device in place of the file."""
     sample = Sample(TARGETS[name], tmp_path / "sample")
     with bounded_addresses(MAX_ADDRESSES_BYTES):
         sample.read()  # the sample itself is fine
@@ -59,7 +57,7 @@ def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_
 
 
 @pytest.mark.parametrize("words", [words for words, _ in verbs()], ids=" ".join)
-def test_any_words_behind_a_verb_are_done_or_declined_in_one_line(words: tuple[str, ...]) -> None:
+def test_random_arguments_never_give_a_traceback(words: tuple[str, ...]) -> None:
     for name, text in (("a.toml", "[method.opensu3d]\ntop_m = 3\n"), ("a.json", json.dumps({"a": 1}))):
         Path(name).write_text(text)
     Path("a.csv").write_text("a,b\n1,2\n")
@@ -80,7 +78,7 @@ NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a 
 
 
 def npz(folder: Path, header: str, body: bytes = b"") -> Path:
-    """An archive of one array, which says of itself what ``header`` says."""
+    """An archive of one array described by ``header``."""
     text = header.encode().ljust(117) + b"\n"
     member = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
     with zipfile.ZipFile(folder / "a.npz", "w") as archive:
@@ -99,7 +97,7 @@ def npz(folder: Path, header: str, body: bytes = b"") -> Path:
         ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", b"\x80\x04N."),
     ],
 )
-def test_no_header_of_an_array_is_believed(tmp_path: Path, header: str, body: bytes) -> None:
+def test_array_headers_are_never_trusted(tmp_path: Path, header: str, body: bytes) -> None:
     path = npz(tmp_path, header, body)
     with pytest.raises(DAMAGE):
         read_arrays(path)
@@ -108,7 +106,7 @@ def test_no_header_of_an_array_is_believed(tmp_path: Path, header: str, body: by
 
 
 @pytest.mark.parametrize("text", [DEEP, '{"a":' * 50_000, f'{{"a": {LONG}}}'])
-def test_a_record_nested_or_numbered_beyond_reason_is_refused(tmp_path: Path, text: str) -> None:
+def test_record_nested_or_numbered_excessively_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(StoreError, match=r"run\.json: not readable as JSON"):
         read_json(tmp_path / "run.json")
@@ -123,7 +121,7 @@ def test_a_record_nested_or_numbered_beyond_reason_is_refused(tmp_path: Path, te
         ("scores", np.zeros(1, np.complex64)),
     ],
 )
-def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+def test_prediction_with_a_field_of_another_kind_is_rejected(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
     file = tmp_path / "prediction.npz"
     arrays = {"kind": np.array("Instances"), "points": np.zeros((3, 3), np.float32), name: array}
     np.savez(file, **arrays)  # type: ignore[arg-type]
@@ -141,7 +139,7 @@ def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, na
         ("score", np.full(30, np.nan)),
     ],
 )
-def test_counts_of_another_kind_shape_or_range_are_damaged(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+def test_counts_of_another_kind_shape_or_range_are_rejected(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
     file = copied_run(tmp_path) / "scenes" / "painted.a" / "collector" / "counts.npz"
     arrays = read_arrays(file) | {f"rooms-instance/{name}": array}
     np.savez(file, **arrays)  # type: ignore[arg-type]

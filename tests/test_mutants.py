@@ -1,4 +1,4 @@
-"""The tool that plants faults: what it plants, what it leaves alone, and that it tells a survivor from a killed one."""
+"""The tool that plants faults: which faults, what it skips, and how it distinguishes survivors from killed ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def mutants() -> ModuleType:
     return benchmark_program("mutants")
 
 
-def test_operators_constants_conditions_and_statements_are_mutated_and_texts_and_types_are_not(
+def test_operators_constants_conditions_and_statements_are_mutated_but_not_texts_and_types(
     mutants: ModuleType,
 ) -> None:
     found = [one.after for one in mutants.mutants_of("a.py", SOURCE)]
@@ -58,7 +58,7 @@ def test_operators_constants_conditions_and_statements_are_mutated_and_texts_and
     assert all(one.before in " ".join(SOURCE.split()) for one in mutants.mutants_of("a.py", SOURCE))
 
 
-def test_every_module_has_guards_that_exist_and_every_fault_is_a_program(mutants: ModuleType) -> None:
+def test_every_module_has_existing_guards_and_every_fault_is_a_program(mutants: ModuleType) -> None:
     modules = mutants.modules_of([])
     metrics = {str(path.relative_to(ROOT)) for path in (ROOT / "su3d_bench/metrics").rglob("*.py")}
     assert {path for path in metrics if not path.endswith("__init__.py")} <= set(modules)
@@ -73,7 +73,7 @@ def test_every_module_has_guards_that_exist_and_every_fault_is_a_program(mutants
 
 
 @pytest.mark.proof
-def test_a_fault_that_no_test_sees_survives_and_one_that_a_test_sees_does_not(
+def test_undetected_fault_survives_and_a_detected_one_does_not(
     mutants: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tree = tmp_path / "tree"

@@ -1,4 +1,4 @@
-"""What holds for the tests themselves: names that stay unique, modules that exist, and nobody who sleeps."""
+"""Rules for the tests themselves: unique names, existing modules, no sleeping."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 from places import ROOT, TESTS
 
 FILES = sorted(TESTS.rglob("*.py"))
-# Where time itself is the point: the one loop that waits, a data set and a method that take their time, a program of
-# LibreOffice's own Python, a program whose duration is measured, and programs that are ended.
+# Exceptions where time matters: the one loop that waits, a slow dataset and method, a program of
+# LibreOffice's own Python, a program whose duration is measured, and programs that are killed.
 MAY_SLEEP = {
     "waiting.py",
     "painted.py",
@@ -23,13 +23,13 @@ MAY_SLEEP = {
 }
 
 
-def test_no_two_files_have_one_name() -> None:
-    # Folders of tests are no packages: each file is a module by its name alone.
+def test_no_two_files_have_the_same_name() -> None:
+    # Test folders are not packages: each file is a module by its name only.
     twice = [name for name, n in Counter(file.name for file in FILES).items() if n > 1]
     assert twice == []
 
 
-def test_every_test_that_a_page_names_is_there() -> None:
+def test_every_test_named_on_a_page_exists() -> None:
     there = {name for file in FILES for name in re.findall(r"^def (test_\w+)", file.read_text(), re.MULTILINE)}
     pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").rglob("*.md")]
     code = re.compile(r"`(?:[\w/]+/)?(test_\w+)(?:\.py)?`")
@@ -38,14 +38,14 @@ def test_every_test_that_a_page_names_is_there() -> None:
     assert sorted(one for one in named if one[1] not in there | {file.stem for file in FILES}) == []
 
 
-def test_nobody_waits_by_sleeping() -> None:
+def test_no_test_waits_by_sleeping() -> None:
     assert {file.name for file in FILES if re.search(r"\bsleep\(", file.read_text())} - {
         Path(__file__).name
     } == MAY_SLEEP
 
 
-def test_programs_in_texts_import_what_there_is() -> None:
-    """Imports in the text of a program that a test starts, which no other tool looks at."""
+def test_programs_in_texts_import_existing_names() -> None:
+    """Imports in the text of a program that a test starts, which no other tool checks."""
     names = {
         name
         for file in (*FILES, *(ROOT / "benchmarks").rglob("*.py"))
@@ -55,10 +55,10 @@ def test_programs_in_texts_import_what_there_is() -> None:
     assert sorted(name for name in names if not _exists(name)) == []
 
 
-def test_every_file_of_benchmarks_finds_what_it_imports() -> None:
+def test_every_file_of_benchmarks_finds_its_imports() -> None:
     program = (
         "import importlib, sys; sys.path.insert(0, 'benchmarks/measuring'); import folders\n"
-        "for name in folders.PROGRAMS.keys() - {'kill_program'}:\n"  # that one begins its work when it is imported
+        "for name in folders.PROGRAMS.keys() - {'kill_program'}:\n"  # that one starts working when imported
         "    importlib.import_module(name)"
     )
     ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)

@@ -1,10 +1,10 @@
-"""CLIP and SigLIP encoders, SAM and RAM++ as ONNX files beside a manifest, compared with torch.
+"""Export CLIP and SigLIP encoders, SAM and RAM++ as ONNX files with a manifest, compared with torch.
 
     python tools/export_onnx.py clip-vit-h-14 --out DIR
     python tools/export_onnx.py ram-plus --checkout recognize-anything --python ENVIRONMENT/bin/python --out DIR
 
-Needs the models extra. RAM++ is exported by its authors' own code, which ``--python`` runs in an environment with
-torch 2.13.0, transformers 4.46.3 (5 has lost functions that it imports), onnx 1.18.0 and NumPy 2.2.6.
+Needs the models extra. RAM++ is exported by its authors' code, which ``--python`` runs in an environment with
+torch 2.13.0, transformers 4.46.3 (5 lacks functions that it imports), onnx 1.18.0 and NumPy 2.2.6.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ from su3d_bench.perception.models.masks.sam import (
 )
 from su3d_bench.perception.models.onnx import OnnxManifest, open_session
 
-# 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
+# 17 has LayerNormalization as one operator; newer ones add nothing that our towers use.
 OPSET = 17
-# A protobuf message may hold 2 GiB; what is larger keeps its weights in a file beside it.
+# A protobuf message is limited to 2 GiB; larger models keep their weights in a separate file.
 LARGEST_SINGLE_FILE = 2**31 - 2**24
 
 
 @dataclass(frozen=True)
 class Parity:
-    """How far one output of ONNX Runtime is from torch's on fixed inputs.
+    """Difference of one output of ONNX Runtime from torch's on fixed inputs.
 
-    ``max_abs_difference`` over all values; ``min_cosine`` over the rows along the last axis; rows that are zero on
-    both sides agree.
+    ``max_abs_difference`` over all values; ``min_cosine`` over the rows along the last axis; rows that are zero in
+    both agree.
     """
 
     output: str
@@ -76,7 +76,7 @@ class Parity:
 
 
 def as_module(compute: Callable[..., Any], model: Any) -> Any:
-    """``compute``, which runs parts of ``model``, as a torch module in evaluation mode, which the exporter takes."""
+    """``compute``, which runs parts of ``model``, as a torch module in evaluation mode for the exporter."""
     import torch
 
     class Computing(torch.nn.Module):
@@ -97,10 +97,10 @@ def export_onnx(
     output_names: Sequence[str],
     dynamic_axes: Mapping[str, Mapping[int, str]] | None = None,
 ) -> list[Path]:
-    """Write ``module`` as ``path`` and return the files made: the weights of a large one lie in ``<path>.data``.
+    """Write ``module`` to ``path`` and return the files created: large weights are in ``<path>.data``.
 
-    ``inputs`` are the module's positional arguments in order, by the names that they get. ``dynamic_axes`` names, for
-    inputs and outputs, the axes whose size may differ from that of ``inputs``. The module's own mode is kept; give it
+    ``inputs`` are the module's positional arguments in order, with their input names. ``dynamic_axes`` names, for
+    inputs and outputs, the axes whose size may differ from that of ``inputs``. The module's mode is kept; pass it
     in evaluation mode.
     """
     import torch
@@ -109,9 +109,9 @@ def export_onnx(
     with unfinished_folder(path) as folder:
         draft = folder / path.name
         with _slow_attention(torch), torch.no_grad(), warnings.catch_warnings():
-            # The exporter warns of its own age and of every shape that it takes as constant; parity is what counts.
+            # The exporter warns about its age and every shape that it treats as constant; only parity matters.
             warnings.simplefilter("ignore")
-            # dynamo=False: the newer exporter needs one more package and always splits the file.
+            # dynamo=False: the newer exporter needs another package and always splits the file.
             torch.onnx.export(
                 module,
                 tuple(inputs.values()),
@@ -127,10 +127,10 @@ def export_onnx(
 
 
 def settle(draft: Path, path: Path) -> list[Path]:
-    """Move the exporter's files to where they belong, the many files of a large model's weights as one."""
+    """Move the exporter's files to their destination, merging the many files of a large model's weights."""
     import onnx
 
-    # The weights name their file relative to the model's folder, so the last name is used from the start.
+    # The weights refer to their file relative to the model's folder, so the final name is used from the start.
     data = path.with_name(f"{path.name}.data")
     size = sum(file.stat().st_size for file in draft.parent.iterdir())
     try:
@@ -156,7 +156,7 @@ def settle(draft: Path, path: Path) -> list[Path]:
 
 @contextmanager
 def _slow_attention(torch: Any) -> Iterator[None]:
-    """Without the fused kernel of ``nn.MultiheadAttention``, for which the exporter has no operator."""
+    """Disable the fused kernel of ``nn.MultiheadAttention``, for which the exporter has no operator."""
     before = torch.backends.mha.get_fastpath_enabled()
     torch.backends.mha.set_fastpath_enabled(False)
     try:
@@ -183,7 +183,7 @@ def measure_parity(
 
 
 def compare_outputs(name: str, mine: NDArray[Any], other: NDArray[Any]) -> Parity:
-    """The ``Parity`` of two arrays of one shape."""
+    """The ``Parity`` of two arrays of the same shape."""
     assert mine.shape == other.shape, f"{name}: {mine.shape} and {other.shape}"
     a, b = mine.astype(np.float64), other.astype(np.float64)
     rows_a, rows_b = (array.reshape(-1, array.shape[-1] if array.ndim else 1) for array in (a, b))
@@ -197,7 +197,7 @@ def compare_outputs(name: str, mine: NDArray[Any], other: NDArray[Any]) -> Parit
 def write_manifest(
     kind: type[OnnxManifest], files: ModelFiles, written: Sequence[Path], parity: Sequence[Parity], **own: Any
 ) -> None:
-    """The manifest of the files ``written`` from ``files``, put beside them, with the fields of its kind."""
+    """Write the manifest of the files ``written`` from ``files`` next to them, with the fields of its kind."""
     content = {
         "format": kind.FORMAT,
         "name": files.entry.name,
@@ -213,14 +213,14 @@ def write_manifest(
 # ---- encoders
 
 TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
-# Of features at length 1. ViT-H-14 in float32 agrees to 2e-7; a wrong operator shows in the second decimal.
+# Of unit features. ViT-H-14 in float32 agrees to 2e-7; a wrong operator shows in the second decimal.
 LARGEST_OF_FEATURES = 1e-4
 SMALLEST_COSINE = 0.99999
 PROBES = ("chair", "an image of a tv-screen", "a red cup on the table in a scene")
 
 
 def export_encoder(files: ModelFiles, folder: Path) -> None:
-    """Write the two towers of a transformers model into ``folder``; ``CheckFailed`` where ONNX Runtime disagrees."""
+    """Write the two towers of a transformers model into ``folder``; ``CheckFailed`` if ONNX Runtime disagrees."""
     import torch
 
     spec = towers.transformers_spec(files, "original")
@@ -237,7 +237,7 @@ def export_encoder(files: ModelFiles, folder: Path) -> None:
         kind = name.partition(".")[0]
         inputs = {"pixels" if kind == "image" else "tokens": values}
         axes = {key: {0: "n"} for key in (*inputs, "features")}
-        # two rows are traced and three compared: the number of rows must not be part of the file
+        # two rows are traced and three compared: the number of rows must not be fixed in the file
         traced = {key: value[:2] for key, value in inputs.items()}
         written += export_onnx(tower, traced, folder / name, ["features"], axes)
         with torch.inference_mode():
@@ -252,7 +252,7 @@ def export_encoder(files: ModelFiles, folder: Path) -> None:
 
 
 def check_parity(name: str, parts: Sequence[Parity]) -> None:
-    """Raise ``CheckFailed`` where a tower's features differ by more than the tolerance."""
+    """Raises ``CheckFailed`` if a tower's features differ by more than the tolerance."""
     for parity in parts:
         if parity.max_abs_difference > LARGEST_OF_FEATURES or parity.min_cosine < SMALLEST_COSINE:
             raise CheckFailed(
@@ -285,7 +285,7 @@ LARGEST_OF_MASKS = 1e-3
 
 
 def export_sam(files: ModelFiles, folder: Path) -> None:
-    """Write SAM's encoder and decoder into ``folder``; ``CheckFailed`` where ONNX Runtime disagrees with torch."""
+    """Write SAM's encoder and decoder into ``folder``; ``CheckFailed`` if ONNX Runtime disagrees with torch."""
     import torch
 
     model = load_sam(files, "cpu", "float32").model
@@ -297,7 +297,7 @@ def export_sam(files: ModelFiles, folder: Path) -> None:
     written = export_onnx(encoder, {"pixels": pixels}, folder / ENCODER_FILE, ["embedding"])
     with torch.inference_mode():
         embedding = encoder(pixels).clone()
-    # Two prompts of three points are traced, five of two compared: neither number must be part of the file.
+    # Two prompts of three points are traced, five of two compared: neither number must be fixed in the file.
     traced = {"embedding": embedding, **_prompt_probes(random, side, 2, 3)}
     axes = {name: {0: "n_prompts", 1: "n_points"} for name in ("points", "labels")}
     outputs = {name: {0: "n_prompts"} for name in ("logits", "iou")}
@@ -315,7 +315,7 @@ def export_sam(files: ModelFiles, folder: Path) -> None:
 
 
 def _prompt_probes(random: np.random.Generator, side: int, n_prompts: int, n_points: int) -> dict[str, Any]:
-    """Prompts of points on the object and beside it, of corners, and of no point."""
+    """Prompts with points on and off the object, with corners, and without points."""
     import torch
 
     points = random.uniform(0, side, (n_prompts, n_points, 2)).astype(np.float32)
@@ -334,7 +334,7 @@ def _check_sam(name: str, parity: Parity, largest: float) -> None:
 def modules_to_export(model: Any) -> tuple[Any, Any]:
     """SAM's encoder (pixels -> embedding) and decoder (embedding, points, labels -> logits, iou) as torch modules.
 
-    The decoder gives all four masks: the single one first, then the three of which a caller takes the best.
+    The decoder returns all four masks: the single one first, then the three from which a caller picks the best.
     """
     import torch
 
@@ -360,7 +360,7 @@ def modules_to_export(model: Any) -> tuple[Any, Any]:
 
 
 def embedded_points(prompt_encoder: Any, points: Any, labels: Any) -> tuple[Any, Any]:
-    """What ``transformers``' prompt encoder makes of points and boxes, from labels alone; sparse and dense."""
+    """Output of ``transformers``' prompt encoder for points and boxes, from labels only; sparse and dense."""
     import torch
 
     side, cells = prompt_encoder.input_image_size, prompt_encoder.image_embedding_size
@@ -377,26 +377,26 @@ def embedded_points(prompt_encoder: Any, points: Any, labels: Any) -> tuple[Any,
 # ---- RAM++
 
 REPOSITORY = "https://github.com/xinyu1205/recognize-anything"
-# What of a checkout makes the network; recognize-anything 7cb804a.
+# Files of a checkout that define the network; recognize-anything 7cb804a.
 CODE = (
     *(f"ram/models/{name}.py" for name in ("ram_plus", "bert", "swin_transformer", "utils")),
     "ram/configs/q2l_config.json",
     "ram/configs/swin/config_swinL_384.json",
     *(f"ram/data/ram_tag_list{kind}.txt" for kind in ("", "_chinese", "_threshold")),
 )
-# Of a tag's logit: of its probability a quarter at most, whose thresholds have two decimals.
+# Of a tag's logit: at most a quarter of that in probability, whose thresholds have two decimals.
 LARGEST_OF_LOGITS = 1e-3
 
 
 def export_ram_plus(files: ModelFiles, folder: Path, checkout: Path, python: Path) -> None:
     """Write ``ram_plus.onnx``, its list of tags and the manifest into ``folder``.
 
-    ``checkout``: a clone of recognize-anything, whose code ``python`` runs. Raises ``ConfigError`` where it is none,
-    ``DataError`` for weights that are no table of tensors, and ``CheckFailed`` where the code fails or ONNX Runtime's
-    answers are not those of the authors' ``generate_tag``; then nothing is left in ``folder``.
+    ``checkout``: a clone of recognize-anything, whose code ``python`` runs. Raises ``ConfigError`` if it is not one,
+    ``DataError`` for weights that are not a table of tensors, and ``CheckFailed`` if the code fails or ONNX Runtime's
+    results differ from the authors' ``generate_tag``; then nothing is left in ``folder``.
     """
     check_checkout(checkout)
-    read_weights(files.weights, "meta")  # says in our words what is wrong with the file
+    read_weights(files.weights, "meta")  # reports faults of the file with our messages
     make_folder(folder)
     images = made_images()
     with unfinished_folder(folder / RAM_MODEL) as place:
@@ -407,12 +407,12 @@ def export_ram_plus(files: ModelFiles, folder: Path, checkout: Path, python: Pat
         answers = read_npz(place / "answers.npz")
         expected = tuple(answers[name] for name in ("logit", "tag", "threshold"))
         if expected[0].shape != (len(images), len(tags)):
-            raise CheckFailed(f"ram-plus: {len(tags)} tags are listed, the network answers {expected[0].shape[1:]}")
+            raise CheckFailed(f"ram-plus: {len(tags)} tags are listed, but the network returns {expected[0].shape[1:]}")
         parity, n_undecided = compared(open_session(place / RAM_MODEL), images, *expected)
         made_with = read_json(place / "versions.json")
         text = file_text(place / RAM_TAG_LIST)
         for name in ("images.npz", "answers.npz", "versions.json", RAM_TAG_LIST):
-            (place / name).unlink()  # what is left is the model and, of a large one, its weights
+            (place / name).unlink()  # what remains is the model and, if large, its weights
         written = settle(place / RAM_MODEL, folder / RAM_MODEL)
     write_text(folder / RAM_TAG_LIST, text)
     write_manifest(
@@ -428,8 +428,8 @@ def export_ram_plus(files: ModelFiles, folder: Path, checkout: Path, python: Pat
 
 
 def _run_program(python: Path, words: Sequence[str], folder: Path) -> None:
-    """Run the authors' code with ``python`` in ``folder``, without this project's modules and without a hub."""
-    # Found without resolving links: a python finds its environment by where the link lies.
+    """Run the authors' code with ``python`` in ``folder``, without this project's modules and without hub access."""
+    # Links are not resolved: Python finds its environment by the location of the link.
     found = str(Path(shutil.which(python) or python).absolute())
     offline = {"HF_HUB_OFFLINE": "1", "TRANSFORMERS_OFFLINE": "1"}
     command = [found, "-I", "-B", str(Path(ram_plus_program.__file__).absolute()), *words]
@@ -443,7 +443,7 @@ def _run_program(python: Path, words: Sequence[str], folder: Path) -> None:
             check=False,
         )
     except OSError as error:
-        raise ConfigError(f"{printable(found)}: cannot be started ({error.strerror}); name a Python") from error
+        raise ConfigError(f"{printable(found)}: cannot be started ({error.strerror}); fix --python") from error
     if done.returncode:
         lines = done.stderr.decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), f"exit code {done.returncode}")
@@ -451,7 +451,7 @@ def _run_program(python: Path, words: Sequence[str], folder: Path) -> None:
 
 
 def check_checkout(checkout: Path) -> None:
-    """Raises ``ConfigError`` for a folder that lacks what makes the network."""
+    """Raises ``ConfigError`` for a folder that lacks a file of the network."""
     lacking = [name for name in CODE if not is_file(checkout / name)]
     if lacking:
         raise ConfigError(
@@ -461,7 +461,7 @@ def check_checkout(checkout: Path) -> None:
 
 
 def made_images() -> Float32Array:
-    """Noise in blocks, prepared as a run prepares images: (N, 3, 384, 384)."""
+    """Blocks of noise, preprocessed as in a run: (N, 3, 384, 384)."""
     random = np.random.default_rng(0)
     sizes = ((8, 12), (24, 24), (96, 128))
     noise = [random.integers(0, 256, (*size, 3), dtype=np.uint8) for size in sizes]
@@ -471,14 +471,14 @@ def made_images() -> Float32Array:
 def compared(
     session: Any, images: Float32Array, logit: Float32Array, tag: BoolArray, threshold: Float32Array
 ) -> tuple[Parity, int]:
-    """How far ``session`` is from ``logit`` (N, T), and how many of ``tag`` (N, T) are too near ``threshold`` (T,).
+    """Difference of ``session`` from ``logit`` (N, T), and how many of ``tag`` (N, T) are too near ``threshold`` (T,).
 
-    Too near is: within the tolerance, where a last bit decides. Raises ``CheckFailed`` where the logits differ by more
-    than the tolerance, or other tags hold.
+    Too near means within the tolerance, where the last bit decides. Raises ``CheckFailed`` if the logits differ by more
+    than the tolerance, or other tags differ.
     """
     tags, theirs = zip(*(session.run(["tag", "logit"], {"image": image[None]}) for image in images), strict=True)
     parity = compare_outputs("logit", logit, np.concatenate(theirs))
-    if not parity.max_abs_difference <= LARGEST_OF_LOGITS:  # not a number is no agreement either
+    if not parity.max_abs_difference <= LARGEST_OF_LOGITS:  # also fails for NaN
         raise CheckFailed(
             f"ram-plus: logits differ between torch and ONNX Runtime by {parity.max_abs_difference:.2e}; "
             f"tolerance {LARGEST_OF_LOGITS:.0e}"
@@ -497,9 +497,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
-    parser.add_argument("--weights", type=Path, metavar="PATH", help="default: where models are looked for")
+    parser.add_argument("--weights", type=Path, metavar="PATH", help="model path (default: the models folder)")
     parser.add_argument("--checkout", type=Path, metavar="DIR", help=f"ram-plus: a clone of {REPOSITORY}")
-    parser.add_argument("--python", type=Path, metavar="PYTHON", help="ram-plus: what runs the code of the clone")
+    parser.add_argument("--python", type=Path, metavar="PYTHON", help="ram-plus: Python to run the clone's code")
     asked = parser.parse_args(arguments)
     try:
         entry = model_entry(asked.name)
@@ -511,7 +511,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             files = locate(entry.name, ("original",), path=asked.weights)
             export_ram_plus(files, asked.out, asked.checkout, asked.python)
         else:
-            parser.error(f"{entry.name}: a detector is not exported; ram-plus needs --checkout and --python")
+            parser.error(f"{entry.name}: detectors cannot be exported; ram-plus needs --checkout and --python")
     except Su3dError as error:
         sys.stderr.write(f"{error}\n")
         return error.exit_code

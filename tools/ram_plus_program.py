@@ -1,15 +1,15 @@
-"""RAM++ as an ONNX file, made by its authors' own code: a program that runs in an environment of its own.
+"""Export RAM++ as an ONNX file with its authors' code: a program that runs in a separate environment.
 
     PYTHON ram_plus_program.py CHECKOUT WEIGHTS FOLDER --opset 17
 
-``export_onnx.py`` starts it where torch, transformers 4 and onnx are; of this program it imports
-nothing. FOLDER holds ``images.npz`` (``images``, float32, N x 3 x 384 x 384). It gets ``ram_plus.onnx``,
+``export_onnx.py`` starts it in an environment with torch, transformers 4 and onnx; it imports nothing of this
+nothing. FOLDER contains ``images.npz`` (``images``, float32, N x 3 x 384 x 384). It gets ``ram_plus.onnx``,
 ``ram_tag_list.txt``, ``versions.json`` and ``answers.npz``: ``logit`` (N, T) and ``tag`` (N, T), whether the
-authors' ``generate_tag`` names it, and ``threshold`` (T,). The last line on stderr says what went wrong.
+authors' ``generate_tag`` names it, and ``threshold`` (T,). The last line on stderr states the error.
 
-Of recognize-anything (read at 7cb804a) only the files are run that RAM++ with a Swin encoder needs. What they import
-and the network does not use once it is trained has a stand-in: timm's initialisation and drop path, SciPy's resizing
-of position tables, the plain ViT, and BERT's tokenizer, whose number of words alone is asked for.
+Only the files of recognize-anything (read at 7cb804a) needed by RAM++ with a Swin encoder are run. Imports that
+the trained network does not use are replaced: timm's initialisation and drop path, SciPy's resizing
+of position tables, the plain ViT, and BERT's tokenizer, of which only the number of words is used.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ import numpy as np
 
 IMAGE_PX = 384
 VIT = "swin_l"
-BERT_WORDS = 30_522 + 2  # bert-base-uncased, and the two that init_tokenizer of ram/models/utils.py adds
-# Made by the network itself from its window size; the authors' loader drops them too.
+BERT_WORDS = 30_522 + 2  # bert-base-uncased, and the two added by init_tokenizer of ram/models/utils.py
+# Computed by the network from its window size; the authors' loader drops them too.
 RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
 
 
 def build_network(checkout: Path) -> Any:
-    """The authors' network as their package makes it, in evaluation mode, with random weights."""
+    """The authors' network as built by their package, in evaluation mode, with random weights."""
     for name in ("modeling_utils", "modeling_outputs", "models.bert.configuration_bert"):
-        importlib.import_module(f"transformers.{name}")  # asks which packages are here: before there are stand-ins
+        importlib.import_module(f"transformers.{name}")  # checks installed packages: before stand-ins are added
     _replace_unused_imports(checkout)
     module: Any = importlib.import_module("ram.models.ram_plus")
     module.init_tokenizer = lambda *_: range(BERT_WORDS)
@@ -46,7 +46,7 @@ def _replace_unused_imports(checkout: Path) -> None:
     import torch
 
     class DropPath(torch.nn.Module):
-        """Drops paths while training; nothing else is done here."""
+        """Drops paths while training; does nothing here."""
 
         def __init__(self, *_: object) -> None:
             super().__init__()
@@ -55,7 +55,7 @@ def _replace_unused_imports(checkout: Path) -> None:
             return values
 
     layers: dict[str, Any] = {"DropPath": DropPath, "to_2tuple": _pair, "trunc_normal_": torch.nn.init.trunc_normal_}
-    _module("ram", folder=checkout / "ram")  # without what its __init__ imports
+    _module("ram", folder=checkout / "ram")  # without the imports of its __init__
     _module("ram.models", folder=checkout / "ram" / "models")
     _module("ram.models.vit", interpolate_pos_embed=None, VisionTransformer=None)
     _module("timm")
@@ -83,12 +83,12 @@ def read_tensors(path: Path) -> Mapping[str, Any]:
     content = torch.load(path, map_location="cpu", weights_only=True)
     tensors = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(tensors, dict) or not all(isinstance(value, torch.Tensor) for value in tensors.values()):
-        raise ValueError(f"{path.name} is no table of tensors by name")
+        raise ValueError(f"{path.name} is not a table of named tensors")
     return tensors
 
 
 def fill(model: Any, tensors: Mapping[str, Any]) -> None:
-    """Give ``model`` its weights under the names of the authors' own loader; ``ValueError`` where they do not fit."""
+    """Load the weights into ``model`` under the names of the authors' loader; ``ValueError`` if they do not fit."""
     kept = {
         name.replace("vision_multi", "tagging_head"): tensor
         for name, tensor in tensors.items()
@@ -104,9 +104,9 @@ def fill(model: Any, tensors: Mapping[str, Any]) -> None:
 
 
 def own_answers(model: Any, images: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """The last layer's output (N, T) in the authors' ``generate_tag`` for ``images``, and which tags (N, T) it names.
+    """The last layer's output (N, T) in the authors' ``generate_tag`` for ``images``, and the tags (N, T) it returns.
 
-    Raises ``ValueError`` where the tags that it names are not those whose probability is above their threshold.
+    Raises ``ValueError`` if these tags are not those whose probability is above their threshold.
     """
     import torch
 
@@ -121,7 +121,7 @@ def own_answers(model: Any, images: Any) -> tuple[np.ndarray[Any, Any], np.ndarr
             logit = seen[0].reshape(-1)
             above = (torch.sigmoid(logit) > model.class_threshold).numpy()
             if named != " | ".join(np.asarray(model.tag_list)[above]):
-                raise ValueError("generate_tag names other tags than those above their thresholds: another version")
+                raise ValueError("generate_tag returns tags other than those above their thresholds: another version")
             logits.append(logit.numpy())
             tags.append(above)
     finally:
@@ -130,10 +130,10 @@ def own_answers(model: Any, images: Any) -> tuple[np.ndarray[Any, Any], np.ndarr
 
 
 def module_to_export(model: Any) -> Any:
-    """``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, and ``logit`` (1, T), by ``model``.
+    """``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 if the tag applies, and ``logit`` (1, T), by ``model``.
 
-    Each class has D descriptions, whose features are weighted by how much they look like the image; this product is
-    formed class by class, so that the table of features stands in the file once.
+    Each class has D descriptions, whose features are weighted by similarity to the image; this product is
+    computed class by class, so that the table of features is stored only once in the file.
     """
     import torch
 
@@ -168,7 +168,7 @@ def module_to_export(model: Any) -> Any:
 
 
 def export(model: Any, image: Any, path: Path, opset: int) -> None:
-    """Write ``model`` to ``path``; ``image`` (1, 3, 384, 384) is what it is traced with."""
+    """Write ``model`` to ``path``; ``image`` (1, 3, 384, 384) is the tracing input."""
     import torch
 
     with torch.no_grad():
@@ -185,7 +185,7 @@ def export(model: Any, image: Any, path: Path, opset: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="RAM++ as an ONNX file, by its authors' own code.")
+    parser = argparse.ArgumentParser(description="Export RAM++ as an ONNX file with its authors' code.")
     for name in ("checkout", "weights", "folder"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--opset", type=int, required=True)
@@ -194,7 +194,7 @@ def main() -> None:
 
 
 def export_all(checkout: Path, weights: Path, folder: Path, opset: int) -> None:
-    """Everything that the program writes into ``folder``."""
+    """Write all outputs of the program into ``folder``."""
     import onnx
     import torch
     import transformers

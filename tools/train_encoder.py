@@ -1,8 +1,8 @@
-"""Train the embedded encoder on rendered rooms that no benchmark uses, export it and measure it.
+"""Train the embedded encoder on rendered rooms not used by benchmarks, export it and evaluate it.
 
     python tools/train_encoder.py --out DIR --rooms 360 --minutes 30 --seed 0
 
-Needs the models extra (torch, onnx). Time decides how many steps are made, so two trainings differ in their weights.
+Needs the models extra (torch, onnx). The number of steps depends on time, so two trainings differ in their weights.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MIN_POSITIVES = 3
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured figure: ``value`` over ``n`` trials, beside ``chance``."""
+    """One measured value: ``value`` over ``n`` trials, with ``chance`` level."""
 
     name: str
     value: float
@@ -54,7 +54,7 @@ class Figure:
 
 
 def measure(encoder: Encoder, crops: CropSet, features: Float32Array, class_names: Sequence[str]) -> tuple[Figure, ...]:
-    """Every figure of the model card, for crops (N) with their ``features`` (N, D) and the classes of the prompts."""
+    """Every value of the model card, for crops (N) with their ``features`` (N, D) and the classes of the prompts."""
     has_class = np.array([truth.class_name in set(class_names) for truth in crops.truths])
     tight = (crops.ratios > 0) & (crops.ratios <= 1.2)
     exact = has_class & tight & crops.is_exact
@@ -90,7 +90,7 @@ class _HeldOut:
         return self.features[rows] @ self.encoder.encode_texts(texts).T
 
     def places(self, rows: NDArray[np.intp], names: Sequence[str], field: str) -> Int64Array:
-        """Where among ``names`` the truths of crops ``rows`` stand."""
+        """Where among ``names`` the ground truths of crops ``rows`` stand."""
         return np.array([names.index(getattr(self.crops.truths[row], field)) for row in rows], np.int64)
 
     def class_figures(self, chosen: BoolArray, prompt: str, label: str) -> list[Figure]:
@@ -145,7 +145,7 @@ class _HeldOut:
         ]
 
     def average_precision(self, label: str, captions: Sequence[Caption], chosen: BoolArray) -> Figure:
-        """Mean average precision of crops ranked by each caption; chance is the mean share of true crops."""
+        """Mean average precision of crops ranked by each caption; chance is the mean share of matching crops."""
         rows = np.flatnonzero(chosen)
         similarity = self.similarity(rows, [caption.text for caption in captions])
         precisions, shares = [], []
@@ -160,7 +160,7 @@ class _HeldOut:
         return Figure(name, _mean(np.array(precisions)), _mean(np.array(shares)), len(precisions))
 
     def relation_choice(self, shown: BoolArray) -> Figure:
-        """How often the true neighbour's caption beats that of a neighbour which the same class has elsewhere."""
+        """How often the true neighbour's caption scores above that of a neighbour that the same class has elsewhere."""
         rows = [row for row in np.flatnonzero(shown) if self.crops.truths[row].neighbours]
         captions = _relative_captions([self.crops.truths[row] for row in rows])
         texts = self.encoder.encode_texts([caption.text for caption in captions])
@@ -201,7 +201,7 @@ def _tops(what: str, rank: Int64Array, n_candidates: int, places: Sequence[int] 
 
 
 def _ranks(similarity: Float32Array, truth: Int64Array) -> Int64Array:
-    """How many candidates stand before the true one in each row."""
+    """Number of candidates ranked before the true one in each row."""
     own = similarity[np.arange(len(truth)), truth]
     return np.asarray((similarity > own[:, None]).sum(axis=1), np.int64)
 
@@ -265,7 +265,7 @@ def run(order: Order) -> tuple[Figure, ...]:
 
 
 def export(towers: Towers, folder: Path) -> None:
-    """The two ONNX files in ``folder``, each written beside its place first and then moved there."""
+    """Write the two ONNX files to ``folder``, each to a temporary name first and then moved."""
     import torch
 
     pixels = torch.zeros(1, IMAGE_SIZE, IMAGE_SIZE, 3, dtype=torch.uint8)
@@ -338,7 +338,7 @@ def _write_card(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line; the answer is the table of figures."""
+    """The command line; prints the table of values."""
     parser = argparse.ArgumentParser(prog=f"python {PROGRAM}", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the two ONNX files and the model card")
     parser.add_argument("--cache", type=Path, help="folder for rendered crops; default: OUT/crops")
@@ -346,10 +346,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--held-out-rooms", type=int, default=24)
     parser.add_argument("--frames-per-room", type=int, default=6)
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--max-steps", type=int, help="end earlier, after this many steps")
-    parser.add_argument("--snapshot-minutes", type=float, help="also export what there is, every so many minutes")
+    parser.add_argument("--max-steps", type=int, help="maximum number of steps")
+    parser.add_argument("--snapshot-minutes", type=float, help="export a snapshot every N minutes")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2, help="processes that render, threads that train")
+    parser.add_argument("--jobs", type=int, default=2, help="rendering processes and training threads")
     given = parser.parse_args(arguments)
     values = {**vars(given), "cache": given.cache or given.out / "crops"}
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)

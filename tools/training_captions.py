@@ -1,7 +1,7 @@
 """Captions of a crop from a generator's ground truth, each with the statement that it makes.
 
-``Caption.is_true_of`` decides for any crop whether a caption fits it, and ``TruthTable`` for whole batches at once:
-training knows every positive pair of a batch and not only the pair that was drawn together.
+``Caption.is_true_of`` checks a caption for one crop, ``TruthTable`` for whole batches:
+training uses every positive pair of a batch, not only pairs drawn together.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Generator = np.random.Generator
 
 @dataclass(frozen=True)
 class Neighbour:
-    """One relation of the crop's object to something else that the crop shows: "on" a "brown" "table"."""
+    """A relation of the crop's object to something else visible in the crop: "on" a "brown" "table"."""
 
     relation: str
     class_name: str
@@ -44,7 +44,7 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class CropTruth:
-    """What a crop shows: ``class_name`` is "" for a whole image, ``room`` is "" where little of the room is seen."""
+    """Content of a crop: ``class_name`` is "" for a whole image, ``room`` is "" if little of the room is visible."""
 
     class_name: str
     colour: str
@@ -56,7 +56,7 @@ class CropTruth:
 
 @dataclass(frozen=True)
 class Caption:
-    """A text and what must hold for it to be true; an empty field asks for nothing."""
+    """A text and the conditions under which it is true; an empty field imposes none."""
 
     text: str
     classes: tuple[str, ...] = ()
@@ -87,14 +87,14 @@ class Caption:
 
 
 def class_caption(class_name: str, random: Generator) -> Caption:
-    """A caption that says the class and nothing else; half of the time by the class's own name."""
+    """A caption that only states the class; half of the time by the class's own name."""
     names = class_words(class_name)
     name = names[0] if random.random() < 0.5 else draw(names, random)
     return Caption(fill(draw(CLASS_TEMPLATES, random), name), classes=(class_name,))
 
 
 def fixed_captions() -> tuple[Caption, ...]:
-    """The captions of affordances and of words for several classes, the same in every scene."""
+    """The captions of affordances and of words for several classes, identical in every scene."""
     uses = [Caption(phrase, classes=classes) for phrase, classes in AFFORDANCES.items()]
     return (*uses, *(Caption(word, classes=classes) for word, classes in GROUPS.items()))
 
@@ -106,7 +106,7 @@ def room_caption(room: str, random: Generator) -> Caption:
 
 
 def draw_caption(crop: CropTruth, random: Generator) -> Caption:
-    """One of the true captions of ``crop``: attributes, relations and use, in words drawn at random."""
+    """A random true caption of ``crop``: attributes, relations and use."""
     if not crop.class_name:
         return _whole_caption(crop, random)
     if crop.neighbours and random.random() < 0.5:
@@ -173,7 +173,7 @@ def _whole_caption(crop: CropTruth, random: Generator) -> Caption:
 
 
 def wrong_relation(caption: Caption, class_names: Sequence[str], random: Generator) -> Caption:
-    """``caption`` of a relation, told of another class or turned round: a hard text to tell from the true one."""
+    """A relational ``caption`` about another class or reversed: hard to distinguish from the true one."""
     subject, other = caption.classes[0], caption.others[0]
     if random.random() < 0.5:
         other = class_names[int(random.integers(len(class_names)))]
@@ -185,7 +185,7 @@ def wrong_relation(caption: Caption, class_names: Sequence[str], random: Generat
 
 
 def fill(template: str, name: str) -> str:
-    """``name`` in a template, where ``{a}`` stands for the name after its article."""
+    """``name`` in a template, where ``{a}`` is replaced by the name with its article."""
     return template.replace("{a}", with_article(name)).replace("{}", name)
 
 
@@ -199,12 +199,12 @@ def draw(choices: Sequence[Word], random: Generator) -> Word:
 
 Names = dict[str, int]
 
-# The words that a caption and a crop have in common.
+# The words shared by captions and crops.
 _WORDS = (attrgetter("colour"), attrgetter("material"), attrgetter("size_word"), attrgetter("room"))
 
 
 class TruthTable:
-    """The truths of N crops as numbers, so that ``matches`` of a batch takes a millisecond."""
+    """Ground truth of N crops as numbers, so that ``matches`` of a batch takes a millisecond."""
 
     def __init__(self, truths: Sequence[CropTruth]) -> None:
         self.class_names = tuple(sorted({truth.class_name for truth in truths} - {""}))

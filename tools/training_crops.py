@@ -1,4 +1,4 @@
-"""Training crops cut from rendered rooms: windows as a segmenter would place them, with what each one shows."""
+"""Training crops cut from rendered rooms: windows as placed by a segmenter, with their content."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 FIRST_TRAINING_NUMBER = 10000
 FIRST_HELD_OUT_NUMBER = 20000
-# Poses of the walk through a room from which the images are drawn.
+# Poses of the trajectory through a room from which the images are drawn.
 WALK_FRAMES = 200
 MIN_VIEW_PIXELS = 80
-# A neighbour counts as shown when it fills this part of the window, or when this part of its visible pixels is inside.
+# A neighbour counts as shown if it fills this part of the window, or if this part of its visible pixels is inside.
 SHOWN_OF_WINDOW, SHOWN_OF_NEIGHBOUR = 0.02, 0.5
-# Ratio from which a window tells the kind of room, if it covers this part of the image.
+# Ratio from which a window shows the kind of room, if it covers this part of the image.
 ROOM_PART_OF_IMAGE = 0.25
-HELD = ("on", "in")  # the holder is shown "with" what it holds; of other pairs the truth has both directions
+HELD = ("on", "in")  # the holder is shown "with" what it holds; of other pairs the ground truth has both directions
 TIGHT_RATIOS = (0.8, 1.0, 1.2)
 WIDE_RATIOS = (2.0, 2.0, 4.0)
-# A region of the segmenter teaches the object that owns at least this part of its pixels.
+# A region of the segmenter is assigned to the object that owns at least this part of its pixels.
 MIN_PURITY = 0.6
 SEGMENTER_LEVELS: tuple[Literal["objects", "parts"], ...] = ("objects", "parts")
 
 
 @dataclass(frozen=True)
 class CropSet:
-    """N crops: ``pixels`` (N, 64, 64, 3) uint8, ``log_sizes`` (N, 2) float32, what they show, and how they were cut.
+    """N crops: ``pixels`` (N, 64, 64, 3) uint8, ``log_sizes`` (N, 2) float32, their content, and how they were cut.
 
-    ``ratios`` (N,) float32 are crop ratios, 0 for a whole image; ``is_exact`` (N,) says that the box was the object's.
+    ``ratios`` (N,) float32 are crop ratios, 0 for a whole image; ``is_exact`` (N,): whether the box was the object's.
     """
 
     pixels: UInt8Array
@@ -61,12 +61,12 @@ class CropSet:
 
 
 def room_names(n_rooms: int, first_number: int) -> list[str]:
-    """``n_rooms`` scene names, the kinds in turn, numbered from ``first_number``; never a benchmark scene."""
+    """``n_rooms`` scene names, cycling through the kinds, numbered from ``first_number``; never a benchmark scene."""
     return [f"{KINDS[index % len(KINDS)]}{first_number + index // len(KINDS)}" for index in range(n_rooms)]
 
 
 def make_crops(scenes: Sequence[str], frames_per_room: int, seed: int, folder: Path, jobs: int) -> CropSet:
-    """The crops of ``scenes``, read from ``folder`` where an earlier call left them, else rendered into it."""
+    """The crops of ``scenes``, read from ``folder`` if an earlier call wrote them, otherwise rendered into it."""
     folder.mkdir(parents=True, exist_ok=True)
     tasks = [(scene, frames_per_room, seed, folder) for scene in scenes if not _facts_path(folder, scene).is_file()]
     if jobs == 1 or len(tasks) < 2:
@@ -79,7 +79,7 @@ def make_crops(scenes: Sequence[str], frames_per_room: int, seed: int, folder: P
 
 
 def read_crops(scenes: Sequence[str], folder: Path) -> CropSet:
-    """The crops of ``scenes`` from the files that ``make_crops`` left in ``folder``."""
+    """The crops of ``scenes`` from the files written by ``make_crops``."""
     facts = [json.loads(file_text(_facts_path(folder, scene))) for scene in scenes]
     rows = [row for of_scene in facts for row in of_scene]
     pixels = np.empty((len(rows), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -128,14 +128,14 @@ def _render_room(task: tuple[str, int, int, Path]) -> None:
             pixels.append(crop)
             facts.append(row)
     np.save(_pixels_path(folder, scene), np.stack(pixels))
-    # The facts come last: their presence says that the room is complete.
+    # The facts come last: their presence marks the room as complete.
     _facts_path(folder, scene).write_text(json.dumps(facts))
 
 
 def _view_crops(
     rgb: UInt8Array, view: _View, regions: Regions, rng: np.random.Generator
 ) -> Iterator[tuple[UInt8Array, list[Any]]]:
-    """The crops of one image: a few an object, one a region of the segmenter, and one of the whole."""
+    """The crops of one image: a few per object, one per region of the segmenter, and the whole image."""
     height, width = view.instance.shape
     for object_id in np.flatnonzero(view.counts >= MIN_VIEW_PIXELS).tolist():
         if object_id == 0:
@@ -165,7 +165,7 @@ def _row(crop: CropTruth, window: Int64Array, ratio: float, is_exact: bool) -> l
 
 
 def _boxes(mask: np.ndarray[Any, Any], rng: np.random.Generator) -> Iterator[tuple[Float32Array, float, bool]]:
-    """Boxes, ratios, and whether the box is exact: the object's box, a careless one, a part of it, a wide one."""
+    """Boxes, ratios, and whether the box is exact: the object's box, an inaccurate one, a part of it, a wide one."""
     box = mask_boxes(mask[None])[0]
     yield box, float(rng.choice(TIGHT_RATIOS)), True
     size = np.array([box[2] - box[0], box[3] - box[1]] * 2, np.float32)
@@ -179,7 +179,7 @@ def _boxes(mask: np.ndarray[Any, Any], rng: np.random.Generator) -> Iterator[tup
 
 
 def _part_box(mask: np.ndarray[Any, Any], box: Float32Array, rng: np.random.Generator) -> Float32Array | None:
-    """A rectangle of 15 to 70 % of ``box`` that the object fills for the most part, as an over-segmentation gives."""
+    """A rectangle of 15 to 70 % of ``box``, mostly filled by the object, like a region of an over-segmentation."""
     x0, y0, x1, y1 = (int(value) for value in box)
     for _ in range(6):
         width, height = (int(max(6, side * rng.uniform(0.35, 0.9))) for side in (x1 - x0, y1 - y0))
@@ -193,7 +193,7 @@ def _part_box(mask: np.ndarray[Any, Any], box: Float32Array, rng: np.random.Gene
 
 
 class _View:
-    """What one image shows: visible pixels and relations by object."""
+    """Content of one image: visible pixels and relations by object."""
 
     def __init__(self, instance: Int32Array, truth: Any) -> None:
         self.instance = instance
@@ -208,7 +208,7 @@ class _View:
                 self._related.setdefault(link.object, []).append(("with", link.subject))
 
     def truth_of(self, object_id: int, window: Int64Array) -> CropTruth:
-        """The truth of a window around ``object_id``, with those neighbours alone that the window shows."""
+        """The ground truth of a window around ``object_id``, with only those neighbours that the window shows."""
         x0, y0, x1, y1 = window.tolist()
         inside = np.bincount(self.instance[y0:y1, x0:x1].ravel(), minlength=len(self.counts))
         area = (x1 - x0) * (y1 - y0)
@@ -230,7 +230,7 @@ class _View:
         )
 
     def whole(self) -> CropTruth:
-        """The truth of the whole image: the kind of room, and what stands out in it."""
+        """The ground truth of the whole image: the kind of room, and its most prominent content."""
         large = np.flatnonzero(self.counts >= 0.01 * self.instance.size)
         seen = [self._objects[int(object_id)] for object_id in large if object_id]
         shown = {Neighbour("with", item.class_name, item.colour): None for item in seen if item.support != "room"}

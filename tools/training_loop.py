@@ -1,4 +1,4 @@
-"""The contrastive training of the two towers on the CPU."""
+"""Contrastive training of the two towers on the CPU."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from su3d_bench.perception.embedded.torch_towers import ImageTower, TextTower
 
 logger = logging.getLogger(__name__)
 
-# Cosines are compared at this scale in training and, as temperature 1 / 20, where regions are named.
+# Cosines are compared at this scale in training and, as temperature 1 / 20, when naming regions.
 LOGIT_SCALE = 20.0
 CAPTIONS_PER_CROP = 1
 FIXED_CAPTIONS = 40
@@ -40,9 +40,9 @@ UNKNOWN_WORDS = 0.06
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """How long and how fast: the learning rate rises for ``warm_up`` of the time and falls as a cosine to 1 %.
+    """Duration and learning rate, which rises for ``warm_up`` of the time and falls as a cosine to 1 %.
 
-    ``batch_size`` counts the crops of a step over all ``threads``.
+    ``batch_size`` is the number of crops of a step over all ``threads``.
     """
 
     minutes: float
@@ -58,7 +58,7 @@ class TrainingPlan:
 
 @dataclass(frozen=True)
 class Towers:
-    """Both towers in evaluation mode, and how they came about."""
+    """Both towers in evaluation mode, and how they were trained."""
 
     image: ImageTower
     text: TextTower
@@ -68,10 +68,10 @@ class Towers:
 
 
 def train(crops: CropSet, plan: TrainingPlan, keep: Callable[[Towers], None]) -> Towers:
-    """Towers trained on ``crops`` until the time or steps of ``plan`` are over; ``keep`` is handed the snapshots.
+    """Train towers on ``crops`` until the time or steps of ``plan`` are over; ``keep`` receives the snapshots.
 
-    Each thread works on a batch of its own and the gradients are averaged: threads then meet once a step, where
-    torch's own would meet in every operation and wait for each other on a busy machine.
+    Each thread works on a separate batch and the gradients are averaged: threads then synchronize once per step, while
+    torch's own threads would synchronize in every operation and wait for each other on a busy machine.
     """
     torch.manual_seed(plan.seed)
     image, text = ImageTower().to(memory_format=torch.channels_last), TextTower()  # type: ignore[call-overload]
@@ -112,7 +112,7 @@ def _part_done(plan: TrainingPlan, started: float, step: int) -> float:
 
 
 def _without_unseen_rows(text: TextTower, optimizer: torch.optim.Optimizer) -> TextTower:
-    """A copy whose table rows that no caption ever used are zero, so that an unknown word is silence, not noise."""
+    """A copy with zeros in table rows not used by any caption, so that unknown words contribute nothing, not noise."""
     known = copy.deepcopy(text)
     has_moved = optimizer.state[text.table]["exp_avg_sq"].sum(1) > 0
     with torch.no_grad():
@@ -133,9 +133,9 @@ def _rate(done: float, warm_up: float) -> float:
 
 @dataclass(frozen=True)
 class Batch:
-    """One step's crops and captions. The first ``n_classes`` captions say one class each, in the order of the classes.
+    """One step's crops and captions. The first ``n_classes`` captions state one class each, in class order.
 
-    ``classes`` (B,) is -1 for a whole image; ``matches`` (T, B) says which caption is true of which crop.
+    ``classes`` (B,) is -1 for a whole image; ``matches`` (T, B) which caption is true of which crop.
     """
 
     pixels: Tensor
@@ -147,7 +147,7 @@ class Batch:
 
 
 class Batches:
-    """Random batches of augmented crops, the rarer classes drawn more often than they occur."""
+    """Random batches of augmented crops, with rarer classes drawn more often than they occur."""
 
     def __init__(self, crops: CropSet, seed: Sequence[int], batch_size: int) -> None:
         self._crops = crops
@@ -157,7 +157,7 @@ class Batches:
         self._fixed = fixed_captions()
         classes = self._table.class_of
         counts = np.bincount(classes + 1, minlength=len(self._table.class_names) + 1).astype(np.float64)
-        # Square-root sampling: between the rooms' own frequencies and one of each class. Whole images count for three.
+        # Square-root sampling: between the rooms' frequencies and uniform classes. Whole images count three times.
         weights = 1.0 / np.sqrt(np.maximum(counts, 1.0))
         weights[0] *= 3.0
         weight = weights[classes + 1]
@@ -186,9 +186,9 @@ class Batches:
 
     def _ids(self, captions: list[Caption]) -> Int64Array:
         ids = token_ids([caption.text for caption in captions])
-        # Positions that no caption of the batch reaches change nothing in the tower and cost as much as the others.
+        # Positions beyond all captions of the batch do not affect the tower but cost as much as the others.
         ids = ids[:, : max(1, int((ids[:, :, 0] != PADDING).sum(axis=1).max()))]
-        # Now and then a word must be told by its 4-grams alone, so that they carry meaning.
+        # Sometimes a word is represented only by its 4-grams, so that they carry meaning.
         ids[:, :, :2][self._rng.random(ids.shape[:2]) < UNKNOWN_WORDS] = PADDING
         return ids
 
@@ -204,7 +204,7 @@ class Batches:
 
 
 def augment(pixels: UInt8Array, rng: np.random.Generator) -> UInt8Array:
-    """``pixels`` mirrored, lit and tinted otherwise, shifted a little, and with a patch hidden, each now and then."""
+    """``pixels`` randomly mirrored, relit, tinted, shifted slightly, and with a patch hidden."""
     n = len(pixels)
     out = pixels.astype(np.float32)
     mirrored = rng.random(n) < 0.5
@@ -239,7 +239,7 @@ def _loss(image: ImageTower, text: TextTower, batch: Batch) -> Tensor:
 
 
 def _multi_positive(logits: Tensor, positives: Tensor) -> Tensor:
-    """Cross-entropy of each row's softmax against its positives in equal parts; rows without any are left out."""
+    """Cross-entropy of each row's softmax against its positives, equally weighted; rows without any are skipped."""
     n_positives = positives.sum(1)
     rows = n_positives > 0
     targets = positives[rows] / n_positives[rows, None]

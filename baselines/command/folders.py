@@ -1,4 +1,4 @@
-"""The folders that a user's program works in: the frames that it gets, and the prediction that it leaves."""
+"""Folders of a user's program: the frames it gets, and the prediction it writes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LAYOUT_VERSION = 1
 MILLIMETRES = 1000.0
 ColourFormat = Literal["png", "jpg"]
 
-# The same folder as the dataset `rgbd` reads it; {index} stands for the frame's number.
+# Description of the folder for the dataset `rgbd`; {index} is the frame number.
 DESCRIPTION = """colour = "colour/{{index}}.{colour}"
 depth = "depth/{{index}}.png"
 pose = "pose/{{index}}.txt"
@@ -35,7 +35,7 @@ intrinsics_file = "intrinsics.txt"
 
 @dataclass
 class FrameFolder:
-    """Writes frames as they come; ``close`` may be called after each and completes the folder as it then is."""
+    """Writes frames one by one; ``close`` completes the folder for the frames so far and may be called after each."""
 
     path: Path
     scene: SceneInfo
@@ -57,8 +57,8 @@ class FrameFolder:
         size = (frame.rgb.shape[1], frame.rgb.shape[0])
         if self._numbers and size != self._size:
             raise DataError(
-                f"{self.scene.dataset}/{self.scene.scene} frame {frame.index}: is {size[0]}x{size[1]}, the frames "
-                f"before are {self._size[0]}x{self._size[1]}; a program gets frames of one size"
+                f"{self.scene.dataset}/{self.scene.scene} frame {frame.index}: is {size[0]}x{size[1]}, previous "
+                f"frames are {self._size[0]}x{self._size[1]}; all frames of a program must have one size"
             )
         self._size = size
         name = f"{frame.index:06d}"
@@ -72,9 +72,9 @@ class FrameFolder:
         self._intrinsics.append(frame.intrinsics)
 
     def close(self) -> None:
-        """Write what holds for all frames so far; ``DataError`` without a frame."""
+        """Write what applies to all frames so far; ``DataError`` without a frame."""
         if not self._numbers:
-            raise DataError(f"{self.scene.dataset}/{self.scene.scene}: no frame to hand to the program")
+            raise DataError(f"{self.scene.dataset}/{self.scene.scene}: no frames for the program")
         write_text(self.path / "intrinsics.txt", matrix_text(self._intrinsics[0]))
         differ = any(not np.array_equal(matrix, self._intrinsics[0]) for matrix in self._intrinsics)
         if differ:
@@ -89,20 +89,20 @@ class FrameFolder:
         first = self._intrinsics[0]
         values: list[tuple[str, object, str]] = [
             ("layout", LAYOUT_VERSION, "version of this folder's layout"),
-            ("dataset", printable(self.scene.dataset), "where the scene is from"),
-            ("scene", printable(self.scene.scene), "its name there"),
+            ("dataset", printable(self.scene.dataset), "dataset of the scene"),
+            ("scene", printable(self.scene.scene), "its name in the dataset"),
             ("image_domain", self.scene.image_domain, "rendered-rooms or camera"),
-            ("stride", self.scene.stride, "every so many frames of the sequence are here"),
-            ("seed", self.scene.seed, "for whatever the program draws at random"),
+            ("stride", self.scene.stride, "every n-th frame of the sequence is in this folder"),
+            ("seed", self.scene.seed, "for the program's random numbers"),
             ("n_frames", len(self._numbers), "frames in this folder"),
             ("width", self._size[0], "pixels"),
             ("height", self._size[1], "pixels"),
             ("colour", f"colour/NNNNNN.{self.colour}", "8-bit RGB"),
-            ("depth", "depth/NNNNNN.png", "16-bit, along the optical axis, 0 where there is none"),
+            ("depth", "depth/NNNNNN.png", "16-bit, along the optical axis, 0 for no depth"),
             ("depth_unit_m", 0.001, "metres of one unit"),
             ("pose", "pose/NNNNNN.txt", "4x4, camera to world, metres; x right, y down, z forward"),
             ("intrinsics", "intrinsics.txt", "3x3, pixels"),
-            ("intrinsics_differ", intrinsics_differ, "then intrinsics/NNNNNN.txt has those of each frame"),
+            ("intrinsics_differ", intrinsics_differ, "if true, intrinsics/NNNNNN.txt has those of each frame"),
             ("fx", float(first[0, 0]), "pixels"),
             ("fy", float(first[1, 1]), "pixels"),
             ("cx", float(first[0, 2]), "pixels"),
@@ -110,18 +110,18 @@ class FrameFolder:
             ("mesh", "mesh.ply" if self.surface is not None else None, "the scan's mesh, without labels"),
             ("n_vertices", 0 if self.surface is None else len(self.surface.vertices), "of the mesh"),
             ("frames", self._numbers, "the numbers NNNNNN, in the order of the updates"),
-            ("times_s", self._times_s, "seconds, one a frame"),
+            ("times_s", self._times_s, "seconds, one per frame"),
         ]
         return write_toml([((key,), value, remark) for key, value, remark in values])
 
 
 def matrix_text(matrix: Float64Array) -> str:
-    """A matrix, a row a line, such that reading it gives the same float64."""
+    """A matrix, one row per line, with enough digits to restore the same float64."""
     return "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in matrix)
 
 
 def write_mesh(path: Path, surface: Surface) -> None:
-    """The mesh as binary PLY, vertices in their order, which is the order that masks over them refer to."""
+    """The mesh as binary PLY, vertices in order, because masks refer to that order."""
     axes = {axis: surface.vertices[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
     corners = list_column(surface.triangles)
     vertices = PlyElement("vertex", len(surface.vertices), axes)
@@ -129,41 +129,39 @@ def write_mesh(path: Path, surface: Surface) -> None:
 
 
 def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:
-    """The only prediction in ``folder``, or the one of ``scene`` where there are several."""
-    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+    """The only prediction in ``folder``, or that of ``scene`` if there are several."""
+    from su3d_bench.predictions.formats import recognise  # imports every format: slow for a list of methods
 
     files = [path for path in folder.iterdir() if not path.name.startswith(".")]
     if not files:
-        raise PredictionError("it ended without an error and left nothing in {output}")
+        raise PredictionError("it ended without an error but wrote nothing to {output}")
     reader = recognise(folder, format)
     names = list(reader.scenes(folder))
     if not names:
-        raise PredictionError(f"what it left in {{output}} has no prediction in the format {reader.name}")
+        raise PredictionError(f"{{output}} has no prediction in the format {reader.name}")
     if len(names) > 1 and scene not in names:
         shown = printable(", ".join(names[:4]), 200)
-        raise PredictionError(f"it left predictions of {len(names)} scenes ({shown}), none of them '{scene}'")
+        raise PredictionError(f"it wrote predictions of {len(names)} scenes ({shown}), none of them '{scene}'")
     return reader.read(folder, scene if scene in names else names[0])
 
 
 def as_prediction(content: Content, surface: Surface | None, names: Mapping[int, str]) -> Prediction:
-    """``content`` as a map; masks and labels without points stand on the vertices of ``surface``.
+    """``content`` as a map; masks and labels without points refer to the vertices of ``surface``.
 
-    ``names`` are those of the class numbers of such masks.
+    ``names`` are the names of the class numbers of such masks.
     """
     if not isinstance(content, VertexMasks | VertexLabels):
         return content
     if surface is None:
-        raise PredictionError(
-            "its masks have no points of their own and the dataset has no mesh; write points too, in another format"
-        )
+        raise PredictionError("its masks have no points and the dataset has no mesh; use a format with points")
     n = len(surface.vertices)
     n_points = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
     if n_points not in {None, n}:
-        raise PredictionError(f"its masks are over {n_points} points, the mesh has {n} vertices; they must be the same")
+        raise PredictionError(f"its masks are over {n_points} points, the mesh has {n} vertices; they must match")
     masks = content.masks() if isinstance(content, VertexLabels) else content
     numbers, kept = masks.class_numbers, np.arange(len(masks))
     if isinstance(content, VertexLabels) and numbers is not None:
-        # ids of 0 and below are no class, nor are places in a list below 0
+        # ids below 1 are not classes, nor are list indices below 0
         kept = np.flatnonzero(numbers >= (content.numbering == "id"))
     return Instances.of(
         surface.vertices,
@@ -177,9 +175,9 @@ def as_prediction(content: Content, surface: Surface | None, names: Mapping[int,
 
 
 def class_names(content: Content, dataset: str, protocol: str | None) -> dict[int, str]:
-    """The names of the class numbers of ``content``: in ``protocol``, else in all that score the dataset by default.
+    """The names of the class numbers of ``content``: in ``protocol``, or in all default protocols of the dataset.
 
-    Empty where it has none. Raises ``PredictionError`` where the protocols give one number different names.
+    Empty if it has none. Raises ``PredictionError`` if the protocols give one number different names.
     """
     if not isinstance(content, VertexMasks | VertexLabels):
         return {}
@@ -194,6 +192,6 @@ def class_names(content: Content, dataset: str, protocol: str | None) -> dict[in
             lists = [rules.scored for rules in own if rules.kind == "instance"]
         pairs = {(number, entry.name) for entries in lists for number, entry in enumerate(entries)}
     if not pairs or len(pairs) > len({number for number, _ in pairs}):
-        known = ", ".join(rules.name for rules in own) or "any that has classes"
-        raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")
+        known = ", ".join(rules.name for rules in own) or "any with classes"
+        raise PredictionError(f"its class numbers are ambiguous; set classes_of to a protocol (known: {known})")
     return dict(pairs)

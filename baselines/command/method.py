@@ -1,7 +1,7 @@
-"""Any other program as a method: it is run once a scene, gets the frames in a folder, and leaves a prediction.
+"""Any other program as a method: it is run once per scene, gets the frames in a folder, and writes a prediction.
 
-Folders of datasets have names that others chose, such as ``x$(touch y)``. No value is ever read as a part of a program:
-it reaches the program as a word, or through its environment; a shell's line gets the variable in its place.
+Dataset folders may have malicious names, such as ``x$(touch y)``. A value is never inserted into code: it is passed as
+an argument or in the environment; a shell line gets the variable instead.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo,
 
 PLACEHOLDER = re.compile(r"\{(\w*)\}")
 PLACEHOLDERS = ("frames", "output", "work", "scene", "dataset", "seed")
-BESIDE = re.compile(r"[\w./:=,@%+~\[\]-]*")  # what may stand in one word with a placeholder: nothing that is code
+BESIDE = re.compile(r"[\w./:=,@%+~\[\]-]*")  # characters allowed in one word with a placeholder: no code
 INTERPRETER = re.compile(
     r"(ba|da|a|z|k|mk|fi|c|tc)?sh|busybox|su|runuser|script|flock|(python|pypy|perl|ruby|lua|php)[\d.]*|node|nodejs|deno"
     r"|bun|R|Rscript|luajit|julia|octave"
 )
-WITH_A_VALUE = re.compile(r"-[OWX]|-[a-z]*o")  # options of interpreters whose value may be a word of its own
-CODE_OPTION = re.compile(r"-[A-Za-z]*[ceEpr]|--(eval|command|print|execute)=?")  # a program follows it
+WITH_A_VALUE = re.compile(r"-[OWX]|-[a-z]*o")  # interpreter options whose value may be a separate word
+CODE_OPTION = re.compile(r"-[A-Za-z]*[ceEpr]|--(eval|command|print|execute)=?")  # followed by a program
 
 
 def variable_of(name: str) -> str:
@@ -48,11 +48,11 @@ def variable_of(name: str) -> str:
 
 
 def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
-    """Raises ``ValueError`` for an unknown placeholder, or one whose value a program would read as code."""
+    """Raises ``ValueError`` for an unknown placeholder, or one whose value would be read as code."""
     if isinstance(command, str) and is_shell:
         for name in _misplaced(command):
             right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
-            raise ValueError(f"'{{{name}}}' stands where a shell would read its value as commands; {right}")
+            raise ValueError(f"'{{{name}}}' is where a shell would read its value as commands; {right}")
         return
     words = shlex.split(command) if isinstance(command, str) else command
     for k, word in enumerate(words):
@@ -63,13 +63,13 @@ def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
             raise ValueError(f"'{{{unknown[0]}}}' is an unknown placeholder; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
         if not BESIDE.fullmatch(PLACEHOLDER.sub("", word)) or _is_code(words, k):
             raise ValueError(
-                f"'{{{names[0]}}}' is inside what a program may read as code; make it an argument of its own, or use "
+                f"'{{{names[0]}}}' is inside text that may be read as code; make it a separate argument, or use "
                 f"the environment variable {variable_of(names[0])} there"
             )
 
 
 def _misplaced(line: str) -> Iterator[str]:
-    """The placeholders of a shell's line that stand where its quotes would be undone, or where a shell is fed."""
+    """The placeholders of a shell line whose value would be read as commands, or fed to a shell."""
     for found in PLACEHOLDER.finditer(line):
         before = line[: found.start()]
         unescaped = re.sub(r"\\.|(?:^|\s)#[^\n]*", "", before)
@@ -79,7 +79,7 @@ def _misplaced(line: str) -> Iterator[str]:
 
 
 def _is_code(words: Sequence[str], k: int) -> bool:
-    """Whether an interpreter reads the ``k``-th word, behind nothing but its options, as a program."""
+    """Whether an interpreter reads the ``k``-th word (preceded only by its options) as a program."""
     for start in (n for n in range(k) if INTERPRETER.fullmatch(PurePath(words[n]).name)):
         between = words[start + 1 : k]
         are_options = all(
@@ -93,26 +93,26 @@ def _is_code(words: Sequence[str], k: int) -> bool:
 
 
 logger = logging.getLogger(__name__)
-logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene
+logger.setLevel(logging.INFO)  # the program's output goes to the log of its scene
 
 Text = Annotated[str, Field(min_length=1)]
-Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # no option in the place of a name
-# What a program finds in its environment unless more is allowed: enough to start it, no credentials.
+Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # an option is not a name
+# The program's environment unless more is allowed: enough to start it, no credentials.
 ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
-INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # of a container
+INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # paths in a container
 
 
 class CommandConfig(BaseModel):
-    """What is run and where; docs/methods/command-method.md says it with examples.
+    """What is run and how; see docs/methods/command-method.md for examples.
 
-    - ``command``: words, or one line that is split as a shell splits it; {frames}, {output}, {work}, {scene}, {dataset}
-      and {seed} stand for themselves in either, and are in the environment as SU3D_FRAMES and so on. ``shell``: the
-      line goes to /bin/sh instead, and gets them from there
-    - ``runner``: plain, docker (with ``image``, ``gpus`` as docker has them, ``network``) or conda (with
-      ``environment``, a name or a folder). ``mounts``: more folders for the container, HERE:THERE, read-only
-    - ``pass_variables``: the environment variables that the program gets, of those that are set
-    - ``format``: of the prediction, where it cannot be recognised; ``classes_of``: the protocol whose class numbers the
-      program writes, where the dataset has several lists
+    - ``command``: words, or one line that is split like in a shell; {frames}, {output}, {work}, {scene}, {dataset}
+      and {seed} are replaced in both, and are in the environment as SU3D_FRAMES and so on. ``shell``: the
+      line is run by /bin/sh instead, and uses the variables
+    - ``runner``: plain, docker (with ``image``, ``gpus`` as in docker, ``network``) or conda (with
+      ``environment``, a name or a folder). ``mounts``: additional folders for the container, HERE:THERE, read-only
+    - ``pass_variables``: environment variables passed to the program, if set
+    - ``format``: of the prediction, if it cannot be recognized; ``classes_of``: the protocol whose class numbers the
+      program writes, if the dataset has several lists
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -135,17 +135,17 @@ class CommandConfig(BaseModel):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         if self.shell and not isinstance(self.command, str):
-            raise ValueError("shell = true takes the command as one line; a list of words needs no shell")
+            raise ValueError("shell = true requires the command as one line, not a list of words")
         check_placeholders(self.command, is_shell=self.shell)
         needed = {"docker": ("image", self.image), "conda": ("environment", self.environment)}.get(self.runner)
         if needed is not None and not needed[1]:
             raise ValueError(f"runner '{self.runner}' needs {needed[0]}")
         if (self.image or self.mounts or self.gpus or self.network) and self.runner != "docker":
-            raise ValueError("image, mounts, gpus and network belong to runner 'docker'")
+            raise ValueError("image, mounts, gpus and network require runner 'docker'")
         if self.environment and self.runner != "conda":
-            raise ValueError("environment belongs to runner 'conda'")
+            raise ValueError("environment requires runner 'conda'")
         if self.format is not None:
-            from su3d_bench.predictions.formats import READERS  # not for a list of methods
+            from su3d_bench.predictions.formats import READERS  # slow for a list of methods
 
             if self.format not in READERS:
                 raise ValueError(f"unknown format '{self.format}'; known: {', '.join(READERS)}")
@@ -153,14 +153,14 @@ class CommandConfig(BaseModel):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The command as the program gets it, placeholders unfilled."""
+        """The command for the program, with placeholders."""
         if not isinstance(self.command, str):
             return self.command
         return ("/bin/sh", "-c", self.command) if self.shell and self.command else tuple(shlex.split(self.command))
 
 
 class Command:
-    """Runs a program of yours once a scene: frames in a folder, a prediction in any format that evaluate reads."""
+    """Runs your program once per scene: frames in a folder, a prediction in any format that evaluate reads."""
 
     name = "command"
     is_system = False
@@ -170,38 +170,38 @@ class Command:
         paper="",
         source="",
         licence="that of the program",
-        needs=("a program of yours", "docker or conda where it is run there"),
-        status="hands over frames and reads predictions as tests of both ways show; vouches for no program",
+        needs=("your program", "docker or conda if used"),
+        status="writing frames and reading predictions are tested in both directions; the program itself is not",
     )
 
     def __init__(self, config: CommandConfig | None = None) -> None:
         self.config = config or CommandConfig()
         if not self.config.words:
             raise ConfigError(
-                "method 'command': no program is named; --set 'command.command=[\"run.sh\", \"{frames}\"]'"
+                "method 'command': no program is set; use --set 'command.command=[\"run.sh\", \"{frames}\"]'"
             )
         self._tools: SceneTools | None = None
         self._scene: SceneInfo | None = None
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
         self._scratch: TemporaryFolder | None = None
-        # What the last run of the program took: ``program_s`` and, where it was measured, ``program_peak_bytes``.
+        # Costs of the program's last run: ``program_s`` and, if measured, ``program_peak_bytes``.
         self.finish_costs: dict[str, float | int] = {}
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Frames alone: the program has its own perception."""
+        """Frames only: the program has its own perception."""
         return PerceptionNeeds(masks="none")
 
     @property
     def inputs(self) -> Mapping[str, str]:
-        """Digest of each file that the command names, so that another version of a program is another run."""
+        """Digest of each file in the command, so that another version of a program is another run."""
         if self.config.runner == "docker":
-            return {}  # its words are files of the image
+            return {}  # its words are files in the image
         command = self.config.command
         try:
             words = shlex.split(command) if isinstance(command, str) else command
-        except ValueError:  # what a shell alone can split is split at spaces
+        except ValueError:  # only a shell can split it: split at spaces
             words = str(command).split()
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
@@ -222,13 +222,13 @@ class Command:
         self._frames.open()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Adds the frame to the folder; the program runs when the map is asked for."""
+        """Adds the frame to the folder; the program runs when the map is requested."""
         assert self._frames is not None, "update before start"
         with timer.stage("export"):
             self._frames.add(frame)
 
     def finish(self) -> Prediction:
-        """What the program makes of the frames so far."""
+        """The program's map of the frames so far."""
         assert self._frames is not None and self._scratch is not None and self._scene is not None, "finish before start"
         self._frames.close()
         where = f"{self._scene.dataset}/{self._scene.scene}: command"
@@ -248,7 +248,7 @@ class Command:
             raise PredictionError(f"{where}: {text}") from error
 
     def close(self) -> None:
-        """Remove the folders that the program worked in."""
+        """Remove the program's folders."""
         if self._scratch is not None:
             self._scratch.close()
         self._scratch = self._frames = None
@@ -285,9 +285,9 @@ class Command:
         self._record(done)
         last = _last_line(done.stderr)
         if done.is_timed_out:
-            raise PredictionError(f"was ended after {self.config.timeout_s:g} s (timeout_s){last}")
+            raise PredictionError(f"terminated after {self.config.timeout_s:g} s (timeout_s){last}")
         if done.exit_code != 0:
-            how = f"exit code {done.exit_code}" if done.exit_code > 0 else f"was ended by signal {-done.exit_code}"
+            how = f"exit code {done.exit_code}" if done.exit_code > 0 else f"terminated by signal {-done.exit_code}"
             raise PredictionError(f"{how}{last}")
 
     def _values(self, folders: Mapping[str, str]) -> dict[str, str]:
@@ -297,12 +297,12 @@ class Command:
 
     def _filled(self, folders: Mapping[str, str]) -> list[str]:
         values = self._values(folders)
-        if self.config.shell:  # what a scene is called never stands where a shell reads commands
+        if self.config.shell:  # a scene name is never inserted into shell commands
             values = {name: f'"${variable_of(name)}"' for name in values}
         words = [PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), word) for word in self.config.words]
         if self.config.runner == "docker":
             return words
-        # The program runs in a folder of its own: files that were named from here must be found from there.
+        # The program runs in another folder: relative file names must be made absolute.
         return [str(Path(w).absolute()) if (k or "/" in w) and is_file(Path(w)) else w for k, w in enumerate(words)]
 
     def _docker_words(
@@ -316,7 +316,7 @@ class Command:
         words += ["--gpus", self.config.gpus] if self.config.gpus else []
         for mount in mounts:
             words += ["--volume", mount]
-        # The container has a PATH and a HOME of its own.
+        # The container has its own PATH and HOME.
         passed = [name for name in self.config.pass_variables if name in os.environ and name not in ENVIRONMENT]
         for name in [*passed, *told]:
             words += ["--env", name]
@@ -335,7 +335,7 @@ class Command:
 
 
 def _program_file(word: str) -> Path | None:
-    """The file that a word of the command names, if it names one; a bare name is looked for as the system does."""
+    """The file that a word of the command refers to, if any; a bare name is looked up like by the system."""
     if PLACEHOLDER.search(word):
         return None
     path = Path(word).expanduser()

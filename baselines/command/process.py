@@ -1,4 +1,4 @@
-"""Run somebody's program and look at it from outside: time, memory of its whole process tree, what it printed."""
+"""Run a user's program and monitor it from outside: time, memory of its process tree, output."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from su3d_bench.core.system.files import file_text
 
 SUPERVISOR = Path(supervisor.__file__)
 ENDING_S = supervisor.ENDING_S + KILL_WAIT_S + 5.0  # for the supervisor to end the program, and a container
-KEPT_CHARACTERS = 100_000  # of each stream, from its end: a log that a person still reads
-GRACE_S = 5.0  # between asking a program to stop and ending it
-MAX_WAIT_S = 0.2  # between two looks at a program; the first ones follow each other faster
+KEPT_CHARACTERS = 100_000  # of each stream, from its end: still readable
+GRACE_S = 5.0  # between asking a program to stop and killing it
+MAX_WAIT_S = 0.2  # between two polls of a program; the first polls are faster
 CGROUPS = Path("/sys/fs/cgroup")
-# Where docker's drivers (systemd, cgroupfs) put a container's peak, for both versions of cgroups.
+# Where docker's drivers (systemd, cgroupfs) store a container's peak, for both cgroup versions.
 PEAK_FILES = (
     "system.slice/docker-{id}.scope/memory.peak",
     "docker/{id}/memory.peak",
@@ -38,9 +38,9 @@ PEAK_FILES = (
 
 @dataclass(frozen=True)
 class Finished:
-    """A program that has ended; ``exit_code`` is negative where a signal ended it, as in ``subprocess``.
+    """A finished program; ``exit_code`` is negative if a signal ended it, as in ``subprocess``.
 
-    ``peak_memory_bytes``: None where it was not measured; ``memory_source`` says how it was, or why not.
+    ``peak_memory_bytes``: None if not measured; ``memory_source``: how it was measured, or why not.
     """
 
     exit_code: int
@@ -53,10 +53,10 @@ class Finished:
 
 
 class MemoryMonitor:
-    """The most memory that a program held; ``look`` is called again and again while it runs.
+    """The peak memory of a program; ``look`` is called repeatedly while it runs.
 
-    That of a process and all its descendants, where pages that several share count once for each; or, where docker
-    writes the id of a container into ``id_file``, the peak that its cgroup keeps, with the files that it caches.
+    That of a process and all its descendants, where shared pages count once for each; or, if docker
+    writes a container id into ``id_file``, the peak recorded by its cgroup, including cached files.
     ``source``: how it was measured, or why not.
     """
 
@@ -64,12 +64,12 @@ class MemoryMonitor:
         self._pid, self._id_file = pid, id_file
         self._seen: dict[int, Any] = {}
         self.peak_bytes: int | None = None
-        self.source = "resident memory of all processes together, sampled"
+        self.source = "total resident memory of all processes, sampled"
         if id_file is not None:
             self.source = "not measured: the cgroup cannot be read here"
 
     def look(self) -> None:
-        """Note what is held now."""
+        """Record the current memory."""
         if self._id_file is not None:
             self._check_container(self._id_file)
             return
@@ -93,9 +93,9 @@ class MemoryMonitor:
                 self.source = "the container's cgroup"
 
     def end(self) -> None:
-        """End what was seen and is left running.
+        """Kill processes that were seen and still run.
 
-        Where the system has no orphans that can be adopted, or the supervisor was killed.
+        Needed if the system cannot adopt orphans, or if the supervisor was killed.
         """
         import psutil
 
@@ -106,7 +106,7 @@ class MemoryMonitor:
 
 
 def _own_peak_bytes(pid: int) -> int:
-    """The peak of one process since it began its program, which no sample can miss; 0 where it is not told."""
+    """The peak of one process since its program started, which sampling cannot miss; 0 if unavailable."""
     try:
         lines = file_text(Path(f"/proc/{pid}/status")).splitlines()
     except OSError:
@@ -115,7 +115,7 @@ def _own_peak_bytes(pid: int) -> int:
 
 
 class _Tail(Thread):
-    """Reads a stream to its end and keeps its last characters, whatever comes."""
+    """Reads a stream to its end and keeps its last characters, regardless of content."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         super().__init__(daemon=True)
@@ -123,7 +123,7 @@ class _Tail(Thread):
         self._kept, self._n_read = b"", 0
 
     def run(self) -> None:
-        # ValueError: the stream was closed because a runaway child still holds its other end.
+        # ValueError: the stream was closed because a runaway child still has its other end open.
         with suppress(OSError, ValueError):
             while chunk := os.read(self._stream.fileno(), 65536):
                 self._n_read += len(chunk)
@@ -132,14 +132,14 @@ class _Tail(Thread):
     def text(self) -> str:
         self.join(GRACE_S)
         text, n_dropped = self._kept.decode("utf-8", "replace"), self._n_read - len(self._kept)
-        return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped > 0 else text
+        return f"[{n_dropped} earlier bytes omitted]\n{text}" if n_dropped > 0 else text
 
 
 class _Supervised:
-    """A program under its supervisor, ``supervisor.py``, which ends it when this process does, however that comes.
+    """A program under its supervisor, ``supervisor.py``, which ends it whenever this process ends.
 
-    ``afterwards`` is run wherever the program is ended and does not end by itself; ``scratch`` is removed where this
-    process is gone and cannot do it.
+    ``afterwards`` is run if the program does not end by itself; ``scratch`` is removed by the supervisor if this
+    process died.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class _Supervised:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                start_new_session=True,  # what ends this process's group leaves the supervisor to do its work
+                start_new_session=True,  # killing this process's group spares the supervisor
             )
         finally:
             os.close(answers)
@@ -170,7 +170,7 @@ class _Supervised:
         order |= {"afterwards": list(afterwards), "scratch": str(scratch or "")}
         try:
             self._order(json.dumps(order).encode() + b"\n")
-            answer = self._answer(None) or {"error": "its supervisor was ended"}
+            answer = self._answer(None) or {"error": "its supervisor was killed"}
             if "error" in answer:
                 raise ConfigError(f"'{words[0]}' cannot be started: {answer['error']}")
             self.pid = int(answer["pid"])
@@ -179,9 +179,9 @@ class _Supervised:
             raise
 
     def has_ended(self, wait_s: float) -> bool:
-        """Whether the program has ended, at the latest after ``wait_s``."""
+        """Whether the program has ended, waiting at most ``wait_s``."""
         if self.exit_code is None and (answer := self._answer(wait_s)) is not None:
-            # A supervisor that was killed has no answer, and the system has ended the program after it.
+            # A killed supervisor gives no answer, and the system has ended the program after it.
             self.exit_code = int(answer.get("exit_code", -signal.SIGKILL))
         return self.exit_code is not None
 
@@ -190,7 +190,7 @@ class _Supervised:
         self._order(STOP)
 
     def end(self) -> None:
-        """End the program and all that it started."""
+        """Kill the program and everything it started."""
         self._order(DONE)
         self.has_ended(ENDING_S)
 
@@ -208,7 +208,7 @@ class _Supervised:
             self._orders.flush()
 
     def _answer(self, wait_s: float | None) -> dict[str, Any] | None:
-        """The next answer, empty where no supervisor is left to give one; None where none came within ``wait_s``."""
+        """The next answer, empty if the supervisor is gone; None if none came within ``wait_s``."""
         until = None if wait_s is None else time.monotonic() + wait_s
         while b"\n" not in self._said:
             left_s = None if until is None else max(until - time.monotonic(), 0.0)
@@ -232,10 +232,10 @@ def run_program(
     afterwards: Sequence[str] = (),
     scratch: Path | None = None,
 ) -> Finished:
-    """Run ``words`` in ``folder`` until it ends or ``timeout_s`` is over; nothing that it started outlives the call.
+    """Run ``words`` in ``folder`` until it ends or after ``timeout_s``; nothing it started outlives the call.
 
-    Nor this process, however that ends: ``afterwards`` is run where the program does not end by itself, and ``scratch``
-    is removed where this process is gone and cannot do it. Into ``id_file`` docker writes the id of a container. A
+    This also holds if this process dies: ``afterwards`` is run if the program does not end by itself, and ``scratch``
+    is removed if this process is gone. Docker writes the container id into ``id_file``. A
     program that cannot be started is a ``ConfigError``.
     """
     start = time.perf_counter()

@@ -1,8 +1,8 @@
-"""Runs one program, and ends it and all that it started as soon as the process that asked for it is gone.
+"""Runs one program, and kills it and everything it started as soon as the requesting process is gone.
 
-A script, started with ``python -I -S``: it imports nothing of the harness, and so neither waits for it nor holds its
-memory. It stands between a run and somebody's program because a process that is killed can do nothing any more, but the
-system closes its pipes, and that can be waited for.
+A script, started with ``python -I -S``: it imports nothing of the harness, so it starts fast and needs little
+memory. It sits between a run and a user's program because a killed process cannot clean up, but the
+system closes its pipes, which can be detected.
 
 It reads its standard input: one line of JSON with the command, then ``STOP`` or ``DONE``. When that pipe closes because
 the parent process has died, it ends the program and removes its folders. It writes to a second pipe, one line of JSON
@@ -24,18 +24,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-STOP, DONE = b"S", b"D"  # ask the program to stop; end it, the parent process removes its folders
-ENDING_S = 5.0  # for processes that were killed to be gone; what waits for a dead disk stays
+STOP, DONE = b"S", b"D"  # ask the program to stop; kill it, the parent process removes its folders
+ENDING_S = 5.0  # for killed processes to disappear; those blocked on a dead disk stay
 KILL_WAIT_S = 60.0  # for `docker kill`
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 
 
 def main(answers: int) -> None:
-    # A child of nobody: Ray ends the children of a worker that it ends, and others end whole trees of processes.
+    # Detached from its parent: Ray and others kill the children of a worker, or whole process trees.
     if os.fork() > 0:
         os._exit(0)
-    # Whoever ends all processes of a job, a closed terminal among them, would leave the program without its supervisor.
-    # Handlers, for a signal that is ignored would be ignored by the program too.
+    # Killing all processes of a job (as closing a terminal does) must not leave the program without its supervisor.
+    # Handlers, because the program would inherit ignored signals.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda number, frame: None)
     woken, waker = os.pipe()
@@ -43,7 +43,7 @@ def main(answers: int) -> None:
     os.set_blocking(woken, False)
     signal.signal(signal.SIGCHLD, lambda number, frame: None)
     signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
-    _prctl(PR_SET_CHILD_SUBREAPER, 1)  # what the program started and left becomes a child of this process
+    _prctl(PR_SET_CHILD_SUBREAPER, 1)  # orphans of the program become children of this process
     with open(0, "rb", buffering=0, closefd=False) as orders:
         line = orders.readline()
     if not line.endswith(b"\n"):  # the parent process is gone already
@@ -64,7 +64,7 @@ def main(answers: int) -> None:
         _run_afterwards(order)
     exit_code = ended if exit_code is None else exit_code
     _answer(answers, {"exit_code": -signal.SIGKILL if exit_code is None else exit_code})
-    if last != DONE and os.read(0, 1) != DONE:  # whoever asked is gone
+    if last != DONE and os.read(0, 1) != DONE:  # the parent process is gone
         shutil.rmtree(order["scratch"], ignore_errors=True)
 
 
@@ -74,25 +74,25 @@ def _start(order: dict[str, Any]) -> int:
         cwd=order["folder"],
         env=order["environment"],
         stdin=subprocess.DEVNULL,
-        start_new_session=True,  # a process group of its own, which can be ended as a whole
+        start_new_session=True,  # a separate process group, which can be killed as a whole
         preexec_fn=lambda: _prctl(PR_SET_PDEATHSIG, signal.SIGKILL),
     )
-    process.returncode = 0  # it is waited for here, with all that is adopted
+    process.returncode = 0  # reaped here, with all adopted processes
     return process.pid
 
 
 def _prctl(option: int, value: int) -> None:
-    with suppress(OSError, AttributeError):  # another system than Linux: the process group alone is ended
+    with suppress(OSError, AttributeError):  # not Linux: only the process group is killed
         ctypes.CDLL(None).prctl(option, ctypes.c_ulong(value), 0, 0, 0)
 
 
 def _answer(answers: int, content: dict[str, object]) -> None:
-    with suppress(OSError):  # nobody is there to hear it
+    with suppress(OSError):  # the reader is gone
         os.write(answers, json.dumps(content).encode() + b"\n")
 
 
 def _wait(program: int, woken: int) -> tuple[int | None, bytes | None]:
-    """The program's exit code once it has ended, and the last order, empty at the end of the pipe, None without one."""
+    """The program's exit code once it has ended, and the last order (empty after the pipe closed, or None)."""
     last = None
     while True:
         ready, _, _ = select.select([0, woken], [], [])
@@ -110,7 +110,7 @@ def _wait(program: int, woken: int) -> tuple[int | None, bytes | None]:
 
 
 def _reap(program: int) -> int | None:
-    """Let go of every child that has ended; the exit code of the program where it is among them."""
+    """Reap every child that has ended; the exit code of the program if it is among them."""
     exit_code = None
     while True:
         try:
@@ -124,7 +124,7 @@ def _reap(program: int) -> int | None:
 
 
 def _end_all(program: int) -> int | None:
-    """End the program's group and all descendants; the program's exit code where it was running until now."""
+    """Kill the program's group and all descendants; the program's exit code if it was still running."""
     exit_code = None
     until = time.monotonic() + ENDING_S
     while True:
@@ -141,13 +141,13 @@ def _end_all(program: int) -> int | None:
 
 
 def _signal_group(program: int, number: signal.Signals) -> None:
-    # The group outlives its leader while any of its members runs, so that its number cannot be another's.
+    # The group outlives its leader while any member runs, so its number cannot be reused.
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(program, number)
 
 
 def _descendants() -> list[int]:
-    """The processes below this one; none where the system has no /proc."""
+    """The processes below this one; none without /proc."""
     children: dict[int, list[int]] = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError, ValueError, IndexError):

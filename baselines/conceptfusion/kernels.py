@@ -1,4 +1,4 @@
-"""Compiled loop of PointFusion's association; imported only when a map is made, for numba takes its time to load."""
+"""Compiled loop of PointFusion's association; imported only when a map is created, because numba loads slowly."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BEFORE_FIRST, BEFORE_LAST = -1e-3, 0.999
 def associate(points, normals, counts, view, distance_m, least_cosine):  # type: ignore[no-untyped-def]
     """The map point that each pixel (height * width) of a ``View`` is associated with, ABSENT for none.
 
-    Goes through all points once. Of several points the one with the highest count wins, then the nearest, then the
+    One pass over all points. Of several candidates the one with the highest count wins, then the nearest, then the
     first.
     """
     camera_to_world, intrinsics, width = view.camera_to_world, view.intrinsics, view.width

@@ -1,7 +1,7 @@
-"""ConceptFusion: pixel-aligned features of image and regions, fused into points; a feature a point, no instances.
+"""ConceptFusion: pixel-aligned features of image and regions, fused into points; one feature per point, no instances.
 
-For each pixel a mix of the image's feature and those of the regions over it. Source of that:
-extract_conceptfusion_features.py of concept-fusion at 4457c1f and of its branch fastsam at 668c26c; the uniqueness term
+Each pixel gets a mixture of the image's feature and those of the regions over it. Source:
+extract_conceptfusion_features.py of concept-fusion at 4457c1f and its branch fastsam at 668c26c; the uniqueness term
 is the paper's (Eq. 4).
 """
 
@@ -33,14 +33,14 @@ from su3d_bench.core.types import (
 
 Weights = Literal["softmax", "uniqueness"]
 Overlaps = Literal["sum", "small-over-large"]
-SMALLEST_LENGTH = 1e-12  # torch's normalize divides by no less
+SMALLEST_LENGTH = 1e-12  # lower bound of the divisor in torch's normalize
 
 
 @dataclass(frozen=True)
 class PixelFeatures:
-    """Which row of ``features`` (C, D) float16 each pixel has: ``row`` (height, width) int32.
+    """The row of ``features`` (C, D) float16 for each pixel: ``row`` (height, width) int32.
 
-    Pixels under the same masks share a row; that of pixels under no mask is all zero.
+    Pixels under the same masks share a row; the row of pixels under no mask is zero.
     """
 
     row: Int32Array
@@ -48,7 +48,7 @@ class PixelFeatures:
 
 
 def picked(n_pixels: int, n_picked: int) -> Int64Array:
-    """Which of ``n_pixels`` a nearest-neighbour resize to ``n_picked`` takes: floor(i n / m), as torch and OpenCV do.
+    """The positions (of ``n_pixels``) used by a nearest-neighbour resize to ``n_picked``: floor(i n / m), as in torch.
 
     >>> picked(6, 4).tolist(), picked(2, 4).tolist()
     ([0, 1, 3, 4], [0, 0, 1, 1])
@@ -57,10 +57,10 @@ def picked(n_pixels: int, n_picked: int) -> Int64Array:
 
 
 def mixing_weights(whole: Float32Array, regions: Float32Array, rule: Weights, temperature: float = 1.0) -> Float64Array:
-    """How much of the image's feature each region's pixels get (K,): a softmax over the regions of one image.
+    """Weight of the image's feature in each region's pixels (K,): a softmax over the regions of one image.
 
     ``softmax`` is over the cosines of regions (K, D) with the image's feature (D,); ``uniqueness`` adds to each the
-    mean cosine with the other regions. One region alone gets weight 1, and none of its own feature.
+    mean cosine with the other regions. A single region gets weight 1, hence nothing of its own feature.
 
     >>> mixing_weights(np.ones(2, np.float32), np.eye(2, dtype=np.float32), "softmax").tolist()
     [0.5, 0.5]
@@ -87,15 +87,15 @@ def paint(
     """The field of ``height`` x ``width`` pixels, from masks (K, H, W) of any size.
 
     ``sum``: masks in their order, F <- normalise(F + f_i), so that the last counts as much as all before it together.
-    ``small-over-large``: the mask of the largest box first, each overwriting those before.
-    The originals paint at full size and resize then, or the reverse; a nearest-neighbour resize makes them the same.
+    ``small-over-large``: masks by descending box area, each overwriting the previous ones.
+    The originals paint at full size and then resize, or vice versa; with nearest-neighbour resizing both are the same.
     """
     k, n_dimensions = features.shape
     if k == 0:
         return PixelFeatures(np.zeros((height, width), np.int32), np.zeros((1, n_dimensions), np.float16))
     rows, columns = picked(masks.shape[1], height), picked(masks.shape[2], width)
     is_inside = masks[:, rows[:, None], columns].reshape(k, -1)
-    # a feature for each set of masks that some pixel lies under, rather than one a pixel
+    # one feature per set of masks covering some pixel, not per pixel
     packed = np.ascontiguousarray(np.packbits(is_inside, axis=0).T)
     _, example, row = np.unique(
         packed.view(np.dtype((np.void, packed.shape[1]))).ravel(), return_index=True, return_inverse=True
@@ -112,7 +112,7 @@ def _painting_order(boxes: Float32Array, overlaps: Overlaps) -> Int64Array:
     if overlaps == "sum":
         return np.arange(len(boxes))
     areas = (boxes[:, 2] - boxes[:, 0]).astype(np.float64) * (boxes[:, 3] - boxes[:, 1])
-    return np.argsort(areas, kind="stable")[::-1]  # of equal boxes the first of the list is painted last, and seen
+    return np.argsort(areas, kind="stable")[::-1]  # of equal boxes the first in the list is painted last, on top
 
 
 def _normalised(rows: Float64Array) -> Float64Array:
@@ -130,35 +130,35 @@ SOURCE = (
 
 
 class ConceptFusionConfig(BaseModel):
-    """Every hyper-parameter; the defaults are the released scripts' where a comment says nothing else."""
+    """Every hyper-parameter; defaults are those of the released scripts unless a comment states otherwise."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     stride: int = Field(default=20, ge=1)
-    # The size at which pixels are fused, whatever the images' own: image_height and image_width of the fusion script.
+    # The size at which pixels are fused, for all images: image_height and image_width of the fusion script.
     height: int = Field(default=120, ge=2, le=4096)
     width: int = Field(default=160, ge=2, le=4096)
-    # The paper's Eq. 4: its README says that masks like Mask2Former's need it and that SAM's do without.
+    # The paper's Eq. 4: according to its README, Mask2Former's masks need it and SAM's do not.
     weights: Weights = "uniqueness"
     temperature: Positive = 1.0
     # "small-over-large" is that of the branch fastsam.
     overlaps: Overlaps = "sum"
-    # gradslam at 59ca872 averages a feature only where no channel is zero, which its own remark (and forks) take for
-    # "where not all are": "any-channel".
+    # gradslam at 59ca872 averages a feature only if no channel is zero; its comment (and forks) suggest
+    # "not all channels are zero": "any-channel".
     valid_features: Literal["no-zero-channel", "any-channel"] = "no-zero-channel"
-    # gradslam at 59ca872 multiplies confidence by feature in half precision, so that points beyond some 3 m, whose
-    # confidence is at its floor, lose the feature of the first image: "half", the preset half-products. Ours is
-    # "single", for what is lost there is neither in the paper nor meant.
+    # gradslam at 59ca872 multiplies confidence by feature in half precision, so that points beyond about 3 m, with
+    # minimal confidence, lose the feature of the first image: "half", the preset half-products. The default is
+    # "single", because that loss is neither in the paper nor intended.
     products: Literal["single", "half"] = "single"
     distance_m: Positive = 0.05  # PointFusion's dist_th
     normal_angle_deg: float = Field(default=20.0, ge=0, le=180)  # angle_th
     sigma: Positive = 0.6  # m, of alpha
-    # Ours: the same numbers from memory or from a file; a scene of 2 M points x 1024 dimensions is 4.1 GB.
+    # Ours: the same numbers in memory or in a file; a scene of 2 M points x 1024 dimensions takes 4.1 GB.
     features_in: Place = "disk"
 
 
 class ConceptFusion:
-    """Pixel features from masks of named objects, fused into one feature a point; it has no instances."""
+    """Pixel features from masks of named objects, fused into one feature per point; no instances."""
 
     name = "conceptfusion"
     warms_up = True
@@ -166,13 +166,13 @@ class ConceptFusion:
     presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"half-products": {"products": "half"}}
     about = MethodAbout(
         paper=PAPER,
-        source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are the paper's alone",
+        source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are from the paper only",
         licence="MIT (concept-fusion and gradslam)",
         needs=("masks of named objects",),
-        status="each formula of the released code and of the paper is tested on hand-worked values; run beside the "
-        "original programs on one made room with the same detections: points within 2e-6 m; the originals multiply "
-        "confidence by feature in half precision, where 15 % of the first frame's points, the far ones, lose their "
-        "feature (the preset half-products does so too); no figure of a paper has been reproduced",
+        status="each formula of the released code and of the paper is tested on hand-worked values; compared with the "
+        "original programs on one generated room with the same detections: points within 2e-6 m; they multiply "
+        "confidence by feature in half precision, where 15 % of the first frame's points (the far ones) lose their "
+        "feature (as with the preset half-products); no results of a paper have been reproduced",
     )
 
     def __init__(self, config: ConceptFusionConfig | None = None) -> None:
@@ -187,29 +187,29 @@ class ConceptFusion:
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Masks of named objects and surfaces, background too, as Mask2Former gives them in the paper.
+        """Masks of named objects and surfaces, including background, as from Mask2Former in the paper.
 
-        ConceptGraphs' table tells the two apart so: its ConceptFusion+SAM has SAM in Mask2Former's place.
+        ConceptGraphs' table distinguishes the two this way: its ConceptFusion+SAM replaces Mask2Former by SAM.
         """
         return PerceptionNeeds(masks="grounded")
 
     @property
     def n_points(self) -> int:
-        """Points of the map so far, those without a feature included."""
+        """Points of the map so far, including those without a feature."""
         return len(self._map)
 
     @property
     def map_bytes(self) -> int:
-        """What points, normals, counts and features take, wherever they lie."""
+        """Bytes of points, normals, counts and features, in memory or on disk."""
         features = self._features
         return self._map.n_bytes + (features.n_bytes + len(features) * 8 if features else 0)
 
     def start(self, scene: SceneInfo) -> None:
-        """Forgets the scene before; of the new one nothing needs to be known."""
+        """Resets the map; the new scene needs no preparation."""
         self._clear()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Fuses one image into the map; the association goes over the whole map, the rest over the image."""
+        """Fuses one image into the map; association scans the whole map, the rest only the image."""
         detections.check_of(frame)
         features = self._table_for(detections)
         with timer.stage("backproject"):
@@ -224,7 +224,7 @@ class ConceptFusion:
             self._average(features, view, field, matched)
         with timer.stage("insert"):
             pixel = self._map.insert(view, matched)
-            # a pixel of no mask makes a point too: its feature is zero, its confidence that of any other
+            # a pixel outside all masks creates a point too, with zero feature and normal confidence
             features.append(field.features, field.row.ravel()[pixel], view.alpha[pixel])
 
     def _table_for(self, detections: Detections) -> FeatureTable:
@@ -234,7 +234,7 @@ class ConceptFusion:
         if self._features.n_dimensions != n_dimensions:
             raise DataError(
                 f"frame {detections.frame_index}: features have {n_dimensions} dimensions, those of the map have "
-                f"{self._features.n_dimensions}; make all with one encoder"
+                f"{self._features.n_dimensions}; use one encoder for all"
             )
         return self._features
 
@@ -269,13 +269,13 @@ class ConceptFusion:
 
 
 class ConceptFusionSamConfig(ConceptFusionConfig):
-    """ConceptFusion's, without the uniqueness term: its README says that SAM's masks do without it."""
+    """ConceptFusion's, without the uniqueness term: according to its README, SAM's masks do not need it."""
 
     weights: Weights = "softmax"
 
 
 class ConceptFusionSam(ConceptFusion):
-    """Pixel features from class-agnostic masks of every region, fused into one feature a point; it has no instances."""
+    """Pixel features from class-agnostic masks of every region, fused into one feature per point; no instances."""
 
     name = "conceptfusion-sam"
     Config = ConceptFusionSamConfig
@@ -288,5 +288,5 @@ class ConceptFusionSam(ConceptFusion):
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Every region of an image, of objects and of their parts, which may overlap."""
+        """Every region of an image, objects and their parts, which may overlap."""
         return PerceptionNeeds(masks="class-agnostic", automatic="conceptfusion")

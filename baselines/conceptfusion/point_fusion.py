@@ -1,7 +1,7 @@
-"""PointFusion as gradslam has it: a map of points that images are associated with by projection and averaged into.
+"""PointFusion as in gradslam: a map of points; images are associated by projection and averaged into it.
 
-Source: gradslam, branch conceptfusion at 59ca872 (slam/fusionutils.py, structures/rgbdimages.py). Colours are left out:
-nothing that is scored reads them. The table holds one half-precision feature per point, in memory or on disk.
+Source: gradslam, branch conceptfusion at 59ca872 (slam/fusionutils.py, structures/rgbdimages.py). Colours are omitted:
+no metric uses them. The table has one half-precision feature per point, in memory or on disk.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, 
 
 Place = Literal["memory", "disk"]
 HalfArray = NDArray[np.float16]
-MAX_LENGTH = 1e30  # at its floor a confidence is rounded up by a fifth, at every image: kept from overflow
+MAX_LENGTH = 1e30  # minimal confidences are rounded up by a fifth at every image: prevents overflow
 BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 
 
 class FeatureTable:
     """Features (N, D) float16 and the confidence of each.
 
-    They lie in a file without a name, on disk or in memory, which is gone with the process, however that ends. The
-    arithmetic is that of a block in float32, rounded to half precision once an update. ``average_in_half`` leaves the
-    length of features apart, so that it does not leave half precision.
+    They are in an anonymous file, on disk or in memory, which disappears with the process. Arithmetic
+    uses blocks in float32, rounded to half precision once per update. ``average_in_half`` stores the
+    length of features separately, so that they stay within half precision.
     """
 
     def __init__(self, n_dimensions: int, place: Place) -> None:
         self.n_dimensions = n_dimensions
         self._file = _nameless_file(place)
         self._confidences = np.empty(0)
-        self._lengths: Float64Array | None = None  # (N,) by what each row is to be multiplied
+        self._lengths: Float64Array | None = None  # (N,) factor of each row
         self._n = 0
 
     def __len__(self) -> int:
@@ -44,7 +44,7 @@ class FeatureTable:
 
     @property
     def n_bytes(self) -> int:
-        """What the features take."""
+        """Bytes of the features."""
         return self._n * self.n_dimensions * 2
 
     @property
@@ -66,7 +66,7 @@ class FeatureTable:
         self._n = end
 
     def _write(self, block: HalfArray, first_row: int) -> None:
-        # A plain write fails where the disk is full; writing through a map of a sparse file would end the process.
+        # A plain write fails if the disk is full; writing through a memory map of a sparse file would kill the process.
         try:
             self._file.seek(first_row * self.n_dimensions * 2)
             self._file.write(block.tobytes())
@@ -75,13 +75,13 @@ class FeatureTable:
             raise _disk_error(error) from error
 
     def average(self, point: Int64Array, features: HalfArray, row: Int32Array, weights: Float64Array) -> None:
-        """Running mean of ``features[row]`` with ``weights`` into the features of ``point``, each named once.
+        """Running mean of ``features[row]`` with ``weights`` into the features of ``point`` (no duplicates).
 
         f <- (c f + w e) / (c + w), c <- c + w; the mean is not normalised.
         """
         if not len(point):
             return
-        order = np.argsort(point, kind="stable")  # neighbours in the file are read together
+        order = np.argsort(point, kind="stable")  # read neighbouring rows together
         table = self._mapped("r+")
         for start in range(0, len(order), BLOCK_ROWS):
             chosen = order[start : start + BLOCK_ROWS]
@@ -94,12 +94,12 @@ class FeatureTable:
             release_pages(table)
 
     def average_in_half(self, point: Int64Array, features: HalfArray, row: Int32Array, weights: Float64Array) -> None:
-        """As ``average``, to be called at every image that met a point, with gradslam's products of half precision.
+        """Like ``average``, for every image that matched a point, with gradslam's half-precision products.
 
-        Confidences are rounded to half precision before they are multiplied; that of the image times its feature stays
-        half precision, and so does, the first time, that of the map: what then falls below 3e-8 is gone. From then on
-        its features are of single precision, and a row that nothing is averaged into is multiplied by its rounded
-        confidence and divided by the one that is not. Source: fuse_with_map of gradslam at 59ca872.
+        Confidences are rounded to half precision first; the product of the image's confidence and feature
+        stays half precision, and so does the map's the first time: what falls below 3e-8 is lost. After that,
+        its features are in single precision, and a row without a match is multiplied by its rounded
+        confidence and divided by the unrounded one. Source: fuse_with_map of gradslam at 59ca872.
         """
         table = self._mapped("r+")
         held = self._confidences[: self._n].copy()
@@ -129,15 +129,15 @@ class FeatureTable:
         self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
-        # mapped anew at each use, for the file grows between them
+        # mapped again at each use, because the file grows in between
         return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
 
     def features(self) -> HalfArray:
-        """The features (N, D), read-only: a view of the table, whose rows move with the next ``average``."""
+        """The features (N, D), read-only: a view of the table, whose rows change with the next ``average``."""
         return self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
 
     def close(self) -> None:
-        """Give the disk space back; a view that is still held keeps it until it goes."""
+        """Release the disk space; a remaining view keeps it until it is deleted."""
         self._file.close()
 
 
@@ -159,7 +159,7 @@ def _disk_error(error: OSError) -> StoreError:
 
 
 def with_room(array: NDArray[Any], used: int, needed: int) -> NDArray[Any]:
-    """``array`` with room for ``needed`` rows, growing by a half so that appending stays cheap."""
+    """``array`` with space for ``needed`` rows, growing by half so that appending stays cheap."""
     if needed <= len(array):
         return array
     larger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -172,7 +172,7 @@ ABSENT = -1
 
 
 class View(NamedTuple):
-    """One image at the size of fusion, a row a pixel in row-major order, P = height * width; kernels take it as it is.
+    """One image at fusion size, one row per pixel in row-major order, P = height * width; used directly by kernels.
 
     ``points`` (P, 3) m and ``normals`` (P, 3) in the world, both zero without depth; ``has_depth`` (P,); ``alpha`` (P,)
     confidence; ``intrinsics`` (3, 3) at this size.
@@ -191,7 +191,7 @@ class View(NamedTuple):
 def alpha(points_camera: Float64Array, sigma: float) -> Float64Array:
     """Confidence of points (..., 3) m in the camera's frame: clamp(exp(-|p|^2 / (2 sigma^2)), 1e-7, 1.01).
 
-    At gradslam's sigma of 0.6 it stands at its floor beyond 3.4 m.
+    At gradslam's sigma of 0.6 it is minimal beyond 3.4 m.
 
     >>> alpha(np.array([[0.0, 0, 0], [0, 0, 0.6], [0, 0, 4]]), 0.6).round(7).tolist()
     [1.0, 0.6065307, 1e-07]
@@ -202,9 +202,9 @@ def alpha(points_camera: Float64Array, sigma: float) -> Float64Array:
 
 
 def normals_of(vertices: Float64Array) -> Float64Array:
-    """Unit normals (h, w, 3) of an image of points: the cross product of the steps to the right and down.
+    """Unit normals (h, w, 3) of an image of points: the cross product of the steps right and down.
 
-    The last column and row repeat the step before; a normal is zero where the steps are parallel.
+    The last column and row repeat the previous step; a normal is zero if the steps are parallel.
     """
     right, down = np.zeros_like(vertices), np.zeros_like(vertices)
     right[:, :-1] = vertices[:, 1:] - vertices[:, :-1]
@@ -222,9 +222,9 @@ def normals_of(vertices: Float64Array) -> Float64Array:
 def view_of(frame: Frame, rows: Int64Array, columns: Int64Array, sigma: float) -> View:
     """``frame`` reduced to the pixels at ``rows`` and ``columns``.
 
-    The intrinsics are scaled as gradslam scales them, by the ratio of the sizes and without regard to which pixel of
-    a cell was taken. gradslam moves all poses into the first camera's frame; the map here is in the world from the
-    start, which changes no distance and no angle.
+    The intrinsics are scaled as in gradslam: by the ratio of sizes, ignoring which pixel of
+    a cell was used. gradslam moves all poses into the first camera's frame; the map here is in the world from the
+    start, which changes no distances or angles.
     """
     (n_rows, n_columns), height, width = frame.depth_m.shape, len(rows), len(columns)
     intrinsics = frame.intrinsics * np.array([[width / n_columns], [height / n_rows], [1.0]])
@@ -238,7 +238,7 @@ def view_of(frame: Frame, rows: Int64Array, columns: Int64Array, sigma: float) -
     x = (u - intrinsics[0, 2] - intrinsics[0, 1] * y) / intrinsics[0, 0]
     vertices = np.stack([x * z, y * z, z], axis=-1)
     rotation, translation = frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3]
-    # einsum, not a matrix product: a threaded one waits for cores that others use
+    # einsum, not a matrix product: a threaded one waits for busy cores
     points = np.einsum("ij,hwj->hwi", rotation, vertices) + translation
     normals = np.einsum("ij,hwj->hwi", rotation, normals_of(vertices))
     shown = has_depth[..., None]
@@ -273,7 +273,7 @@ class PointFusion:
 
     @property
     def normals(self) -> Float64Array:
-        """Weighted means of unit normals, not normalised again; a view."""
+        """Weighted means of unit normals, not renormalised; a view."""
         return self._normals[: self._n]
 
     @property
@@ -283,15 +283,15 @@ class PointFusion:
 
     @property
     def n_bytes(self) -> int:
-        """What the points in use take."""
+        """Bytes of the points in use."""
         return self._n * 7 * 8
 
     def associate(self, view: View) -> Int64Array:
-        """The map point (P,) of each pixel, ABSENT for none; no point has two pixels. Costs a pass over the map.
+        """The map point (P,) of each pixel, ABSENT for none; each point has at most one pixel. One pass over the map.
 
-        A map point is projected and rounded to the nearest pixel; it matches where it lies nearer than the distance
-        and its normal within the angle. Of several the highest count wins, then the smallest distance to the pixel's
-        point (which gradslam calls the distance to the ray), then the older point.
+        A map point is projected and rounded to the nearest pixel; it matches if it is nearer than the distance
+        and its normal within the angle. Of several candidates the highest count wins, then the smallest distance to the
+        pixel's point (called the distance to the ray in gradslam), then the older point.
         """
         from su3d_bench.baselines.conceptfusion.kernels import associate
 
@@ -311,7 +311,7 @@ class PointFusion:
         self._counts[point] = total
 
     def insert(self, view: View, matched: Int64Array) -> Int64Array:
-        """Append the pixels with depth that found no point; those pixels, in the order of their new points."""
+        """Append the pixels with depth but no match; returns those pixels, in the order of their new points."""
         pixel = np.flatnonzero(view.has_depth & (matched == ABSENT))
         start, end = self._n, self._n + len(pixel)
         self._points = with_room(self._points, start, end)

@@ -1,4 +1,4 @@
-"""Compiled intersection of oriented boxes and averages of a grid's cells; imported only where a map is made."""
+"""Compiled intersection of oriented boxes and averages of grid cells; imported only when a map is created."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COINCIDENT_M = 1e-9
 
 @njit(cache=True)
 def _cut(polygon, n, axis, side, limit, result):  # type: ignore[no-untyped-def]
-    """The part of a polygon of ``n`` corners with ``side * x[axis] <= limit`` into ``result``; its corner count."""
+    """Clips a polygon of ``n`` corners to ``side * x[axis] <= limit`` into ``result``; returns its corner count."""
     m = 0
     for k in range(n):
         here, there = polygon[k], polygon[(k + 1) % n]
@@ -42,10 +42,10 @@ def _area(polygon, n, normal):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _flux(centre, rotation, half, other_half, origin, skip_coincident):  # type: ignore[no-untyped-def]
-    """Flux of ``(x - origin) / 3`` through the faces of a box that lie inside another box.
+    """Flux of ``(x - origin) / 3`` through the faces of a box inside another box.
 
-    All in the frame of the other box. ``skip_coincident`` leaves out faces that lie in a face of the other, same way
-    out, which would else count for both boxes.
+    All in the coordinates of the other box. ``skip_coincident`` skips faces that coincide with a face of the other and
+    have the same normal, which would otherwise count for both boxes.
     """
     total = 0.0
     polygon, result = np.empty((MAX_CORNERS, 3)), np.empty((MAX_CORNERS, 3))
@@ -73,7 +73,7 @@ def _flux(centre, rotation, half, other_half, origin, skip_coincident):  # type:
 
 @njit(cache=True)
 def intersection_volumes(centres_a, halves_a, rotations_a, centres_b, halves_b, rotations_b):  # type: ignore[no-untyped-def]
-    """Volumes (A, B) that boxes share, by the divergence theorem over the faces of both."""
+    """Intersection volumes (A, B) of boxes, by the divergence theorem over the faces of both."""
     volumes = np.zeros((len(centres_a), len(centres_b)))
     for i in range(len(centres_a)):
         a = np.ascontiguousarray(rotations_a[i])

@@ -1,4 +1,4 @@
-"""ConceptGraphs' map of objects, frame by frame: which detection joins which object; what its two variants share.
+"""ConceptGraphs' map of objects, frame by frame: association of detections with objects; shared by both variants.
 
 Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/cfslam_pipeline_batch.py``,
 ``conceptgraph/slam/mapping.py`` and ``compute_overlap_matrix_2set``.
@@ -17,16 +17,16 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances, Masks, starts_of
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Frame, Int64Array
 
-MIN_SIDE_M = 0.02  # thinner boxes are grown to it before they are intersected
+MIN_SIDE_M = 0.02  # thinner boxes are extended to it before intersection
 MIN_IOU = 1e-6
 NEW_OBJECT = -1
 
 
 def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Float64Array:
-    """IoU (M, N) of the boxes, sides below 2 cm grown.
+    """IoU (M, N) of the boxes, with sides of at least 2 cm.
 
-    Where one box of the frame or the map is not flat-sided enough for PyTorch3D, that of the clouds' axis-aligned
-    extents for all pairs, as the original does on PyTorch3D's error.
+    If PyTorch3D rejects a box of the frame or the map as not planar enough, the IoU of axis-aligned extents
+    is used for all pairs, as in the original after PyTorch3D's error.
     """
     of_detections = steps.grown([item.box for item in detections], MIN_SIDE_M)
     of_objects = steps.grown([item.box for item in objects], MIN_SIDE_M)
@@ -39,7 +39,7 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
 
 
 def overlap_similarity(detections: Sequence[MapObject], objects: Sequence[MapObject], voxel_m: float) -> Float64Array:
-    """The share (M, N) of each detection's points nearer than ``voxel_m`` to the object; 0 where boxes do not meet."""
+    """The share (M, N) of each detection's points nearer than ``voxel_m`` to the object; 0 for disjoint boxes."""
     similarity = np.zeros((len(detections), len(objects)))
     for i, j in np.argwhere(box_iou(detections, objects) >= MIN_IOU):
         similarity[i, j] = objects[j].share_near(detections[i].points, voxel_m)
@@ -61,7 +61,7 @@ def geometric_similarity(
 def semantic_similarity(
     detections: Sequence[MapObject], objects: Sequence[MapObject], config: MappingConfig
 ) -> Float64Array:
-    """s_sem (M, N): the cosine as the code has it, or the paper's phi_sem = cosine / 2 + 1 / 2."""
+    """s_sem (M, N): the cosine as in the code, or the paper's phi_sem = cosine / 2 + 1 / 2."""
     cosine: Float64Array = (
         np.stack([item.feature for item in detections]) @ np.stack([item.feature for item in objects]).T
     )
@@ -71,16 +71,16 @@ def semantic_similarity(
 def total_similarity(
     detections: Sequence[MapObject], objects: Sequence[MapObject], config: MappingConfig
 ) -> Float64Array:
-    """(1 + b) s_geo + (1 - b) s_sem (M, N) with the physical bias b, which is 0 in every published command."""
+    """(1 + b) s_geo + (1 - b) s_sem (M, N) with the physical bias b, 0 in all published commands."""
     geometric = geometric_similarity(detections, objects, config)
     semantic = semantic_similarity(detections, objects, config)
     return (1 + config.phys_bias) * geometric + (1 - config.phys_bias) * semantic
 
 
 def assign(similarity: Float64Array, threshold: float) -> Int64Array:
-    """The object (M,) that each detection joins: the most similar one at ``threshold`` or above, else NEW_OBJECT.
+    """The object (M,) for each detection: the most similar one at or above ``threshold``, otherwise NEW_OBJECT.
 
-    Several detections may join one object; the first of equally similar objects wins.
+    Several detections may join one object; ties go to the first object.
 
     >>> assign(np.array([[1.3, 1.2], [1.1, 1.19], [1.0, 1.2]]), 1.2).tolist()
     [0, -1, 1]
@@ -91,7 +91,7 @@ def assign(similarity: Float64Array, threshold: float) -> Int64Array:
 
 
 class ObjectMap:
-    """Objects in the foreground, and one object a background class that takes every region of its name."""
+    """Foreground objects, and one object per background class, which gets all regions with its name."""
 
     def __init__(self, config: MappingConfig, seed: int, background_names: Sequence[str] = ()) -> None:
         self._config = config
@@ -107,12 +107,12 @@ class ObjectMap:
 
     @property
     def n_points(self) -> int:
-        """Points of all objects, background included."""
+        """Points of all objects, including background."""
         return sum(len(item.points) for item in self._everything)
 
     @property
     def n_bytes(self) -> int:
-        """What points and features of all objects take, their KD-trees apart."""
+        """Bytes of points and features of all objects, without their KD-trees."""
         arrays = [(item.points, item.feature, item.text_feature) for item in self._everything]
         return sum(array.nbytes for of_object in arrays for array in of_object)
 
@@ -121,7 +121,7 @@ class ObjectMap:
         return [item for item in (*self._objects, *self._background.values()) if item is not None]
 
     def update(self, frame: Frame, detections: Detections, text_features: Float32Array, timer: StageTimer) -> None:
-        """Take in one frame; ``text_features`` (K, T) are those of the detections' names."""
+        """Add one frame; ``text_features`` (K, T) are those of the detections' names."""
         detections.check_of(frame)
         self._n_frames += 1
         self._feature_size = detections.crop_features.shape[2]
@@ -136,7 +136,7 @@ class ObjectMap:
             with timer.stage("background"):
                 self._merge_background(fresh)
         foreground = [item for item in fresh if item.sightings[0].name not in self._background]
-        if not foreground:  # the original goes on to the next frame here, past the periodic steps too
+        if not foreground:  # the original skips to the next frame here, including the periodic steps
             return
         if not self._objects:
             self._objects = foreground
@@ -173,7 +173,7 @@ class ObjectMap:
                 )
 
     def _associate(self, fresh: Sequence[MapObject], timer: StageTimer) -> None:
-        """All similarities are those before the first merge; no clustering here."""
+        """All similarities are computed before the first merge; no clustering here."""
         with timer.stage("match"):
             joins = assign(total_similarity(fresh, self._objects, self._config), self._config.association_threshold)
         with timer.stage("merge"):
@@ -184,7 +184,7 @@ class ObjectMap:
                     self._objects[j] = steps.merged(self._objects[j], item, self._config, with_dbscan=False)
 
     def _tidy_up(self, timer: StageTimer) -> None:
-        """What happens at every so many frames."""
+        """The periodic steps."""
         config = self._config
         if self._is_due(config.denoise_interval):
             with timer.stage("denoise"):
@@ -199,7 +199,7 @@ class ObjectMap:
         return interval > 0 and self._n_frames % interval == 0
 
     def finish(self) -> Instances:
-        """The map so far after its last clean-up, background objects last and labelled with their names."""
+        """The map after a final clean-up, background objects last and labelled with their names."""
         background = [steps.denoised(item, self._config) for item in self._background.values() if item is not None]
         objects = [steps.denoised(item, self._config) for item in self._objects]
         objects = steps.merge_overlapping(steps.seen_enough(objects, self._config), self._config)
@@ -226,7 +226,7 @@ class ObjectMap:
 
 
 def _description(item: MapObject) -> tuple[str, str]:
-    """The name of most of its detections, the first seen of equals, and the caption of the surest one of that name."""
+    """The most frequent name of its detections (the first in a tie), and the caption of the most certain of them."""
     names = Counter(seen.name for seen in item.sightings)
     name = max(names, key=lambda name: names[name])
     best = max((seen for seen in item.sightings if seen.name == name), key=lambda seen: seen.score)

@@ -1,4 +1,4 @@
-"""ConceptGraphs, class-agnostic: masks of everything, joined to objects by overlap in space and alike features."""
+"""ConceptGraphs, class-agnostic: masks of everything, merged into objects by spatial overlap and feature similarity."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo
 
-CROP_PADDING_PX = 20  # the original's crops: the box and 20 px on every side
+CROP_PADDING_PX = 20  # the original's crops: the box plus 20 px on every side
 
 
 class ConceptGraphs:
-    """Class-agnostic masks joined to objects where overlap in space and likeness of features sum to 1.2.
+    """Class-agnostic masks merged into objects if spatial overlap and feature similarity sum to at least 1.2.
 
-    The SAM-only variant of the original; ``finish`` gives the map so far and changes nothing. Every region is an "item"
-    to it: walls, floor and ceiling are objects like others unless their box is too large, and names are only shown.
+    The SAM-only variant of the original; ``finish`` returns the map so far unchanged. Every region is an "item"
+    to it: walls, floor and ceiling are ordinary objects unless their box is too large, and names are only displayed.
     """
 
     name = "conceptgraphs"
@@ -34,10 +34,10 @@ class ConceptGraphs:
         source="https://github.com/concept-graphs/concept-graphs, commit 5c4da70",
         licence="MIT",
         needs=("class-agnostic masks", "an image encoder"),
-        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; run beside the "
-        "original program on one made room with the same detections: 62 of 62 and 56 of 56 objects, 450 of 450 and 511 "
-        "of 511 associations, points equal once poses are rounded to float32 as there; the original's unseeded noise "
-        "moves voxel IoU between two of its own runs to a median of 0.65; no figure of the paper has been reproduced",
+        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; compared with "
+        "the original on one generated room with the same detections: 62 of 62 and 56 of 56 objects, 450 of 450, 511 "
+        "of 511 associations, points equal if poses are rounded to float32 as there; the original's unseeded noise "
+        "lowers the median voxel IoU between two of its own runs to 0.65; no results of the paper have been reproduced",
     )
 
     def __init__(self, config: MappingConfig | None = None) -> None:
@@ -49,7 +49,7 @@ class ConceptGraphs:
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Boxes that are too large are left out before their features are computed."""
+        """Too large boxes are excluded before their features are computed."""
         return PerceptionNeeds(
             masks="class-agnostic",
             crop_ratios=(1.0,),
@@ -72,15 +72,15 @@ class ConceptGraphs:
 
     @property
     def n_instances(self) -> int:
-        """Objects now, background and those seen too rarely included."""
+        """Current objects, including background and rarely seen ones."""
         return len(self._map)
 
     def start(self, scene: SceneInfo) -> None:
         self._map = self._empty_map(scene.seed)
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        # The original encodes the word "item" for every region; whatever its feature, all are equal and the cosine of
-        # any two is 1, as it is between these.
+        # The original encodes the word "item" for every region; whatever its feature, all are equal and any cosine
+        # is 1, as here.
         item = np.ones((len(detections), 1), np.float32)
         self._map.update(frame, detections, item, timer)
 
@@ -89,10 +89,10 @@ class ConceptGraphs:
 
 
 class DetectorConfig(MappingConfig):
-    """The values of the README's command for Detect where they differ; no overlap merge but the last.
+    """The values of the README's command for Detect where they differ; only a final overlap merge.
 
-    ``grounding``: how the profile ``paper`` names boxes. The original guesses by the first word of what a box was found
-    by; ``conceptgraphs-whole-tags`` leaves out a box that no whole tag names.
+    ``grounding``: how the profile ``paper`` names boxes. The original guesses by the first word of the phrase of a
+    box; ``conceptgraphs-whole-tags`` drops boxes not named by a whole tag.
     """
 
     mask_conf_threshold: Fraction = 0.25  # of GroundingDINO's score
@@ -105,9 +105,9 @@ class DetectorConfig(MappingConfig):
 
 
 class ConceptGraphsDetector(ConceptGraphs):
-    """ConceptGraphs with named masks of a tagger and a detector; walls, floor and ceiling are one object a class.
+    """ConceptGraphs with named masks of a tagger and a detector; walls, floor and ceiling are one object per class.
 
-    Background regions are merged whatever they look like. As in the original's evaluation the feature of an object
+    Background regions are merged regardless of appearance. As in the original's evaluation the feature of an object
     decides its class, not its detections' names; background objects have their own name as label.
     """
 
@@ -125,7 +125,7 @@ class ConceptGraphsDetector(ConceptGraphs):
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """Boxes are not limited here: background may fill the image."""
+        """Boxes are not limited here, because background may fill the image."""
         return PerceptionNeeds(
             masks="grounded",
             crop_ratios=(1.0,),

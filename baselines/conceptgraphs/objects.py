@@ -1,11 +1,11 @@
-"""The objects of ConceptGraphs' map: their clouds and boxes, merging two, denoising, dropping what was seen too rarely.
+"""Objects of ConceptGraphs' map: clouds and boxes, merging, denoising, removing those seen too rarely.
 
-Objects never change: a merge makes a new one, so that a map can be finished midway.
+Objects are immutable: a merge creates a new one, so a map can be finished midway.
 Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose geometry is Open3D's (from the regions
 of an image to clouds: ``filter_gobs``, ``gobs_to_detection_list``), and ``conceptgraph/utils/ious.py``
-(``mask_subtract_contained``; overlaps of boxes, for which it asks PyTorch3D's ``box3d_overlap``). The hyper-parameters
+(``mask_subtract_contained``; overlaps of boxes by PyTorch3D's ``box3d_overlap``). The hyper-parameters
 are those of ``configs/slam_pipeline/base.yaml`` and of the README's commands for the SAM-only variant; options that
-these commands leave off and that change the method (``use_contain_number``, other similarities) are left out.
+these commands leave off and that change the method (``use_contain_number``, other similarities) are omitted.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ Cosine = Annotated[float, Field(ge=-1, le=1)]
 Interval = Annotated[int, Field(ge=-1)]  # processed frames; -1 or 0: never
 InstanceScore = Literal["ones", "num-detections", "max-confidence"]
 
-# The sum of both similarities that joins a detection to an object. The two rules are not equivalent: 1.1 of the paper
-# is 1.2 of the code only where the cosine is 0.8.
+# The sum of both similarities required to join a detection to an object. The two rules are not equivalent: 1.1 in the
+# paper is 1.2 in the code only if the cosine is 0.8.
 SIM_THRESHOLDS = {"code": 1.2, "paper": 1.1}
 
 
 class MappingConfig(BaseModel):
-    """What both variants share; names are those of the original's configuration where it has one."""
+    """Settings shared by both variants; names are those of the original's configuration if it has them."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     stride: int = Field(default=5, ge=1)
     # code: overlap + cosine >= 1.2; paper: overlap + (cosine / 2 + 1 / 2) >= 1.1 (its equation for phi_sem).
     association: Literal["code", "paper"] = "code"
-    sim_threshold: float | None = None  # another threshold than that of the rule
-    # overlap: share of the detection's points that lie at the object; iou: of axis-aligned boxes, the default that the
+    sim_threshold: float | None = None  # overrides the threshold of the rule
+    # overlap: share of the detection's points near the object; iou: of axis-aligned boxes, the default that the
     # original's commands override.
     spatial_sim_type: Literal["overlap", "iou"] = "overlap"
     phys_bias: float = Field(default=0.0, ge=-1, le=1)
-    mask_area_threshold: int = Field(default=25, ge=0)  # pixels; the original takes at least 10
+    mask_area_threshold: int = Field(default=25, ge=0)  # pixels; the original uses at least 10
     mask_conf_threshold: Fraction = 0.95  # of SAM's predicted IoU
-    # Instead, where a profile's scores are on a scale of their own (Detections.score_scale); 0: all regions stay.
+    # Used instead if a profile's scores have a different scale (Detections.score_scale); 0: all regions stay.
     own_scale_conf_threshold: Fraction = 0.0
     max_bbox_area_ratio: Fraction = 0.5
-    min_points_threshold: int = Field(default=16, ge=0)  # the original takes at least 5
+    min_points_threshold: int = Field(default=16, ge=0)  # the original uses at least 5
     # Gaussian noise on every coordinate, "to avoid colinearity": 4 mm in the code, there from an unseeded generator,
     # here from the scene's seed. 0: none.
     noise_m: float = Field(default=0.004, ge=0, allow_inf_nan=False)
@@ -67,32 +67,32 @@ class MappingConfig(BaseModel):
     merge_overlap_thresh: float = Field(default=0.7, ge=0, le=1)  # 0: no overlap merge
     merge_visual_sim: Cosine = 0.8
     merge_text_sim: Cosine = 0.8
-    # The original has no scores; instance AP needs some. ones: as readers of its maps take it.
+    # The original has no scores, but instance AP needs them. ones: as assumed by readers of its maps.
     instance_score: InstanceScore = "ones"
 
     @property
     def association_threshold(self) -> float:
-        """The least similarity at which a detection joins an object."""
+        """Minimum similarity at which a detection joins an object."""
         return SIM_THRESHOLDS[self.association] if self.sim_threshold is None else self.sim_threshold
 
     @property
     def score_caveat(self) -> str:
-        """What must be said of the instances' scores."""
+        """The caveat on the instances' scores."""
         if self.instance_score == "ones":
             return "the original has no scores: 1 for every object"
         what = {"num-detections": "number of detections", "max-confidence": "largest detection score"}
         return f"the original has no scores: each object's {what[self.instance_score]}"
 
 
-MIN_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud stays
+MIN_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud is kept
 MIN_FOR_ORIENTED_BOX = 4  # points that span a volume
 
 
 def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
-    """The mean point (V, 3) of each occupied voxel, in the order of the voxels' first points.
+    """The mean point (V, 3) of each occupied voxel, ordered by the voxels' first points.
 
-    The grid starts half a voxel below the cloud's own minimum, as Open3D's ``voxel_down_sample`` has it: it moves with
-    the cloud, so that a cloud averaged again is not left as it is.
+    The grid starts half a voxel below the cloud's minimum, as in Open3D's ``voxel_down_sample``: it moves with
+    the cloud, so averaging a cloud again changes it.
     """
     if not len(points):
         return points
@@ -110,9 +110,9 @@ def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int
 
 
 def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Float64Array:
-    """The points of the largest DBSCAN cluster; all of them where there is none, or none of at least five points.
+    """The points of the largest DBSCAN cluster; all points if no cluster has at least five.
 
-    Of clusters of equal size the one whose first point comes first, as Python's ``Counter`` counts them.
+    Ties go to the cluster whose first point comes first, as with Python's ``Counter``.
     """
     labels = density_clusters(points, eps_m, min_points)
     distinct, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
@@ -124,7 +124,7 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
 
 
 def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
-    """The box around ``points``: along the principal axes of their convex hull, else along the world's axes."""
+    """The box around ``points``: along the principal axes of their convex hull, otherwise along the world's axes."""
     if oriented and len(points) >= MIN_FOR_ORIENTED_BOX:
         import open3d as o3d
 
@@ -132,13 +132,13 @@ def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
         try:
             box = cloud.get_oriented_bounding_box(robust=True)
             return OrientedBox(np.array(box.center), np.array(box.extent), np.array(box.R))
-        except RuntimeError:  # Qhull found no volume even in the jolted points
+        except RuntimeError:  # Qhull found no volume even after joggling
             pass
     low, high = points.min(axis=0), points.max(axis=0)
     return OrientedBox((low + high) / 2, high - low, np.eye(3))
 
 
-# The faces of PyTorch3D's boxes in our order of corners, where bit i of a corner is its side along axis i: PyTorch3D's
+# The faces of PyTorch3D's boxes in our corner order, where bit i of a corner is its side along axis i: PyTorch3D's
 # corners 0..7 are 0, 2, 6, 4, 1, 3, 7, 5 here.
 FACES = np.array([[0, 2, 6, 4], [4, 6, 7, 5], [0, 2, 3, 1], [0, 4, 5, 1], [2, 6, 7, 3], [1, 3, 7, 5]])
 COPLANAR_M = 1e-4  # PyTorch3D's tolerance
@@ -153,7 +153,7 @@ class Extents:
 
 
 def grown(boxes: Sequence[OrientedBox], least_side_m: float) -> list[OrientedBox]:
-    """``boxes`` with every side that is shorter grown to ``least_side_m`` about the centre."""
+    """``boxes`` with shorter sides extended to ``least_side_m`` about the centre."""
     return [OrientedBox(box.centre, np.maximum(box.sizes, least_side_m), box.rotation) for box in boxes]
 
 
@@ -165,13 +165,13 @@ def extents_of_boxes(boxes: Sequence[OrientedBox]) -> Extents:
 
 
 def extents_of_clouds(clouds: Sequence[Float64Array]) -> Extents:
-    """The axis-aligned extents of clouds, none of them empty."""
+    """The axis-aligned extents of non-empty clouds."""
     low, high = [cloud.min(axis=0) for cloud in clouds], [cloud.max(axis=0) for cloud in clouds]
     return Extents(np.array(low).reshape(-1, 3), np.array(high).reshape(-1, 3))
 
 
 def shared_volume(a: Extents, b: Extents) -> Float64Array:
-    """Volumes (A, B) that axis-aligned boxes share."""
+    """Intersection volumes (A, B) of axis-aligned boxes."""
     low = np.maximum(a.low[:, None], b.low[None])
     high = np.minimum(a.high[:, None], b.high[None])
     volume: Float64Array = np.maximum(high - low, 0).prod(axis=2)
@@ -192,7 +192,7 @@ def axis_aligned_iou(a: Extents, b: Extents) -> Float64Array:
 
 
 def oriented_iou(a: Sequence[OrientedBox], b: Sequence[OrientedBox]) -> Float64Array:
-    """IoU (A, B) of oriented boxes, exact up to rounding; every side must be longer than 0."""
+    """IoU (A, B) of oriented boxes, exact up to rounding; all sides must be longer than 0."""
     from su3d_bench.baselines.conceptgraphs import kernels as kernels
 
     shared = kernels.intersection_volumes(*_arrays(a), *_arrays(b))
@@ -203,10 +203,10 @@ def oriented_iou(a: Sequence[OrientedBox], b: Sequence[OrientedBox]) -> Float64A
 
 
 def are_coplanar(boxes: Sequence[OrientedBox]) -> bool:
-    """Whether PyTorch3D takes ``boxes``: the corners of each face lie in a plane, in single precision.
+    """Whether PyTorch3D accepts ``boxes``: the corners of each face are coplanar in single precision.
 
-    Boxes far from the origin fail by rounding; at the size of a building none does. As in PyTorch3D the distances of
-    the six faces' fourth corners are summed with their signs, so that those of opposite faces may cancel.
+    Boxes far from the origin fail by rounding; at building scale none does. As in PyTorch3D the distances of
+    the six faces' fourth corners are summed with signs, so those of opposite faces may cancel.
     """
     if not boxes:
         return True
@@ -231,10 +231,10 @@ def _arrays(boxes: Sequence[OrientedBox]) -> tuple[Float64Array, Float64Array, F
     return centres, halves, rotations
 
 
-MIN_MASK_AREA = 10  # pixels, whatever the configuration says
+MIN_MASK_AREA = 10  # pixels, regardless of the configuration
 MIN_POINTS = 5  # likewise
 MIN_VOLUME = 1e-6  # m^3 of the box of a detection
-MAX_CONTAINER_SHARE = 0.7  # th2: a box that covers more of the other is no part of it
+MAX_CONTAINER_SHARE = 0.7  # th2: a box covering more of the other is not part of it
 MIN_CONTAINED_SHARE = 0.8  # th1
 
 
@@ -248,7 +248,7 @@ class LiftedRegion:
 
 
 def kept_regions(detections: Detections, is_background: BoolArray, config: MappingConfig) -> NDArray[np.intp]:
-    """Rows of the regions that are large and sure enough; background may be as large as it is."""
+    """Rows of the regions that are large and certain enough; background may have any size."""
     if not len(detections):
         return np.zeros(0, np.intp)
     image_area = detections.masks.shape[1] * detections.masks.shape[2]
@@ -263,17 +263,17 @@ def kept_regions(detections: Detections, is_background: BoolArray, config: Mappi
 
 
 def subtract_contained(boxes: Float32Array, masks: BoolArray) -> BoolArray:
-    """``masks`` (K, H, W) without those of the boxes that each box contains.
+    """``masks`` (K, H, W) minus those of contained boxes.
 
-    Box i contains box j where j covers less than 0.7 of i and i covers more than 0.8 of j. In the order of i, then j,
-    each with what the steps before have left: what was cut out of a mask is not cut out of another by it.
+    Box i contains box j if j covers less than 0.7 of i and i covers more than 0.8 of j. In the order of i, then j,
+    using the results of previous steps: pixels already cut from a mask are not cut from another by it.
     """
     corners = boxes.astype(np.float64)
     areas = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
     low = np.maximum(corners[:, None, :2], corners[None, :, :2])
     high = np.minimum(corners[:, None, 2:], corners[None, :, 2:])
     shared = np.maximum(high - low, 0).prod(axis=2)
-    with np.errstate(invalid="ignore", divide="ignore"):  # a box without area is neither container nor contained
+    with np.errstate(invalid="ignore", divide="ignore"):  # a box without area neither contains nor is contained
         share = shared / areas[:, None]
     result = masks.copy()
     for i, j in np.argwhere((share < MAX_CONTAINER_SHARE) & (share.T > MIN_CONTAINED_SHARE)):
@@ -284,7 +284,7 @@ def subtract_contained(boxes: Float32Array, masks: BoolArray) -> BoolArray:
 def lift(
     frame: Frame, rows: NDArray[np.intp], masks: BoolArray, config: MappingConfig, seed: int
 ) -> Iterator[LiftedRegion]:
-    """The regions ``rows`` of a frame, whose masks (K, H, W) are given in their order, those too small left out."""
+    """The regions ``rows`` of a frame, whose masks (K, H, W) are in the same order; too small ones are dropped."""
     if not len(rows):
         return
     has_depth = valid_depth(frame.depth_m, 0.0, np.inf)
@@ -305,7 +305,7 @@ def lift(
 
 
 def cleaned(points: Float64Array, config: MappingConfig) -> Float64Array:
-    """``points`` averaged by voxel, then without what does not hang together with most of them."""
+    """``points`` averaged by voxel, keeping only the largest cluster."""
     points = voxel_average(points, config.downsample_voxel_size)
     if not config.dbscan_remove_noise:
         return points
@@ -313,16 +313,16 @@ def cleaned(points: Float64Array, config: MappingConfig) -> Float64Array:
 
 
 def box_of(points: Float64Array, config: MappingConfig) -> OrientedBox:
-    """The box of a cloud: oriented where the similarity is the overlap of points, else along the world's axes."""
+    """The box of a cloud: oriented if the similarity is point overlap, otherwise along the world's axes."""
     return bounding_box(points, oriented=config.spatial_sim_type == "overlap")
 
 
-MIN_AFTER_DENOISING = 4  # points; with fewer the object stays as it was
+MIN_AFTER_DENOISING = 4  # points; with fewer the object is unchanged
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """One detection of an object: where it is found again, and what perception said of it."""
+    """One detection of an object: its frame and position, and what perception reported."""
 
     frame_index: int
     detection: int
@@ -344,7 +344,7 @@ class MapObject:
 
     @property
     def n_detections(self) -> int:
-        """Detections merged into it; those of an object that was merged twice count twice, as in the original."""
+        """Detections merged into it; those of an object merged twice count twice, as in the original."""
         return len(self.sightings)
 
     @cached_property
@@ -366,7 +366,7 @@ class MapObject:
         return int(np.count_nonzero(distances < radius_m))
 
     def reach(self, radius_m: float) -> tuple[Float64Array, Float64Array]:
-        """The corners (3,) of a box beyond which nothing is nearer than ``radius_m``; its margin covers rounding."""
+        """The corners (3,) of a box outside which nothing is nearer than ``radius_m``; its margin covers rounding."""
         low, high = self.extent
         return low - 1.001 * radius_m, high + 1.001 * radius_m
 
@@ -377,13 +377,13 @@ class MapObject:
 
 
 def unit(vector: Float64Array) -> Float64Array:
-    """``vector`` scaled to length 1; zeros stay."""
+    """``vector`` scaled to length 1; zeros are unchanged."""
     length = float(np.linalg.norm(vector))
     return vector / length if length > 0 else vector
 
 
 def merged(into: MapObject, other: MapObject, config: MappingConfig, *, with_dbscan: bool) -> MapObject:
-    """``into`` with ``other``; each feature weighs as many detections as it had before the merge."""
+    """``into`` merged with ``other``; features are weighted by the number of detections before the merge."""
     points = np.concatenate([into.points, other.points])
     points = cleaned(points, config) if with_dbscan else voxel_average(points, config.downsample_voxel_size)
     n, m = into.n_detections, other.n_detections
@@ -398,7 +398,7 @@ def merged(into: MapObject, other: MapObject, config: MappingConfig, *, with_dbs
 
 
 def denoised(item: MapObject, config: MappingConfig) -> MapObject:
-    """``item`` averaged anew and reduced to its largest cluster."""
+    """``item`` averaged by voxel and reduced to its largest cluster."""
     points = cleaned(item.points, config)
     if len(points) < MIN_AFTER_DENOISING:
         return item
@@ -406,7 +406,7 @@ def denoised(item: MapObject, config: MappingConfig) -> MapObject:
 
 
 def seen_enough(objects: Sequence[MapObject], config: MappingConfig) -> list[MapObject]:
-    """The objects of enough points and detections."""
+    """The objects with enough points and detections."""
     return [
         item
         for item in objects
@@ -417,7 +417,7 @@ def seen_enough(objects: Sequence[MapObject], config: MappingConfig) -> list[Map
 def overlap_ratios(objects: Sequence[MapObject], radius_m: float) -> Float64Array:
     """The share (N, N) of object i's points nearer than ``radius_m`` to a point of object j.
 
-    0 on the diagonal and where the axis-aligned extents of the two boxes share no volume.
+    0 on the diagonal and if the axis-aligned extents of the two boxes do not overlap.
     """
     extents = extents_of_boxes([item.box for item in objects])
     has_shared_volume = shared_volume(extents, extents) > 0
@@ -425,7 +425,7 @@ def overlap_ratios(objects: Sequence[MapObject], radius_m: float) -> Float64Arra
     ratios = np.zeros((len(objects), len(objects)))
     for i in np.flatnonzero(has_shared_volume.any(axis=1)).tolist():
         points = objects[i].points
-        # By the longest axis, so that a wall is not gone through from end to end for each of the things along it.
+        # Sorted along the longest axis, so that a wall is not scanned from end to end for each object along it.
         axis = int(np.argmax(np.ptp(points, axis=0)))
         points = points[np.argsort(points[:, axis])]
         along = points[:, axis].copy()
@@ -437,11 +437,11 @@ def overlap_ratios(objects: Sequence[MapObject], radius_m: float) -> Float64Arra
 
 
 def merge_overlapping(objects: Sequence[MapObject], config: MappingConfig) -> list[MapObject]:
-    """The objects after those that lie in another that looks like them went into it.
+    """Merge each object into a similar one that contains it.
 
-    Pairs go by falling ratio; of equal ratios the last by (i, j) first, which is what the original's reversed sort
-    gives where its sort keeps the order of equals. As in the original, ratios are not computed anew after a merge, and
-    an object that has gone into another can go into a second one too.
+    Pairs are processed by descending ratio; ties start with the last (i, j), as in the original's reversed sort
+    if it is stable. As in the original, ratios are not updated after a merge, and
+    an already merged object can be merged into a second one too.
     """
     if config.merge_overlap_thresh <= 0:
         return list(objects)
@@ -453,7 +453,7 @@ def merge_overlapping(objects: Sequence[MapObject], config: MappingConfig) -> li
         i, j = rows[k], columns[k]
         if ratios[i, j] <= config.merge_overlap_thresh:
             break
-        # cosines: the features are of length 1, or all zeros
+        # cosines: features have length 1, or are zero
         looks_alike = result[i].feature @ result[j].feature > config.merge_visual_sim
         is_called_alike = result[i].text_feature @ result[j].text_feature > config.merge_text_sim
         if looks_alike and is_called_alike and is_kept[j]:

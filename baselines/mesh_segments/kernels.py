@@ -1,4 +1,4 @@
-"""Edges of a mesh with their weights, GNU's sort, and the forest that joins vertices; single precision as ScanNet's."""
+"""Mesh edges with weights, GNU's sort, and the forest that joins vertices; single precision as in ScanNet's program."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from su3d_bench.numerics.clusters import root_of
 
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
-SHORT = 16  # runs up to this length are left to the insertion sort, as _S_threshold of GNU's std::sort
+SHORT = 16  # runs up to this length use insertion sort: _S_threshold of GNU's std::sort
 
 
 @njit(cache=True)
 def vertex_normals(vertices, triangles):  # type: ignore[no-untyped-def]
-    """Running means (V, 3) of the unit normals of the triangles around each vertex, in the order of the triangles."""
+    """Running means (V, 3) of the unit normals of the triangles around each vertex, in triangle order."""
     normals = np.zeros((len(vertices), 3), np.float32)
     counts = np.zeros(len(vertices), np.int32)
     for t in range(len(triangles)):
@@ -47,10 +47,10 @@ def vertex_normals(vertices, triangles):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def edges_of(vertices, triangles):  # type: ignore[no-untyped-def]
-    """Three edges (3 T, 2) a triangle, those of two triangles twice, and their weights (3 T,).
+    """Three edges (3 T, 2) per triangle, shared edges twice, and their weights (3 T,).
 
-    The weight is 1 minus the dot product of the normals, squared where the end's normal leans away from the start: a
-    convex edge counts less.
+    The weight is 1 minus the dot product of the normals, squared if the end's normal leans away from the start:
+    convex edges count less.
     """
     normals = vertex_normals(vertices, triangles)
     edges = np.empty((3 * len(triangles), 2), np.int32)
@@ -78,7 +78,7 @@ def edges_of(vertices, triangles):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore[no-untyped-def]
-    """The root (V,) of each vertex after the edges in the given order, and then small segments, were joined."""
+    """The root (V,) of each vertex after joining along the edges in the given order, and then small segments."""
     parent = np.arange(n_vertices).astype(np.int32)
     rank = np.zeros(n_vertices, np.int32)
     size = np.ones(n_vertices, np.int32)
@@ -100,7 +100,7 @@ def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore
 
 @njit(cache=True)
 def _join(parent, rank, size, a, b):  # type: ignore[no-untyped-def]
-    """Hang the root of the lower rank below the other, ``a`` below ``b`` where they are equal; the root that stays."""
+    """Attach the root of lower rank to the other, ``a`` to ``b`` in a tie; the remaining root."""
     if rank[a] > rank[b]:
         parent[b] = a
         size[a] += size[b]
@@ -114,10 +114,10 @@ def _join(parent, rank, size, a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def sort_as_gnu(weights, edges):  # type: ignore[no-untyped-def]
-    """Sorts both by ``weights`` in place, equal ones in the order in which GNU's ``std::sort`` leaves them.
+    """Sorts both by ``weights`` in place, ties in the order of GNU's ``std::sort``.
 
-    Introsort: quicksort with the median of three as pivot down to runs of 16, heap sort where it goes too deep,
-    insertion sort at the end. With a NaN among the weights the original is undefined; here no step leaves the list.
+    Introsort: quicksort with median-of-three pivots down to runs of 16, heap sort if the recursion is too deep,
+    insertion sort at the end. NaN weights are undefined in the original; here no step leaves the list.
     """
     n = len(weights)
     if n < 2:
@@ -134,7 +134,7 @@ def sort_as_gnu(weights, edges):  # type: ignore[no-untyped-def]
                 break
             depth_left -= 1
             cut = _partition(weights, edges, first, last)
-            # the parts do not touch each other: their order does not matter
+            # the parts are independent: their order does not matter
             stack.append((cut, last, depth_left))
             last = cut
     for k in range(1, n):
@@ -201,7 +201,7 @@ def _heap_sort(weights, edges, first, last):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _sift_down(weights, edges, first, hole, n, weight, a, b):  # type: ignore[no-untyped-def]
-    """Lets the hole sink to a leaf along the larger children, then its new content rise, as GNU's __adjust_heap."""
+    """Moves the hole to a leaf along the larger children, then sifts its new content up, as GNU's __adjust_heap."""
     top, child = hole, hole
     while child < (n - 1) // 2:
         child = 2 * (child + 1)

@@ -1,4 +1,4 @@
-"""Projection of points into a depth image, and how many pixels a mask covers; imported lazily."""
+"""Projection of points into a depth image, and the number of pixels per mask; imported lazily."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def project(points, projection, depth_m, tolerance_m):  # type: ignore[no-untype
 
 @njit(cache=True)
 def count_distinct(pixels, indptr, indices, n_image):  # type: ignore[no-untyped-def]
-    """Distinct pixels of each mask, in whichever order its members come."""
+    """Number of distinct pixels of each mask, in any order of its members."""
     last_mask = np.full(n_image, -1, np.int32)
     counts = np.zeros(len(indptr) - 1, np.int64)
     for k in range(len(indptr) - 1):

@@ -1,7 +1,7 @@
 """OpenMask3D: class-agnostic 3D proposals, each described by crops of the few views that show it best.
 
-It is bound to its proposals: what no proposal covers is never found, what one merges stays merged. Which views show a
-mask best, prompted masks, crops at levels and their mean: openmask3d/mask_features_computation/utils.py,
+It depends on its proposals: objects without a proposal are never found, merged ones stay merged. Selection of views,
+prompted masks, crops at levels and their mean: openmask3d/mask_features_computation/utils.py,
 features_extractor.py and openmask3d/data/load.py at commit 3bc3fc5.
 """
 
@@ -35,9 +35,9 @@ from su3d_bench.perception.cache import mask_boxes
 def prompted_mask(
     regions: RegionPerception, frame: Frame, pixels: Int64Array, n_rounds: int, n_points: int, rng: np.random.Generator
 ) -> BoolArray | None:
-    """The mask (H, W) of which the segmenter is surest in ``n_rounds``, each of ``n_points`` random ones of ``pixels``.
+    """The mask (H, W) with the highest score in ``n_rounds``, each prompted by ``n_points`` random ones of ``pixels``.
 
-    The first of equals; None where every round is empty or of certainty 0, where the original stops with an error.
+    The first in a tie; None if every round is empty or has score 0, where the original stops with an error.
     """
     best, best_score = None, 0.0
     for _ in range(n_rounds):
@@ -48,7 +48,7 @@ def prompted_mask(
 
 
 def crop_boxes(mask: BoolArray, n_levels: int, growth: float) -> Int64Array:
-    """Boxes (n_levels, 4), x0 y0 x1 y1, right and bottom exclusive, of a mask that is not empty.
+    """Boxes (n_levels, 4), x0 y0 x1 y1, right and bottom exclusive, of a non-empty mask.
 
     Level 0 is tight; level l is larger on every side by l times the floor of the growth times the side, clipped.
 
@@ -67,10 +67,10 @@ NO_VIEW = -1
 
 
 def swapped_intrinsics(intrinsics: Float64Array, resolution: tuple[int, int], height: int, width: int) -> Float64Array:
-    """What OpenMask3D makes of ``intrinsics`` (3, 3) at ``resolution`` (height, width) for images of another size.
+    """OpenMask3D's version of ``intrinsics`` (3, 3) at ``resolution`` (height, width) for images of another size.
 
     The focal lengths are scaled by a floored width over the height, and by the width; each centre by the other axis's
-    factor: that is the original's slip, which moves the centre by about a pixel.
+    factor: this is a bug of the original, which shifts the centre by about a pixel.
 
     >>> colour = np.array([[1170.0, 0, 648], [0, 1170, 484], [0, 0, 1]])
     >>> swapped_intrinsics(colour, (968, 1296), 480, 640).round(2).tolist()
@@ -86,9 +86,9 @@ def swapped_intrinsics(intrinsics: Float64Array, resolution: tuple[int, int], he
 
 
 def as_openmask3d(frame: Frame, resolution: tuple[int, int]) -> Float64Array:
-    """The intrinsics that OpenMask3D would use for ``frame``, were it a reduced image of ``resolution``.
+    """The intrinsics that OpenMask3D would use for ``frame`` if it were downsampled from ``resolution``.
 
-    The camera at full resolution is the frame's own, scaled up axis by axis, centres between corner pixels.
+    The camera at full resolution is the frame's, scaled up per axis, with centres between corner pixels.
     """
     height, width = frame.depth_m.shape
     full_height, full_width = resolution
@@ -103,12 +103,12 @@ def as_openmask3d(frame: Frame, resolution: tuple[int, int]) -> Float64Array:
 def visible_pixels(
     points: Float32Array, frame: Frame, intrinsics: Float64Array, depth_tolerance_m: float
 ) -> Int32Array:
-    """The pixel (V,), row * width + column, at which each point is seen; -1 where it is not.
+    """The pixel (V,), row * width + column, at which each point is visible; -1 if it is not.
 
-    A pixel is the projection truncated toward zero, so that -0.9 lies in pixel 0. A point is seen where its depth
-    differs from the image's by at most ``depth_tolerance_m``. As in the original nothing asks for a positive depth:
-    beside a hole of the depth image, whose depth is 0, a point within the tolerance of the camera's plane is seen,
-    whichever side it is on; one in the plane itself falls on the first pixel.
+    A pixel is the projection truncated toward zero, so -0.9 is in pixel 0. A point is visible if its depth
+    differs from the image's by at most ``depth_tolerance_m``. As in the original, negative depth is not excluded:
+    at a hole of the depth image (depth 0), a point within the tolerance of the camera plane is visible,
+    on either side; one exactly in the plane falls on the first pixel.
     """
     from su3d_bench.baselines.openmask3d.kernels import project
 
@@ -118,10 +118,10 @@ def visible_pixels(
 
 
 class MaskViews:
-    """The ``k`` views of each mask with the most pixels, so far; of equal views the earlier one comes first.
+    """The ``k`` views of each mask with the most pixels so far; ties go to the earlier view.
 
-    ``positions`` (K, k) are positions of frames in the order of ``add``, -1 where there are fewer; ``n_pixels`` (K, k).
-    The original sorts unstably: which of equal views it takes depends on NumPy and the machine.
+    ``positions`` (K, k) are positions of frames in the order of ``add``, -1 if there are fewer; ``n_pixels`` (K, k).
+    The original sorts unstably: its choice among equal views depends on NumPy and the machine.
     """
 
     def __init__(self, n_masks: int, k: int) -> None:
@@ -129,7 +129,7 @@ class MaskViews:
         self.n_pixels = np.zeros((n_masks, k), np.int64)
 
     def add(self, position: int, n_pixels: Int64Array) -> None:
-        """Enter the view ``position``, later than all before, in which each mask covers ``n_pixels`` (K,)."""
+        """Add the view ``position``, later than all before, in which each mask covers ``n_pixels`` (K,)."""
         if not self.positions.size:
             return
         better = np.flatnonzero(n_pixels > self.n_pixels[:, -1])
@@ -141,7 +141,7 @@ class MaskViews:
 
 
 def count_pixels(pixels: Int32Array, proposals: Proposals, n_image: int) -> Int64Array:
-    """How many distinct ones of ``pixels`` (V,), of the ``n_image`` that there are, each mask covers (K,)."""
+    """Number of distinct ``pixels`` (V,), of ``n_image`` in total, that each mask covers (K,)."""
     from su3d_bench.baselines.openmask3d.kernels import count_distinct
 
     counts: Int64Array = count_distinct(pixels, proposals.indptr, proposals.indices, n_image)
@@ -159,13 +159,13 @@ Pixels = Annotated[int, Field(ge=2, le=65536)]
 
 
 class OpenMask3DConfig(ProposalConfig):
-    """Hyper-parameters of views, prompts and crops with the names and values of the original's ScanNet200 run.
+    """Hyper-parameters of views, prompts and crops, named and set as in the original's ScanNet200 run.
 
-    The masks are Mask3D's where ``proposals_folder`` names them.
+    The masks are Mask3D's if ``proposals_folder`` contains them.
 
-    ``intrinsics``: ``as-is`` projects with the frame's own; ``openmask3d`` with what the original's scaling would make
-    of them, had the frames been reduced from ``intrinsic_resolution`` (height, width): its centre is about a pixel off.
-    ``confidence``: 1 for every mask, as the original is evaluated, or the score of its ``proposal``.
+    ``intrinsics``: ``as-is`` projects with the frame's own; ``openmask3d`` with the original's scaling,
+    as if frames had been downsampled from ``intrinsic_resolution`` (height, width): its centre is about a pixel off.
+    ``confidence``: 1 for every mask, as in the original's evaluation, or the score of its ``proposal``.
     """
 
     stride: int = Field(default=10, ge=1)  # openmask3d.frequency
@@ -181,7 +181,7 @@ class OpenMask3DConfig(ProposalConfig):
 
 
 class OpenMask3D:
-    """OpenMask3D: 3D proposals of Mask3D's kind, described by CLIP features of their five best views."""
+    """OpenMask3D: 3D proposals as from Mask3D, described by CLIP features of their five best views."""
 
     name = "openmask3d"
     Config: type[OpenMask3DConfig] = OpenMask3DConfig
@@ -190,31 +190,31 @@ class OpenMask3D:
         source="https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
         licence="MIT",
         needs=("a mesh of the scan", "Mask3D's exported masks; without them weight-free proposals from the mesh"),
-        status="projection, view selection, crops and means are tested on hand-worked values, its file formats on made "
-        "files; segments equal those of ScanNet's program on made meshes; run beside the original program on one made "
+        status="projection, view choice, crops and means are tested on hand-worked values, file formats on synthetic "
+        "files; segments match ScanNet's program on synthetic meshes; compared with the original on a generated "
         "room with the same masks: the same views, 72 of 72 crops; Mask3D's score of a part is a mean of its heat map, "
-        "which exports do not hold; no figure of the paper has been reproduced",
+        "which exports lack; no results of the paper have been reproduced",
     )
 
-    needs_surface = True  # its proposals lie on the scan's mesh
+    needs_surface = True  # its proposals are on the scan's mesh
 
     def __init__(self, config: OpenMask3DConfig | None = None) -> None:
         self.config = config or self.Config()
-        self.finish_costs: dict[str, float | int] = {}  # frames read again and views looked at by the last ``finish``
+        self.finish_costs: dict[str, float | int] = {}  # frames read again and views used by the last ``finish``
 
     @property
     def needs(self) -> PerceptionNeeds:
-        """No detections: it prompts for masks itself, where its proposals lie."""
+        """No detections: it prompts for masks itself, at its proposals."""
         return PerceptionNeeds(masks="none", true_proposals=self.config.kind == "oracle")
 
     @property
     def caveat(self) -> str | None:
-        """What must be said beside numbers from these proposals."""
+        """The caveat on results from these proposals."""
         return SOURCE if self.config.kind == "surface" else None
 
     @property
     def inputs(self) -> Mapping[str, str]:
-        """Digest of the proposals' files, which are no part of the configuration."""
+        """Digest of the proposals' files, which are not part of the configuration."""
         folder = self.config.proposals_folder
         return {} if folder is None else {"proposals": digest_of_folder(folder)}
 
@@ -224,7 +224,7 @@ class OpenMask3D:
 
     @property
     def map_bytes(self) -> int:
-        """What the proposals take: their points, masks and scores."""
+        """Bytes of the proposals: points, masks and scores."""
         proposals = self.proposals
         arrays = (proposals.points, proposals.indptr, proposals.indices, proposals.scores)
         return sum(array.nbytes for array in arrays)
@@ -234,11 +234,11 @@ class OpenMask3D:
         return len(self.proposals)
 
     def receive_tools(self, tools: SceneTools) -> None:
-        """The frames to look at again, the mesh, and perception on demand."""
+        """Access to frames for reading again, the mesh, and perception on demand."""
         self._tools = tools
 
     def start(self, scene: SceneInfo) -> None:
-        """Makes or reads the proposals."""
+        """Creates or reads the proposals."""
         self.proposals = make_proposals(self.config, self._tools, scene.dataset, scene.scene)
         self.finish_costs = {}
         self._scene = scene
@@ -246,7 +246,7 @@ class OpenMask3D:
         self._frame_indices: list[int] = []
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Enters the frame among the views of the masks it shows; costs what the mesh and the masks are large."""
+        """Adds the frame to the views of its visible masks; cost grows with mesh and masks."""
         with timer.stage("project"):
             pixels = self._visible(frame)
         with timer.stage("select"):
@@ -257,8 +257,8 @@ class OpenMask3D:
     def finish(self) -> Instances:
         """The proposals with the mean feature of their best views so far; changes nothing.
 
-        It is the plain mean of the unit features of all crops of a mask, itself not of unit length, and zeros without a
-        crop. The chosen frames are read again, once each and in order.
+        The plain mean of the unit features of all crops of a mask, not normalized; zeros without a
+        crop. The selected frames are read again, once each and in order.
         """
         start = time.perf_counter()
         k = len(self.proposals)
@@ -296,10 +296,10 @@ class OpenMask3D:
         return frame
 
     def _view_features(self, mask: int, frame: Frame, visible: np.ndarray) -> Float32Array:
-        """The features of the crops of one view of ``mask``; none where its prompts find nothing."""
+        """The features of the crops of one view of ``mask``; none if its prompts find nothing."""
         config, regions = self.config, self._tools.regions
         pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
-        # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
+        # Each view has its own generator, so its prompts do not depend on other masks or an earlier finish.
         rng = np.random.default_rng([self._scene.seed, mask, frame.index])
         seen = prompted_mask(regions, frame, pixels, config.num_random_rounds, config.num_selected_points, rng)
         if seen is None:
@@ -312,7 +312,7 @@ class OpenMask3D:
         k = len(proposals)
         is_view = views.positions != NO_VIEW
         frame_of = np.append(np.array(self._frame_indices, np.int32), np.int32(-1))
-        # In the order of their number of pixels; of a view no detection is known but the mask itself.
+        # Ordered by number of pixels; the only known detection of a view is the mask itself.
         rows = np.stack([frame_of[views.positions], np.broadcast_to(np.arange(k)[:, None], is_view.shape)], axis=-1)
         return Instances.of(
             proposals.points,
@@ -324,23 +324,23 @@ class OpenMask3D:
         )
 
 
-# Views, prompts, crops and features are OpenMask3D's. Source of what differs: Segment3D's evaluation script at commit
+# Views, prompts, crops and features are OpenMask3D's. Source of differences: Segment3D's evaluation script at commit
 # 1861478.
 class OpenMask3DSegment3DConfig(OpenMask3DConfig):
-    """OpenMask3D's settings with Segment3D's for proposals: 400 queries, and parts by density instead of by gaps."""
+    """OpenMask3D's settings with Segment3D's for proposals: 400 queries, and parts by density instead of gaps."""
 
     part_eps_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05  # general.dbscan_eps
     part_min_points: int = Field(default=5, ge=1)  # general.dbscan_min_points
     part_max_dropped: int = Field(default=15, ge=0)
     part_kept_share: Annotated[float, Field(gt=0, le=1)] = 0.8  # general.topk_per_image
     surface_max: int = Field(default=400, ge=1, le=100_000)  # queries of the evaluation script
-    surface_min_points: int = Field(default=16, ge=1)  # more than what part_max_dropped drops
-    # SAM cuts objects into parts and parts of parts; so of two nested proposals more stay beside each other.
+    surface_min_points: int = Field(default=16, ge=1)  # more than part_max_dropped
+    # SAM splits objects into parts and parts of parts; so more nested proposals are kept.
     surface_same_iou: Annotated[float, Field(gt=0, le=1)] = 0.8
 
 
 class OpenMask3DSegment3D(OpenMask3D):
-    """OpenMask3D with Segment3D's proposals: many fine parts, small and weak ones dropped."""
+    """OpenMask3D with Segment3D's proposals: many fine parts; small and weak ones are dropped."""
 
     name = "openmask3d-segment3d"
     Config = OpenMask3DSegment3DConfig
@@ -353,5 +353,5 @@ class OpenMask3DSegment3D(OpenMask3D):
         needs=("a mesh of the scan", "Segment3D's exported masks; without them weight-free proposals from the mesh"),
         status="as openmask3d; connected parts, dropped ones and the kept share are tested on hand-worked values; no "
         "public file of these proposals was found; Segment3D's score of a part is a mean of its heat map, "
-        "which exports do not hold: parts keep the score of their mask; no figure has been reproduced",
+        "which exports lack: parts keep the score of their mask; no results have been reproduced",
     )

@@ -1,10 +1,10 @@
-"""Class-agnostic 3D proposals for methods that describe masks: from files, from the mesh's shape, or from the truth.
+"""Class-agnostic 3D proposals for methods that describe masks: from files, the mesh's shape, or ground truth.
 
-Files are those of Mask3D, Segment3D and OpenMask3D, in any format of masks that `evaluate` reads, treated as these do
-before they save: connected parts, small ones left out.
+Files are those of Mask3D, Segment3D and OpenMask3D, in any mask format that `evaluate` reads, processed as they do
+before saving: connected parts, without small ones.
 
-From the shape alone, without weights (ours; not Mask3D's): the mesh's segments (the dataset's, else ScanNet's
-algorithm) are merged to a tree, and the nodes that bend most against what is around them for the length of their border
+From the shape alone, without weights (ours; not Mask3D's): the mesh's segments (the dataset's, otherwise ScanNet's
+algorithm) are merged into a tree; nodes whose border bends most, relative to its length,
 become masks.
 """
 
@@ -35,10 +35,10 @@ NOISE = -1
 def split_into_parts(
     proposals: Proposals, eps_m: float, min_points: int, most_dropped: int, kept_share: float
 ) -> Proposals:
-    """Each connected part of each mask as a mask with its score, the best first, of equal ones the earlier.
+    """Each connected part of each mask as a mask with its score, best first, ties in order.
 
-    Parts are DBSCAN's with ``eps_m`` and ``min_points``, whose noise belongs to none; those of at most ``most_dropped``
-    points go, and of n others the first floor(``kept_share`` n) stay.
+    Parts are DBSCAN's with ``eps_m`` and ``min_points``, without noise; those of at most ``most_dropped``
+    points are dropped, and the first floor(``kept_share`` n) of the other n are kept.
     """
     parts: list[Int64Array] = []
     scores: list[float] = []
@@ -56,9 +56,9 @@ def split_into_parts(
 
 
 def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
-    """Each mask made of whole segments: those of which it holds more than half, as both networks are evaluated.
+    """Each mask made of whole segments: those of which it contains more than half, as both networks are evaluated.
 
-    ``segments`` (N,) are numbered from 0 on, one a point; masks that hold no segment by more than half become empty.
+    ``segments`` (N,) are numbered from 0, one per point; masks without more than half of any segment become empty.
 
     >>> points = np.zeros((5, 3), np.float32)
     >>> masks = Proposals(np.array([0, 3]), np.array([0, 1, 3]), points=points, scores=np.ones(1), source="made")
@@ -78,7 +78,7 @@ def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
 
 
 def density_clusters(points: Float32Array, eps_m: float, min_points: int) -> Int64Array:
-    """DBSCAN's label (N,) of each point, 0, 1, ... in the order of their first points, -1 for noise."""
+    """DBSCAN's label (N,) of each point, 0, 1, ... ordered by first point, -1 for noise."""
     if not len(points):
         return np.zeros(0, np.int64)
     if min_points <= 1:
@@ -89,10 +89,10 @@ def density_clusters(points: Float32Array, eps_m: float, min_points: int) -> Int
 
 
 def linked_within(points: Float64Array, gap_m: float) -> Int64Array:
-    """The group (N,) of each point, where points within ``gap_m`` of each other are linked: DBSCAN with one point.
+    """The group (N,) of each point, linking points within ``gap_m`` of each other: DBSCAN with one point.
 
-    DBSCAN itself lists all neighbours, which is the square of the number of points where ``gap_m`` spans a room. Here
-    points share a cube whose diagonal is ``gap_m``, and two cubes are linked by their nearest points.
+    DBSCAN itself lists all neighbours, quadratic in the number of points if ``gap_m`` spans a room. Here
+    points are grouped in cubes of diagonal ``gap_m``, and two cubes are linked by their nearest points.
     """
     from scipy.spatial import cKDTree
 
@@ -125,29 +125,29 @@ def linked_within(points: Float64Array, gap_m: float) -> Int64Array:
 
 
 def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:
-    """The masks of ``scene`` over the vertices of ``surface``, in the order of the file; classes are left aside.
+    """The masks of ``scene`` over the vertices of ``surface``, in file order; classes are ignored.
 
-    Raises ``PredictionError`` where the files hold no masks, cannot be used, or are of another mesh.
+    Raises ``PredictionError`` if the files have no masks, cannot be used, or belong to another mesh.
     """
-    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+    from su3d_bench.predictions.formats import recognise  # imports every format: slow for a list of methods
 
     reader = recognise(folder)
     prediction = reader.read(folder, scene)
     masks, where = prediction.content, shown(prediction.path)
     if not isinstance(masks, VertexMasks):
-        raise PredictionError(f"{where}: format '{reader.name}' holds no masks over the mesh; give proposals that do")
+        raise PredictionError(f"{where}: format '{reader.name}' has no masks over the mesh; use proposals that do")
     n_vertices = len(surface.vertices)
     if masks.n_points not in (None, n_vertices):
         raise PredictionError(
-            f"{where}: proposals of {masks.n_points} points, but the mesh of '{scene}' has {n_vertices} vertices; take "
-            "proposals that were made on this mesh"
+            f"{where}: proposals of {masks.n_points} points, but the mesh of '{scene}' has {n_vertices} vertices; use "
+            "proposals created for this mesh"
         )
     source = f"{reader.name} in {where}"
     return Proposals(masks.indptr, masks.indices, points=surface.vertices, scores=masks.scores, source=source)
 
 
 def digest_of_folder(folder: Path) -> str:
-    """A key of the names and content of all files below ``folder``; of a missing one, of nothing."""
+    """A key of the names and content of all files below ``folder``, which may be missing."""
     files: Mapping[str, Path] = {
         path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()
     }
@@ -160,19 +160,19 @@ def digest_of_folder(folder: Path) -> str:
 
 @cache
 def _digest(path: Path, size: int, changed_ns: int) -> str:
-    """Of the content; what size and time tell is that it need not be read again for the next scene."""
+    """A key of the content; size and time decide whether it must be read again for the next scene."""
     return digest_file(path)
 
 
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
-# Square metres of surface from which on size no longer speaks for a part. Chosen on rooms/living0 and rooms/office0.
+# Surface area (square metres) above which size no longer counts for a part. Chosen on rooms/living0 and rooms/office0.
 FULL_AREA_M2 = 0.5
-MIN_BORDER = 0.2  # added to the relative length of a border, which is 0 where a part touches nothing
-LONE_BEND = 0.3  # bend of the border of a part that touches nothing
+MIN_BORDER = 0.2  # added to the relative border length, which is 0 for an isolated part
+LONE_BEND = 0.3  # border bend of an isolated part
 
 
 def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: int = MIN_VERTICES) -> Int64Array:
-    """The segment (V,) of each vertex, numbered 0 to S - 1: the published ones, else those of ScanNet's algorithm."""
+    """The segment (V,) of each vertex, numbered 0 to S - 1: published, otherwise by ScanNet's algorithm."""
     segments = surface.segments
     if segments is None:
         segments = mesh_segments(surface.vertices, surface.triangles, threshold, min_vertices)
@@ -180,7 +180,7 @@ def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: in
 
 
 def surface_proposals(surface: Surface, row: Int64Array, config: ProposalConfig) -> Proposals:
-    """The masks over the vertices of ``surface``, the best first; ``row`` (V,) is the segment of each vertex."""
+    """The masks over the vertices of ``surface``, best first; ``row`` (V,) is the segment of each vertex."""
     tree = merge_tree(contacts_of(surface.vertices, surface.triangles, row))
     n_points = np.bincount(row, minlength=len(tree.leaves))
     scores = contrast(tree)
@@ -194,10 +194,10 @@ def surface_proposals(surface: Surface, row: Int64Array, config: ProposalConfig)
 
 
 def contrast(tree: SegmentTree) -> Float64Array:
-    """How much each node stands out (N,), about 0 to 1: mean bend of its border over the border's relative length.
+    """How much each node stands out (N,), about 0 to 1: mean bend of its border over the relative border length.
 
-    The relative length is the number of contacts over the root of the number of patches; nodes of less than
-    ``FULL_AREA_M2`` count by the root of their area.
+    The relative length is the number of contacts over the root of the number of patches; nodes below
+    ``FULL_AREA_M2`` are weighted by the root of their area.
     """
     mean_bend = np.where(tree.n_contacts > 0, tree.bend / np.maximum(tree.n_contacts, 1), LONE_BEND)
     border = tree.n_contacts / np.sqrt(tree.n_patches)
@@ -207,10 +207,10 @@ def contrast(tree: SegmentTree) -> Float64Array:
 
 
 def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, config: ProposalConfig) -> Int64Array:
-    """The nodes that become masks, the best first, of equal ones the earlier; ``n_points`` (S,) of the segments.
+    """The nodes that become masks, best first, ties in order; ``n_points`` (S,) of the segments.
 
-    At most ``surface_max``, of ``surface_min_points`` vertices to ``surface_max_share`` of all; of two nested ones
-    whose IoU exceeds ``surface_same_iou`` only the better one.
+    At most ``surface_max``, of ``surface_min_points`` vertices up to ``surface_max_share`` of all; of two nested ones
+    whose IoU exceeds ``surface_same_iou`` only the better one is kept.
     """
     before = np.concatenate([[0], np.cumsum(n_points[tree.leaves])])
     n_of_node = before[tree.end] - before[tree.start]
@@ -232,13 +232,13 @@ Share = Annotated[float, Field(gt=0, le=1)]
 
 
 class ProposalConfig(BaseModel):
-    """Where proposals come from; the defaults are Mask3D's in OpenMask3D, as far as the original has the setting.
+    """Source of proposals; the defaults are Mask3D's in OpenMask3D if the original has the setting.
 
-    ``proposals``: ``files`` of ``proposals_folder``, ``surface`` for weight-free ones made from the mesh, ``oracle``
-    for the truth's instances; ``auto`` takes files where a folder is set, else the surface.
-    ``split_parts``: the original's last step on its masks: their connected parts, then whole segments by majority
-    where ``segment_vote`` is on. Exports have gone through it, so it is done for ``surface`` alone; ``always`` does it
-    for files, too. Proposals from the truth stay as they are.
+    ``proposals``: ``files`` of ``proposals_folder``, ``surface`` for weight-free ones from the mesh, ``oracle``
+    for the ground truth's instances; ``auto`` uses files if a folder is set, otherwise the surface.
+    ``split_parts``: the original's last step on its masks: connected parts, then whole segments by majority
+    if ``segment_vote`` is on. Exports already include it, so it applies to ``surface`` only; ``always`` applies it
+    to files too. Proposals from the ground truth are unchanged.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
@@ -264,7 +264,7 @@ class ProposalConfig(BaseModel):
         if self.proposals == "files" and self.proposals_folder is None:
             raise ValueError("proposals = 'files' needs proposals_folder, the folder of the masks")
         if self.proposals in ("surface", "oracle") and self.proposals_folder is not None:
-            raise ValueError(f"proposals = '{self.proposals}' reads no proposals_folder; leave one of the two out")
+            raise ValueError(f"proposals = '{self.proposals}' does not use proposals_folder; remove one of the two")
         return self
 
     @property
@@ -276,7 +276,7 @@ class ProposalConfig(BaseModel):
 
 
 def make_proposals(config: ProposalConfig, tools: SceneTools, dataset: str, scene: str) -> Proposals:
-    """The proposals of a scene over the vertices of its mesh, empty masks included where files have them."""
+    """The proposals of a scene over the vertices of its mesh, including empty masks if files have them."""
     kind, surface = config.kind, _surface(config, tools, f"{dataset}/{scene}")
     if kind == "oracle":
         return _true_proposals(tools, surface)
@@ -305,12 +305,12 @@ def _surface(config: ProposalConfig, tools: SceneTools, where: str) -> Surface:
         return tools.surface()
     except DataError as error:
         reason = str(error).removeprefix(f"{where}: ")
-        raise DataError(f"{where}: proposals '{config.kind}' lie on the scan's mesh: {reason}") from error
+        raise DataError(f"{where}: proposals '{config.kind}' need the scan's mesh: {reason}") from error
 
 
 def _true_proposals(tools: SceneTools, surface: Surface) -> Proposals:
-    """The truth's instances on the vertices of ``surface``: a vertex is in the masks of its nearest labelled point."""
-    assert tools.true_proposals is not None, "the runner hands over true proposals to a method that needs them"
+    """The ground-truth instances on the vertices of ``surface``: each vertex uses its nearest labelled point."""
+    assert tools.true_proposals is not None, "the runner passes true proposals to methods that need them"
     truth = tools.true_proposals()
     masks = transfer_masks(truth.points, truth, surface.vertices)
     return replace(truth, points=surface.vertices, indptr=masks.indptr, indices=masks.indices)

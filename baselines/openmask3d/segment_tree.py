@@ -1,8 +1,8 @@
-"""A tree over the segments of a mesh: which parts belong together, from the surface's shape alone.
+"""A tree over the segments of a mesh: which parts belong together, from the surface's shape only.
 
-Our own design, no published method's. Segments touch along edges and where they share a small cube of space, so that a
-crack in a scan parts nothing. Two regions are merged the sooner the less the surface bends into the room's
-inside between them, the larger the share of the smaller one's border that lies between them, and the smaller they are.
+Our own design, not from a paper. Segments touch along edges and if they share a small cube of space, so
+cracks in a scan do not separate. Two regions are merged earlier the less the surface bends into the room's
+interior between them, the larger the shared part of the smaller one's border, and the smaller they are.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
-MIN_PATCH_M = 0.02  # side of the cubes, where the mesh's edges are not longer
-FLAT_BEND = 0.01  # of a contact without any bend, so that flat borders still count by their length
-CONVEX_SHARE = 0.5  # a convex edge is an object's own edge more often than a border: its bend is squared and halved
-# Added to the mean bend and taken from the share, so that neither factor of a cost is ever 0.
+MIN_PATCH_M = 0.02  # side of the cubes, unless the mesh's edges are longer
+FLAT_BEND = 0.01  # bend of a flat contact, so that flat borders still count by their length
+CONVEX_SHARE = 0.5  # convex edges are more often inside an object than at its border: their bend is squared and halved
+# Added to the mean bend and subtracted from the share, so that no factor of a cost is 0.
 MIN_BEND, MIN_OPEN = 0.02, 0.01
 NO_PARENT = -1
-Border = dict[int, tuple[int, float]]  # region -> contacts with it, and their summed bend
+Border = dict[int, tuple[int, float]]  # region -> number of contacts with it, and their summed bend
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """Borders between segments: E pairs ``first`` < ``second`` with how many contacts they have and their summed bend.
+    """Borders between segments: E pairs ``first`` < ``second`` with their number of contacts and summed bend.
 
     ``n_patches`` (S,) is the size of each of S segments in cubes of side ``patch_m``.
     """
@@ -41,10 +41,10 @@ class Contacts:
 
 @dataclass(frozen=True)
 class SegmentTree:
-    """N nodes, the S segments first, each later one two earlier ones merged.
+    """N nodes: first the S segments, then merges of two earlier nodes.
 
     ``parent`` (N,), -1 for roots; ``n_patches`` (N,); ``n_contacts`` and ``bend`` (N,) of a node's border with all
-    others. Node k holds the segments ``leaves[start[k]:end[k]]``, so nodes are nested or apart.
+    others. Node k contains the segments ``leaves[start[k]:end[k]]``, so nodes are nested or disjoint.
     """
 
     parent: Int64Array
@@ -58,10 +58,10 @@ class SegmentTree:
 
 
 def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Array) -> Contacts:
-    """Contacts between ``segments`` (V,), numbered 0 to S - 1: patches with a common edge, or in cubes that touch.
+    """Contacts between ``segments`` (V,), numbered 0 to S - 1: patches with a common edge, or in touching cubes.
 
-    A patch is what one segment has in one cube; cubes touch that are one or share a face. The bend of a contact is
-    (1 - cos) / 2 of the angle between the normals of its patches, less where the surface is convex there.
+    A patch is the part of one segment in one cube; cubes touch if identical or sharing a face. The bend of a contact is
+    (1 - cos) / 2 of the angle between the normals of its patches, reduced where the surface is convex.
     """
     n_segments = int(segments.max()) + 1 if len(segments) else 0
     patch_m = _patch_size_m(vertices, triangles)
@@ -90,7 +90,7 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
 
 
 def _patch_size_m(vertices: Float32Array, triangles: Int32Array) -> float:
-    """The median length of an edge, so that neighbours lie in cubes that touch; decimated scans have 3 cm and more."""
+    """The median edge length, so that neighbours are in touching cubes; decimated scans have at least 3 cm."""
     if not len(triangles):
         return MIN_PATCH_M
     edges = vertices[triangles].astype(np.float64)
@@ -98,11 +98,11 @@ def _patch_size_m(vertices: Float32Array, triangles: Int32Array) -> float:
 
 
 def _cells(vertices: Float32Array, n_segments: int, patch_m: float) -> tuple[Int64Array, tuple[int, int, int]]:
-    """A number for the cube of each vertex, and what a step along each axis adds to it."""
+    """A number for the cube of each vertex, and its increment for a step along each axis."""
     extent_m = np.ptp(vertices.astype(np.float64), axis=0) if len(vertices) else np.zeros(3)
     sizes = [int(side / patch_m) + 3 for side in extent_m]  # a free layer on both sides: steps never wrap around
     if sizes[0] * sizes[1] * sizes[2] * max(n_segments, 1) > 2**62:
-        raise DataError(f"the mesh spans {extent_m.max():.0f} m; proposals from its surface need one in metres")
+        raise DataError(f"the mesh spans {extent_m.max():.0f} m; proposals from its surface need a mesh in metres")
     step = (sizes[1] * sizes[2], sizes[2], 1)
     low = vertices.min(axis=0).astype(np.float64) if len(vertices) else np.zeros(3)
     grid = np.floor((vertices - low) / patch_m).astype(np.int64) + 1
@@ -114,7 +114,7 @@ def _sums(group: Int32Array | Int64Array, values: Float32Array | Float64Array, n
 
 
 def _vertex_normals(vertices: Float32Array, triangles: Int32Array) -> Float64Array:
-    """Sums (V, 3) of the triangles' normals around each vertex, as long as their areas."""
+    """Area-weighted sums (V, 3) of the triangles' normals around each vertex."""
     corners = vertices.astype(np.float64)[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return sum((_sums(triangles[:, k], normals, len(vertices)) for k in range(3)), np.zeros((len(vertices), 3)))
@@ -123,7 +123,7 @@ def _vertex_normals(vertices: Float32Array, triangles: Int32Array) -> Float64Arr
 def _touching(
     cube: Int64Array, owner: Int64Array, step: tuple[int, int, int], triangles: Int64Array
 ) -> tuple[Int64Array, Int64Array]:
-    """Pairs of patches of two segments, each pair once; ``cube`` ascends, ``triangles`` (T, 3) name patches."""
+    """Pairs of patches of two segments, without duplicates; ``cube`` ascends, ``triangles`` (T, 3) index patches."""
     pairs = []
     for offset in (0, *step):
         begin = np.searchsorted(cube, cube + offset, "left")
@@ -139,7 +139,7 @@ def _touching(
 
 
 def merge_cost(bend: float, n: int, n_smaller_border: int, n_patches: int) -> float:
-    """What it costs to merge two regions that share ``n`` of the contacts of the one with fewer.
+    """The cost of merging two regions that share ``n`` of the contacts of the one with fewer.
 
     >>> round(merge_cost(bend=5.0, n=10, n_smaller_border=40, n_patches=100), 4)  # (0.5 + 0.02) * (1.01 - 0.25) * 10
     3.952
@@ -148,9 +148,9 @@ def merge_cost(bend: float, n: int, n_smaller_border: int, n_patches: int) -> fl
 
 
 def merge_tree(contacts: Contacts) -> SegmentTree:
-    """The tree that grows by merging the cheapest pair of touching regions, of equal ones that of the lowest numbers.
+    """The tree built by merging the cheapest pair of touching regions, ties by lowest numbers.
 
-    What touches nothing stays apart: the tree may have several roots.
+    Isolated regions stay separate: the tree may have several roots.
     """
     n_leaves = len(contacts.n_patches)
     borders: list[Border] = [{} for _ in range(n_leaves)]
@@ -198,7 +198,7 @@ def _total(border: Border) -> tuple[int, float]:
 
 
 def _joined_border(borders: list[Border], a: int, b: int, new: int) -> Border:
-    """The border of the region made of ``a`` and ``b``, entered with its neighbours too."""
+    """The border of the region merged from ``a`` and ``b``, updated at its neighbours too."""
     joined: Border = {}
     for old in (a, b):
         for other, (n, bend) in borders[old].items():
@@ -214,7 +214,7 @@ def _joined_border(borders: list[Border], a: int, b: int, new: int) -> Border:
 
 
 def _ranges(parent: list[int], n_leaves: int) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """An order of the leaves in which each node's stand together, and where they begin and end."""
+    """An order of the leaves in which each node's leaves are contiguous, and their start and end."""
     n = len(parent)
     size = np.zeros(n, np.int64)
     size[:n_leaves] = 1
@@ -236,7 +236,7 @@ def _ranges(parent: list[int], n_leaves: int) -> tuple[Int64Array, Int64Array, I
 
 
 def is_within(tree: SegmentTree, nodes: Int64Array, node: int) -> BoolArray:
-    """Whether each of ``nodes`` lies in ``node`` or holds it."""
+    """Whether each of ``nodes`` is inside ``node`` or contains it."""
     inside = (tree.start[nodes] >= tree.start[node]) & (tree.end[nodes] <= tree.end[node])
     around = (tree.start[nodes] <= tree.start[node]) & (tree.end[nodes] >= tree.end[node])
     result: BoolArray = inside | around

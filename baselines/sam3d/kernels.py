@@ -1,6 +1,6 @@
-"""Compiled nearest-neighbour search in a grid; imported only where clouds are matched, for numba takes time to load.
+"""Compiled nearest-neighbour search in a grid; imported only when clouds are matched, because numba loads slowly.
 
-Points lie in buckets, one or several cells of side ``cell`` to a bucket: bucket b holds the points
+Points are in buckets of one or several cells of side ``cell``: bucket b contains the points
 ``order[starts[b]:starts[b + 1]]``, ascending, their coordinates side by side in ``held``.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.compiled import njit
 
-# A cell is looked into although it lies this much beyond what was found: float32 distances are rounded.
+# A cell is searched even if it is this much beyond the best distance, because float32 distances are rounded.
 SLACK = 1.0 + 1e-5
 
 
@@ -62,10 +62,10 @@ def _gap(x, c, own, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def nearest(queries, cap, cell, starts, order, held, lower, upper, index, squared):  # type: ignore[no-untyped-def]
-    """Writes the nearest point of each query and its squared distance (float32, summed x, y, z), the lowest index of
-    equals; -1 where none is within ``cap``, give or take a rounding.
+    """Writes the nearest point of each query and its squared distance (float32, summed x, y, z), the lowest index in
+    a tie; -1 if none is within ``cap``, up to rounding.
 
-    The cells around a query are visited in shells, until no nearer point can lie further out.
+    The cells around a query are visited in shells, until no nearer point can be further out.
     """
     n_buckets = len(starts) - 1
     for i in range(len(queries)):

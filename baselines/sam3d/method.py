@@ -1,8 +1,8 @@
-"""SAM3D: the masks of single images, merged bottom-up into groups of one cloud by overlap alone.
+"""SAM3D: masks of single images, merged bottom-up into groups of one cloud by overlap only.
 
 Yang, Wu, He, Zhao, Liu, "SAM3D: Segment Anything in 3D Scenes", 2023, and its code, Pointcept/SegmentAnything3D at
-2aaa8c9. The original has no features, classes or scores; what open-vocabulary protocols need beyond its groups is ours
-and named so: a feature a group, and 1.0 for every score.
+2aaa8c9. The original has no features, classes or scores; additions for open-vocabulary protocols are ours
+and named so: one feature per group, and score 1.0 for all.
 """
 
 from __future__ import annotations
@@ -46,26 +46,26 @@ class SAM3DConfig(BaseModel):
 
     stride: int = Field(default=20, ge=1)  # --frame_skip of the original's export
     voxel_m: Metres = 0.05  # --voxel_size
-    ratio: float = Field(default=0.5, ge=0, le=1)  # cal_group's default, which no caller changes
+    ratio: float = Field(default=0.5, ge=0, le=1)  # cal_group's default, changed by no caller
     th: int = Field(default=50, ge=0)  # --th: points below which a group is dropped at the end
-    merge_th: int = Field(default=50, ge=0)  # the same before each merge; 50 whatever --th says
-    # "tree" merges neighbouring frames, then neighbouring pairs, ... once all are there; "incremental" merges every
-    # frame into the map as it comes, which is how one would use SAM3D on a stream.
+    merge_th: int = Field(default=50, ge=0)  # the same before each merge; 50 regardless of --th
+    # "tree" merges neighbouring frames, then neighbouring pairs, ... at the end; "incremental" merges every
+    # frame into the map immediately, as for SAM3D on a stream.
     schedule: Literal["tree", "incremental"] = "tree"
-    max_distance_m: Metres = 0.6  # a vertex farther from every merged point has no group
-    ensemble: bool = False  # pcd_ensemble: groups in the borders of the mesh's over-segmentation
+    max_distance_m: Metres = 0.6  # vertices farther from every merged point have no group
+    ensemble: bool = False  # pcd_ensemble: groups snap to the mesh's over-segmentation
     ensemble_th: int = Field(default=20, ge=0)  # vertices, in pcd_ensemble
     features: Literal["mean-of-views", "largest-view"] = "mean-of-views"  # ours
 
     @property
     def rules(self) -> overlap.MergeRules:
-        """What merges two clouds."""
+        """Parameters of merging two clouds."""
         return overlap.MergeRules(self.voxel_m, self.ratio, self.merge_th)
 
 
 @dataclass(frozen=True)
 class _View:
-    """One mask of one image, with the pixels of it that have a depth and are not painted over."""
+    """One mask of one image, with its pixels that have a depth and are not painted over."""
 
     frame_index: int
     detection: int
@@ -77,9 +77,9 @@ class _View:
 
 
 class SAM3D:
-    """Masks of single images merged into groups by how many of their points overlap; features play no part in it.
+    """Masks of single images merged into groups by how many of their points overlap; features are not used.
 
-    ``finish`` gives the groups so far and changes nothing.
+    ``finish`` returns the groups so far without changing them.
     """
 
     name = "sam3d"
@@ -92,11 +92,11 @@ class SAM3D:
     about = MethodAbout(
         paper="Yang, Wu, He, Zhao, Liu: SAM3D: Segment Anything in 3D Scenes, 2023",
         source="https://github.com/Pointcept/SegmentAnything3D, commit 2aaa8c9",
-        licence="its README names none",
-        needs=("class-agnostic masks", "the scan's mesh where ensemble is on"),
+        licence="none stated in its README",
+        needs=("class-agnostic masks", "the scan's mesh if ensemble is on"),
         status=(
             "the merging of clouds, the tree and the ensemble match the original's output on reference inputs to the "
-            "last id, with a stable sort in place of its unstable one; run beside the original program on one made "
+            "last id, with a stable sort in place of its unstable one; compared with the original on one generated "
             "room with the same masks: 503,520 of 503,520 vertices with the stable sort; its unstable one changes 2 "
             "of 39 groups; features of groups and scores are ours"
         ),
@@ -105,11 +105,11 @@ class SAM3D:
     def __init__(self, config: SAM3DConfig | None = None) -> None:
         self.config = config or SAM3DConfig()
         self._tools: SceneTools | None = None
-        self.finish_costs: dict[str, float | int] = {}  # the tree's stages, for it merges in ``finish`` alone
+        self.finish_costs: dict[str, float | int] = {}  # the tree's stages, because it only merges in ``finish``
         self._clear()
 
     def _clear(self) -> None:
-        self._clouds: list[GroupedCloud] = []  # one a frame, or the map alone where it is incremental
+        self._clouds: list[GroupedCloud] = []  # one per frame, or only the map if incremental
         self._views: list[_View] = []
         self._surface: Surface | None = None
         self._scene = ""
@@ -121,39 +121,39 @@ class SAM3D:
 
     @property
     def needs_surface(self) -> bool:
-        """The ensemble alone asks for the scan's segments."""
+        """Only the ensemble needs the scan's segments."""
         return self.config.ensemble
 
     @property
     def caveat(self) -> str:
-        """The original has neither features nor scores, and ends on the vertices of ScanNet's meshes."""
+        """The original has neither features nor scores, and evaluates on the vertices of ScanNet's meshes."""
         return (
-            f"sam3d has no features of its own: ours are '{self.config.features}', and every score is 1; its groups "
-            "are on the scan's mesh where the dataset has one, else on its merged cloud"
+            f"sam3d itself has no features: ours are '{self.config.features}', and every score is 1; its groups "
+            "are on the scan's mesh if the dataset has one, otherwise on its merged cloud"
         )
 
     @property
     def n_points(self) -> int:
-        """Points held: of the map, or of all frames while they wait for the tree."""
+        """Points stored: of the map, or of all frames while they wait for the tree."""
         return sum(len(cloud) for cloud in self._clouds)
 
     @property
     def n_instances(self) -> int:
-        """Groups held: of the map, or of all frames while they wait for the tree."""
+        """Groups stored: of the map, or of all frames while they wait for the tree."""
         return sum(cloud.n_groups for cloud in self._clouds)
 
     @property
     def map_bytes(self) -> int:
-        """What points, groups and the numbers of views take; the views' features come on top."""
+        """Bytes of points, groups and view numbers, without the views' features."""
         parts = [(cloud.points, cloud.group, cloud.view_group, cloud.views) for cloud in self._clouds]
         return sum(array.nbytes for arrays in parts for array in arrays)
 
     def receive_tools(self, tools: SceneTools) -> None:
-        """Take the way to the scan's mesh."""
+        """Get access to the scan's mesh."""
         self._tools = tools
 
     def start(self, scene: SceneInfo) -> None:
-        """Forgets the scene before, and reads the mesh of the new one where there is one."""
+        """Resets the map, and reads the mesh of the new scene if there is one."""
         self._clear()
         self._scene = f"{scene.dataset}/{scene.scene}"
         self._surface = self._read_surface()
@@ -168,17 +168,17 @@ class SAM3D:
                 raise DataError(
                     f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set ensemble=false"
                 ) from error
-            logger.warning("%s: sam3d's groups stay on its own points, for there is no mesh (%s)", self._scene, error)
+            logger.warning("%s: sam3d's groups stay on its own points; no mesh (%s)", self._scene, error)
             return None
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Takes one image in; with ``schedule`` incremental it is merged at once, which costs what the map costs."""
+        """Adds one image; with ``schedule`` incremental it is merged immediately, at a cost proportional to the map."""
         detections.check_of(frame)
         n_dimensions = detections.crop_features.shape[2]
         if len(detections) and self._views and n_dimensions != len(self._views[0].feature):
             raise DataError(
                 f"frame {frame.index}: features have {n_dimensions} dimensions, those of the map have "
-                f"{len(self._views[0].feature)}; make all with one encoder"
+                f"{len(self._views[0].feature)}; use one encoder for all"
             )
         with timer.stage("backproject"):
             pixels = valid_depth(frame.depth_m, 0.0, np.inf)
@@ -197,7 +197,7 @@ class SAM3D:
             self._clouds.append(cloud)
 
     def _grouped(self, points: Float64Array, detection: Int64Array, detections: Detections) -> GroupedCloud:
-        """The image's cloud, the last detection's group first; enters what is seen of each detection as a view."""
+        """The image's cloud, the last detection's group first; stores each detection as a view."""
         n_masks = len(detections)
         n_pixels = np.bincount(detection + 1, minlength=n_masks + 1)[1:]
         group = overlap.renumber(np.where(detection == NO_GROUP, NO_GROUP, n_masks - 1 - detection))
@@ -218,14 +218,14 @@ class SAM3D:
         return GroupedCloud(points, group, rows, rows + first_view)
 
     def finish(self) -> Instances:
-        """The groups of at least ``th`` points, on the mesh's vertices where there is a mesh, else on the merged cloud.
+        """The groups of at least ``th`` points, on the mesh's vertices if there is one, otherwise on the merged cloud.
 
-        A segment of the ensemble that no group claims has no feature and is no instance.
+        A segment of the ensemble without a group has no feature and is not an instance.
         """
         timer = Timer()
         cloud = overlap.merge_regions(self._clouds, self.config.rules, timer)
         if cloud is None:
-            logger.warning("%s: no frame of sam3d has a valid point; its map is empty", self._scene)
+            logger.warning("%s: sam3d found no valid points in any frame; its map is empty", self._scene)
             cloud = _EMPTY
         cloud = overlap.numbered(overlap.without_small_groups(cloud, self.config.th))
         points, group = cloud.points.astype(np.float32), cloud.group
@@ -241,7 +241,7 @@ class SAM3D:
         return instances
 
     def _in_segments(self, group: Int64Array, cloud: GroupedCloud, surface: Surface) -> tuple[Int64Array, GroupedCloud]:
-        """Groups of the vertices after the ensemble, and the cloud with its views under the new numbers."""
+        """Groups of the vertices after the ensemble, and the cloud with its views renumbered accordingly."""
         segments = surface.segments
         if segments is None:
             from su3d_bench.baselines.mesh_segments.segments import mesh_segments
@@ -272,7 +272,7 @@ class SAM3D:
         )
 
     def _features(self, views: Sequence[Int64Array], largest: Sequence[_View]) -> Float32Array:
-        """A feature (K, D) a group, normalised: the mean over its views, each counted once, or that of the largest."""
+        """One feature (K, D) per group, normalised: the mean over its views (unweighted), or that of the largest."""
         if self.config.features == "largest-view":
             means = [np.asarray(view.feature, np.float64) for view in largest]
         else:
@@ -284,7 +284,7 @@ class SAM3D:
 
 
 def paint(frame: Frame, masks: BoolArray) -> Int64Array:
-    """The detection (H, W) of each pixel, NO_GROUP in no mask; of overlapping masks the first shows."""
+    """The detection (H, W) of each pixel, NO_GROUP outside all masks; the first of overlapping masks is on top."""
     detection = np.full(frame.depth_m.shape, NO_GROUP, np.int64)
     for k in reversed(range(len(masks))):
         detection[masks[k]] = k

@@ -1,9 +1,9 @@
-"""SAM3D's bidirectional group overlap: two clouds with a group id a point become one, and many become one in a tree.
+"""SAM3D's bidirectional group overlap: merges two clouds with one group id per point, and many in a tree.
 
-Follows ``sam3d.py`` and ``util.py`` of Pointcept/SegmentAnything3D at 2aaa8c9, quirks included, with two differences.
-What survives in a voxel is the first of its points in the cloud (a stable sort); the original sorts unstably, so there
-it depends on the processor and the version of numpy. Matching uses a grid instead of every pair of points, with the
-same float32 distances and the same choice among equals.
+Follows ``sam3d.py`` and ``util.py`` of Pointcept/SegmentAnything3D at 2aaa8c9, including quirks, with two differences.
+The point kept in a voxel is its first one in the cloud (a stable sort); the original sorts unstably, so there
+it depends on the processor and the NumPy version. Matching uses a grid instead of all pairs of points, with the
+same float32 distances and the same choice in ties.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Ar
 
 NO_GROUP = -1
 PAIR_RADIUS_VOXELS = 1.5  # the search radius in util.py's callers: 1.5 * voxel_size
-SURFACE_CELL_M = 0.15  # side of the grid's cells where a cloud is looked up over large distances; moves no result
-MAX_EXTENT_M = 1e6  # beyond it a grid of centimetres has no whole numbers left in float32
+SURFACE_CELL_M = 0.15  # side of the grid's cells for searches over large distances; does not affect results
+MAX_EXTENT_M = 1e6  # beyond it, float32 cannot number the cells of a centimetre grid
 
 
 @dataclass(frozen=True)
 class GroupedCloud:
     """``points`` (N, 3) float64 m and the ``group`` (N,) of each, NO_GROUP for none.
 
-    ``views`` (V,) numbers masks of images, and ``view_group`` (V,) says which group each has gone into.
+    ``views`` (V,) numbers masks of images, and ``view_group`` (V,) the group into which each was merged.
     """
 
     points: Float64Array
@@ -54,7 +54,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class MergeRules:
-    """Side of a voxel in metres, the overlap that joins two groups, and the points below which a group is dropped."""
+    """Side of a voxel in metres, the overlap that joins two groups, and the minimum points of a group."""
 
     voxel_m: float = 0.05
     ratio: float = 0.5
@@ -63,7 +63,7 @@ class MergeRules:
 
 @dataclass(frozen=True)
 class Relabelled:
-    """``group`` (N,) after an overlap was counted; what was group b before is ``id_of_group[b]`` now."""
+    """``group`` (N,) after counting overlaps; the former group b is now ``id_of_group[b]``."""
 
     group: Int64Array
     id_of_group: Int64Array
@@ -73,7 +73,7 @@ def first_of_voxels(points: Float64Array, voxel_m: float) -> Int64Array:
     """Index of the first point of each voxel, in the order of the voxels' FNV-64 keys."""
     if not len(points):
         return np.zeros(0, np.int64)
-    with np.errstate(invalid="ignore"):  # a cloud with NaN is left out when it is merged, not here
+    with np.errstate(invalid="ignore"):  # a cloud with NaN is excluded when merging, not here
         cells = np.floor(points / voxel_m).astype(np.int64)
     cells -= cells.min(axis=0)
     keys = np.full(len(points), 14695981039346656037, np.uint64)  # offset basis and prime of FNV-64
@@ -81,19 +81,19 @@ def first_of_voxels(points: Float64Array, voxel_m: float) -> Int64Array:
         # The product comes before the xor, which is FNV-1; the original calls it FNV-1A.
         keys *= np.uint64(1099511628211)
         keys ^= cells[:, axis].astype(np.uint64)
-    # Neighbours in an image share voxels: only the first of a run of equal keys can be the first of its voxel.
+    # Neighbours in an image share voxels: only the first of a run of equal keys can be the first in its voxel.
     runs = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
     return np.asarray(runs[np.unique(keys[runs], return_index=True)[1]], np.int64)
 
 
 def voxelise(cloud: GroupedCloud, voxel_m: float) -> GroupedCloud:
-    """One point a voxel, the first; groups that lose their last point lose their views, ids stay."""
+    """One point per voxel, the first; groups that lose their last point lose their views, ids are unchanged."""
     kept = first_of_voxels(cloud.points, voxel_m)
     return _with_views_of_present(replace(cloud, points=cloud.points[kept], group=cloud.group[kept]))
 
 
 def drop_small_groups(group: Int64Array, min_points: int) -> Int64Array:
-    """NO_GROUP in place of every id with fewer than ``min_points`` points.
+    """Replaces every id with fewer than ``min_points`` points by NO_GROUP.
 
     >>> drop_small_groups(np.array([4, 4, 2, -1, 4]), 2).tolist()
     [4, 4, -1, -1, 4]
@@ -103,7 +103,7 @@ def drop_small_groups(group: Int64Array, min_points: int) -> Int64Array:
 
 
 def renumber(group: Int64Array) -> Int64Array:
-    """Ids 0, 1, 2, ... in the order of the old ones; NO_GROUP stays.
+    """Ids 0, 1, 2, ... in the order of the old ones; NO_GROUP is unchanged.
 
     >>> renumber(np.array([7, -1, 3, 7])).tolist()
     [1, -1, 0, 1]
@@ -114,10 +114,10 @@ def renumber(group: Int64Array) -> Int64Array:
 def nearest_points(
     queries: Float64Array | Float32Array, points: Float64Array | Float32Array, cap_m: float, cell_m: float
 ) -> tuple[Int64Array, Float32Array]:
-    """Index of the nearest point of each query and its distance in metres, -1 and infinity where ``cap_m`` is passed.
+    """Index of the nearest point of each query and its distance in metres; -1 and infinity beyond ``cap_m``.
 
-    Distances are float32, of float32 coordinates, as on the original's GPU; among equals the lowest index wins.
-    ``cell_m``, the side of the grid's cells, moves no result.
+    Distances are float32, of float32 coordinates, as on the original's GPU; ties go to the lowest index.
+    ``cell_m``, the side of the grid's cells, does not affect results.
     """
     index, squared = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
     if len(queries) and len(points):
@@ -133,25 +133,25 @@ def nearest_points(
 
 
 def _float32(points: Float64Array | Float32Array) -> Float32Array:
-    """The points as the search takes them; ``DataError`` for what no grid of centimetres can hold."""
+    """The points in the form used by the search; ``DataError`` if they do not fit a centimetre grid."""
     if not np.abs(points).max() <= MAX_EXTENT_M:  # written so that NaN fails too
-        raise DataError(f"merging clouds: a point lies beyond {MAX_EXTENT_M:.0e} m or is not finite; check the poses")
+        raise DataError(f"merging clouds: a point is beyond {MAX_EXTENT_M:.0e} m or is not finite; check the poses")
     return np.ascontiguousarray(points, np.float32)
 
 
 def match_pairs(queries: Float64Array, points: Float64Array, radius_m: float) -> Pairs:
-    """Each query that has a point nearer than ``radius_m``, with the nearest one."""
+    """Each query with a point nearer than ``radius_m``, and its nearest one."""
     index, distance = nearest_points(queries, points, radius_m, radius_m * 1.001)
     matched = np.flatnonzero((index >= 0) & (distance < np.float32(radius_m)))
     return Pairs(matched, index[matched])
 
 
 def cal_group(other: Int64Array, group: Int64Array, pairs: Pairs, ratio: float) -> Relabelled:
-    """The ids of ``group`` once they are matched with those of ``other``: what overlaps enough takes the other's id.
+    """The ids of ``group`` after matching with ``other``: groups that overlap enough take the other's id.
 
-    Ids of ``group`` are first shifted beyond those of ``other``. A point without a group takes the group of its pair,
-    even where that is none, and counts for nothing. Each group is compared with the one of ``other`` it shares most
-    pairs with (the first met among equals) and joins it where the shared pairs are at least ``ratio`` of the smaller of
+    Ids of ``group`` are first shifted beyond those of ``other``. A point without a group takes the group of its pair
+    (even NO_GROUP) and does not count. Each group is compared with the group of ``other`` with which it shares most
+    pairs (the first encountered in a tie) and joins it if the shared pairs are at least ``ratio`` of the smaller of
     the two, in float32.
 
     >>> cal_group(np.array([0, 0, 1]), np.array([0, 0, -1, 1]), Pairs(np.array([0, 1, 2]), np.array([1, 0, 2])), 0.5)
@@ -177,11 +177,11 @@ def cal_group(other: Int64Array, group: Int64Array, pairs: Pairs, ratio: float) 
 
 
 def merge(first: GroupedCloud, second: GroupedCloud, rules: MergeRules, timer: StageTimer) -> GroupedCloud | None:
-    """Both clouds as one by bidirectional group overlap; None where both hold a NaN, the other where one does.
+    """Both clouds merged by bidirectional group overlap; if one contains a NaN, the other; if both do, None.
 
-    The second call of ``cal_group`` shifts the ids of ``first`` beyond those of ``second``: an identity that the first
-    call found survives only where the second finds it too, counted after the first. Small groups go, from a cloud that
-    stays alone as well. The result is voxelised after it is numbered, so ids may be missing.
+    The second call of ``cal_group`` shifts the ids of ``first`` beyond those of ``second``: a match of the first
+    call survives only if the second finds it too, counted after the first. Small groups are dropped, also from a cloud
+    that is not merged. The result is voxelised after numbering, so ids may be missing.
     """
     with timer.stage("merge"):
         first, second = without_small_groups(first, rules.min_points), without_small_groups(second, rules.min_points)
@@ -201,9 +201,9 @@ def merge(first: GroupedCloud, second: GroupedCloud, rules: MergeRules, timer: S
 
 
 def _joined(first: GroupedCloud, second: GroupedCloud, of_first: Relabelled, of_second: Relabelled) -> GroupedCloud:
-    """One cloud after the other, with the views of both.
+    """Both clouds concatenated, with the views of both.
 
-    A group may be left with points that inherited an id and no mask of its own; its views are those of the group of
+    A group may consist of points that inherited an id without a mask; its views are then those of the group of
     ``first`` that the id came from.
     """
     group = np.concatenate([of_first.group, of_second.group])
@@ -222,7 +222,7 @@ def _joined(first: GroupedCloud, second: GroupedCloud, of_first: Relabelled, of_
 def merge_regions(clouds: Sequence[GroupedCloud], rules: MergeRules, timer: StageTimer) -> GroupedCloud | None:
     """All clouds merged pairwise in a binary tree: [0, 1], [2, 3], ...; an odd last one passes unchanged.
 
-    None where no cloud is without NaN; the original never ends then.
+    None if every cloud contains a NaN; the original never ends then.
     """
     left = list(clouds)
     while len(left) > 1:
@@ -231,7 +231,7 @@ def merge_regions(clouds: Sequence[GroupedCloud], rules: MergeRules, timer: Stag
 
 
 def next_level(clouds: Sequence[GroupedCloud], rules: MergeRules, timer: StageTimer) -> list[GroupedCloud]:
-    """The next level of the tree: neighbours merged, the odd last one as it is, what is None left out."""
+    """The next level of the tree: neighbours merged, an odd last one unchanged, None dropped."""
     merged = [merge(clouds[i], clouds[i + 1], rules, timer) for i in range(0, len(clouds) - 1, 2)]
     odd = clouds[len(clouds) - len(clouds) % 2 :]
     return [cloud for cloud in (*merged, *odd) if cloud is not None]
@@ -245,10 +245,10 @@ def groups_on_surface(cloud: GroupedCloud, vertices: Float32Array, cap_m: float)
 
 
 def ensemble(group: Int64Array, segments: Int32Array | Int64Array, min_points: int, ratio: float) -> Int64Array:
-    """The groups (V,) in the borders of ``segments`` (V,): each takes the group that it shares enough vertices with.
+    """The groups (V,) snapped to ``segments`` (V,): each segment takes the group with which it shares enough vertices.
 
-    Groups of fewer than ``min_points`` vertices do not take part. A segment that none claims keeps an id of its own,
-    its number beyond the groups'.
+    Groups of fewer than ``min_points`` vertices are ignored. A segment without a group gets a new id:
+    its number shifted beyond the groups'.
     """
     groups = renumber(drop_small_groups(group, min_points))
     numbers, rank = np.unique(segments, return_inverse=True)
@@ -259,7 +259,7 @@ def ensemble(group: Int64Array, segments: Int32Array | Int64Array, min_points: i
 
 
 def without_small_groups(cloud: GroupedCloud, min_points: int) -> GroupedCloud:
-    """The cloud with NO_GROUP in place of its small groups, whose views go too."""
+    """The cloud with small groups replaced by NO_GROUP, and without their views."""
     return _with_views_of_present(replace(cloud, group=drop_small_groups(cloud.group, min_points)))
 
 
@@ -287,6 +287,6 @@ def _is_present(group: Int64Array, n_ids: int) -> BoolArray:
 
 
 def _numbers_of(group: Int64Array) -> Int64Array:
-    """The new number of each id, with NO_GROUP's own at the end, where -1 finds it."""
+    """The new number of each id, followed by NO_GROUP, where index -1 finds it."""
     is_present = _sizes(group) > 0
     return np.append(np.where(is_present, np.cumsum(is_present) - 1, NO_GROUP), NO_GROUP)

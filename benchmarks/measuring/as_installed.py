@@ -1,4 +1,4 @@
-"""The surroundings of a measured command: those of an installed program, whatever the shell of the measurer has."""
+"""The environment of a measured command: that of an installed program, whatever the current shell has."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 
 def as_installed(folder: Path) -> dict[str, str]:
-    """The environment with Python's compiled modules kept below ``folder``: an installed program finds them.
+    """An environment that caches Python's compiled modules below ``folder``, as for an installed program.
 
-    The first command in it writes them, and is not to be measured.
+    The first command in it writes them and must not be measured.
     """
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     return kept | {"PYTHONPYCACHEPREFIX": str(folder)}

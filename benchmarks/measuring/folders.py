@@ -1,4 +1,4 @@
-"""Importing this lets a benchmark import every other by its name, what tests share, and the programs of ``tools``."""
+"""Importing this lets a benchmark import all others by name, the tests' support, and the programs of ``tools``."""
 
 from __future__ import annotations
 

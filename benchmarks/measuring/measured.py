@@ -1,4 +1,4 @@
-"""What a measuring script found, as a JSON file from which ``write_performance`` makes a table of its notes."""
+"""Results of a measuring script as a JSON file, from which ``write_performance`` creates a table."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 def write_measured(
     path: Path, title: str, command: str, columns: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequence[str]
 ) -> None:
-    """Write one table: ``rows`` of text under ``columns``; ``command`` makes it anew; ``notes`` are sentences."""
+    """Write one table: ``rows`` of text under ``columns``; ``command`` reproduces it; ``notes`` are sentences."""
     assert all(len(row) == len(columns) for row in rows), (columns, rows)
     content = {"title": title, "command": command, "columns": columns, "rows": rows, "notes": notes}
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""``docs/running/performance.md``, the results, and ``benchmarks/measured.md``, every table that was measured.
+"""Write ``docs/running/performance.md`` (results) and ``benchmarks/measured.md`` (all measured tables).
 
-``python benchmarks write_performance [build/bench.json] [--rooms RUN] [--corridors RUN]``: the JSON file is that of
-``make bench``, the runs are those of ``make bench-methods``. What is not given stays as the pages have it, and so do
-the list of marks, which is written by hand, and what a script measured that left no new file.
+``python benchmarks write_performance [build/bench.json] [--rooms RUN] [--corridors RUN]``: the JSON file comes from
+``make bench``, the runs from ``make bench-methods``. Parts without new input are kept, including
+the hand-written list of targets and tables of scripts that left no new file.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ without reading and perception, over the tenth of the updates with the smallest 
 Exponents, with 95 % intervals, are those of log-log fits against the points of the method's map: of the total, and of
 stages that grow and take at least 1/20 of that time.
 """
-MIN_SHARE = 0.05  # of the time without reading and perception, for a stage to be named
+MIN_SHARE = 0.05  # minimum share of the time (without reading and perception) to list a stage
 
 
 def benchmark_sections(benchmarks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """One a group of the ``benchmarks`` of a JSON file of pytest-benchmark, with ratios within it."""
+    """One table per group of ``benchmarks`` in a JSON file of pytest-benchmark, with ratios within it."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for one in benchmarks:
         groups.setdefault(str(one["group"] or one["name"]), []).append(one)
@@ -88,7 +88,7 @@ def _words(name: str) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Three digits in the unit that fits: 12.3 ms."""
+    """Three digits in a suitable unit: 12.3 ms."""
     for unit, scale in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
         if seconds * scale >= 1:
             return f"{seconds * scale:.3g} {unit}"
@@ -96,7 +96,7 @@ def _time(seconds: float) -> str:
 
 
 def measured_sections(folder: Path) -> Iterator[str]:
-    """One a JSON file that ``write_measured`` left in ``folder``, in the order of their names."""
+    """One table per JSON file that ``write_measured`` left in ``folder``, in alphabetical order."""
     for path in sorted(folder.glob("*.json")):
         told = json.loads(path.read_text(encoding="utf-8"))
         notes = [" ".join(told["notes"]), ""] if told["notes"] else []
@@ -105,7 +105,7 @@ def measured_sections(folder: Path) -> Iterator[str]:
 
 
 def program_of(section: str) -> str | None:
-    """The measuring program whose table a section holds; None for a group of benchmarks.
+    """The program that measured a section's table; None for a group of benchmarks.
 
     >>> program_of("## A map\\n\\n`python benchmarks big_map --points 5`\\n")
     'big_map'
@@ -115,8 +115,8 @@ def program_of(section: str) -> str | None:
 
 
 def rooms_section(run: Path) -> str:
-    """Run time and memory of every method on the scenes of a run."""
-    rows = [["method", "updates", "ms per update", "of it the map", "finish, s", "whole scene, s", "peak memory, MiB"]]
+    """Run time and memory of every method on a run's scenes."""
+    rows = [["method", "updates", "ms per update", "map update", "finish, s", "whole scene, s", "peak memory, MiB"]]
     for times in _times(run):
         summary = summarise(times)
         total_s = [one.ms(TOTAL).sum() / 1e3 + one.maps[-1].finish_ms / 1e3 for one in times]
@@ -137,7 +137,7 @@ def rooms_section(run: Path) -> str:
 
 
 def corridors_section(runs: Sequence[Path]) -> str:
-    """How the cost of an update grows with each method's map, and its plot."""
+    """Growth of each method's update cost with its map, and the plot."""
     every = [times for run in runs for times in _times(run)]
     PICTURE.write_bytes(draw_update_cost(every, WARM_UP, "png"))
     plot = f"![Cost of an update against the points of the map](../{PICTURE.parent.name}/{PICTURE.name})"
@@ -145,7 +145,7 @@ def corridors_section(runs: Sequence[Path]) -> str:
 
 
 def growth_table(every: Sequence[Sequence[UpdateTimes]]) -> list[list[str]]:
-    """A row a method: how large its map became, and what an update of the smallest and the largest maps cost."""
+    """One row per method: the size of its map, and the cost of updates of the smallest and largest maps."""
     head = ["method", "m", "updates", "points, from", "to", "ms, smallest tenth", "largest", "worst", "exponent", ""]
     rows = [[*head, "stages that grow"]]
     for times in every:
@@ -194,22 +194,22 @@ def _stage(summary: MethodSummary, name: str) -> StageSummary:
 
 
 def section_of(page: str, title: str) -> str:
-    """The section of ``page`` below the line ``title``, with it; empty where there is none."""
+    """The section of ``page`` with the heading ``title``; empty if there is none."""
     return next((one for one in sections_of(page) if one.startswith(f"{title}\n")), "")
 
 
 def sections_of(page: str) -> list[str]:
-    """What stands below each heading of the second order, with it; what stands above the first is left out."""
+    """The second-level sections, with their headings; text before the first is omitted."""
     return [f"## {one.rstrip()}\n" for one in f"\n{page}".split("\n## ")[1:]]
 
 
 def head_of(page: str) -> str:
-    """What stands above the first heading of the second order."""
+    """The text before the first second-level heading."""
     return f"{page.partition(chr(10) + '## ')[0].rstrip()}\n"
 
 
 def results_page(before: str, hardware: str | None, rooms: Path | None, corridors: Sequence[Path] | None) -> str:
-    """The page of results; what is None stays as it was ``before``."""
+    """The page of results; None keeps the text of ``before``."""
     sections = [
         head_of(before) if hardware is None else PAGE_HEAD.format(hardware=hardware),
         section_of(before, MARKS_TITLE),
@@ -221,9 +221,9 @@ def results_page(before: str, hardware: str | None, rooms: Path | None, corridor
 
 
 def notes_page(before: str, hardware: str | None, groups: Sequence[str] | None, measured: Sequence[str]) -> str:
-    """Every table: the ``groups`` of benchmarks, then what scripts ``measured``, one table a script.
+    """All tables: the ``groups`` of benchmarks, then those ``measured`` by scripts, one table per script.
 
-    A script's table takes the place of the one ``before``; groups are new as a whole, or as they were.
+    A script's table replaces its previous one in ``before``; groups are replaced as a whole or kept.
     """
     known = sections_of(before)
     if groups is None:

@@ -1,13 +1,13 @@
-"""How often a 95 % interval holds the truth, over benchmarks that are drawn from a world whose truth is known.
+"""Coverage of 95 % intervals, over benchmarks drawn from a world with known ground truth.
 
 ``python benchmarks coverage_of_intervals [--simulations 2000] [--write docs/numbers/statistics.md]`` prints the tables
-of docs/numbers/statistics.md and, with ``--write``, puts them there; two minutes on one idle core. Exit code 1: a cell
+of docs/numbers/statistics.md and, with ``--write``, updates them; two minutes on one idle core. Exit code 1: a cell
 is below 90.
 
-The world is made of scenes: which classes they hold, how large these are, how hard the scene, its classes and its
-instances are for two methods that are equally good. Truth is what the metric gives over very many scenes. Numbers,
-values without each scene, and intervals come from the functions that score runs. The world's settings are round numbers
-that were fixed before any coverage was looked at; they make scenes differ more than the built-in rooms do.
+The world consists of scenes: their classes and sizes, and the difficulty of scenes, classes and
+instances for two equally good methods. The true value is that of the metric over very many scenes. Values,
+jackknife values and intervals come from the functions that score runs. The world's settings are round numbers
+fixed before looking at any coverage; they make scenes differ more than the built-in rooms do.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from su3d_bench.numerics.statistics import (
 from su3d_bench.reports.tables.formats import aligned
 
 BEGIN, END = "<!-- coverage: written by benchmarks/numbers/coverage_of_intervals.py -->", "<!-- end of coverage -->"
-LOW, HIGH, MIN_COVERAGE = 93.0, 97.0, 90.0  # per cent: the mark, and below what no interval may be shown
-N_BOOTSTRAP, N_RESAMPLES, MAX_BOOTSTRAP = 500, 400, 20  # simulations, resamples, and scenes up to which it is asked
-N_TRUTH = 20_000  # scenes that stand for all there are
+LOW, HIGH, MIN_COVERAGE = 93.0, 97.0, 90.0  # per cent: target range, and the minimum to show an interval
+N_BOOTSTRAP, N_RESAMPLES, MAX_BOOTSTRAP = 500, 400, 20  # simulations, resamples, and maximum scenes for the bootstrap
+N_TRUTH = 20_000  # scenes that represent the population
 THRESHOLDS = (0.5, 0.75, 0.25)
-QUALITY = np.array([0.5, -0.6, 1.3])  # added to an instance's quality, which then decides on each threshold
+QUALITY = np.array([0.5, -0.6, 1.3])  # added to an instance's quality, which decides at each threshold
 Weights = Int64Array
 Values = dict[str, Float64Array]
 
@@ -68,7 +68,7 @@ class Semantic:
         self.size = 2000 * rng.lognormal(0, 1.2, self.n_classes)
 
     def points(self, rng: np.random.Generator, n: int) -> tuple[Int64Array, list[tuple[Int64Array, Int64Array]]]:
-        """Points of each class (n, C), and of two methods those called rightly, and wrongly called by the class."""
+        """Points of each class (n, C) and, for two methods, those predicted correctly and wrongly predicted as it."""
         shape = (n, self.n_classes)
         is_present = rng.random(shape) < self.presence
         n_true = np.where(is_present, self.size * rng.lognormal(0, 0.7, shape), 0).astype(np.int64)
@@ -87,11 +87,11 @@ class Semantic:
         return [[self._counts(*row) for row in zip(n_true, *of_method, strict=True)] for of_method in methods]
 
     def _counts(self, n_true: Int64Array, hit: Int64Array, wrong: Int64Array) -> SemanticCounts:
-        """Rows and columns have the sums that matter; between which pairs points were mistaken does not."""
+        """Rows and columns have the relevant sums; the pairs of confused classes do not matter."""
         confusion = np.zeros((self.n_classes + 1, self.n_classes + 1), np.int64)
         np.fill_diagonal(confusion, hit)
         confusion[: self.n_classes, -1] = n_true - hit
-        for row, columns in ((0, slice(1, self.n_classes)), (1, slice(0, 1))):  # beside the diagonal
+        for row, columns in ((0, slice(1, self.n_classes)), (1, slice(0, 1))):  # off the diagonal
             confusion[row, columns] += wrong[columns]
             confusion[row, -1] -= wrong[columns].sum()
         return SemanticCounts(confusion[: self.n_classes], n_true > 0)
@@ -107,7 +107,7 @@ class Semantic:
 
 
 class SceneMeans(Semantic):
-    """The mean over scenes of each scene's own accuracy."""
+    """The mean over scenes of each scene's accuracy."""
 
     names = ("mean of scenes",)
 
@@ -124,7 +124,7 @@ class SceneMeans(Semantic):
 
 
 class Shares:
-    """Shares of questions, some 10 to 40 a scene, that are answered rightly."""
+    """Shares of correctly answered questions, about 10 to 40 per scene."""
 
     names = ("share of questions",)
 
@@ -142,7 +142,7 @@ class Shares:
 
 
 class Instances:
-    """Precision-recall rows of 8 classes, from 4 instances a scene to one in four scenes."""
+    """Precision-recall rows of 8 classes, from 4 instances per scene to one in four scenes."""
 
     names = ("pooled AP", "pooled AP50")
     rate = np.array([4, 3, 2, 1.5, 1, 0.6, 0.4, 0.25])
@@ -198,10 +198,10 @@ class Instances:
 
 WORLDS: tuple[Callable[[], Any], ...] = (Semantic, SceneMeans, Shares, Instances)
 REASONS: Mapping[str, str] = {
-    "mAcc": "a class that few scenes hold weighs as much as any other, and rests on one of them or is missing",
-    "F-mIoU": "a few large classes carry the sum, so that it is skewed: now and then one scene outweighs the others",
-    "pooled AP": "rare classes rest on a few instances, and AP of few instances is too high on average",
-    "pooled AP50": "rare classes rest on a few instances, and AP of few instances is too high on average",
+    "mAcc": "a class in few scenes weighs as much as any other, and depends on one of them or is missing",
+    "F-mIoU": "a few large classes dominate the sum, which is skewed: occasionally one scene outweighs the others",
+    "pooled AP": "rare classes have few instances, and AP of few instances is biased upwards",
+    "pooled AP50": "rare classes have few instances, and AP of few instances is biased upwards",
     "mean of scenes": "the scenes' values are skewed",
     "share of questions": "scenes with many questions outweigh the others",
 }
@@ -209,7 +209,7 @@ REASONS: Mapping[str, str] = {
 
 @dataclass
 class Tally:
-    """Of how many intervals there were, how many held the truth; by kind of interval."""
+    """Number of intervals and of those that contain the true value, by kind of interval."""
 
     held: dict[str, int]
     n: dict[str, int]
@@ -238,7 +238,7 @@ def add_intervals(
 
 
 def simulate(world: Any, truth: Mapping[str, float], n_scenes: int, n_simulations: int, seed: int) -> dict[str, Tally]:
-    """Number -> what its intervals hold over ``n_simulations`` benchmarks of ``n_scenes``."""
+    """Metric -> coverage of its intervals over ``n_simulations`` benchmarks of ``n_scenes``."""
     rng = np.random.default_rng([seed, n_scenes])
     weights = leave_one_out(n_scenes)
     names = [*world.names, *(f"{name}, difference" for name in world.names)]
@@ -259,7 +259,7 @@ def simulate(world: Any, truth: Mapping[str, float], n_scenes: int, n_simulation
 
 
 def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator[str]:
-    """The table of intervals over scenes, and what is said of its cells."""
+    """The table of intervals over scenes, and remarks on its cells."""
     table: dict[str, dict[int, Tally]] = {}
     for make in WORLDS:
         world = make()
@@ -285,7 +285,7 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     refused = [(n, n_) for n, of in table.items() for n_ in sizes if (of[n_].per_cent(JACKKNIFE) or 0) < MIN_COVERAGE]
     where = ", ".join(f"{name} at {n} scenes" for name, n in refused)
     yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90: an interval is shown from 2 scenes on.\n")
-    yield "The same benchmarks with the two intervals that were not taken:\n"
+    yield "The same benchmarks with the two rejected intervals:\n"
     few = [n for n in sizes if n <= MAX_BOOTSTRAP]
     yield from aligned(
         [
@@ -313,22 +313,22 @@ RATES = (0.5, 0.7, 0.9, 0.98)
 
 
 def over_items(n_simulations: int, seed: int) -> Iterator[str]:
-    """The table of intervals over items: Wilson's, counted exactly; those of changes and of agreement, simulated."""
+    """The table of intervals over items: Wilson's, computed exactly; those of changes and agreement, simulated."""
     rng = np.random.default_rng([seed, 1])
     rows = [[f"share of {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
-    for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 people", agreement)):
+    for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
     yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
-        "\nShares miss the mark, in italics, because counts are whole numbers: coverage goes up and down with rate and "
-        "number (Brown, Cai and DasGupta); changes and agreement because few items are skewed. Of fewer than "
-        f"{MIN_ITEMS} items these two have no interval: at 5 they hold {few[0]} and {few[1]} per cent."
+        "\nShares miss the target, in italics, because counts are integers: coverage oscillates with rate and "
+        "number (Brown, Cai and DasGupta); changes and agreement because few items are skewed. With fewer than "
+        f"{MIN_ITEMS} items these two have no interval: at 5 coverage is {few[0]} and {few[1]} per cent."
     )
 
 
 def wilson(rate: float, n: int) -> float:
-    """How often the interval of a share holds ``rate``, over all that can be seen."""
+    """Coverage of the interval of a share at ``rate``, over all possible observations."""
     from scipy.stats import binom
 
     held = [(interval := share_interval(k / n, n)) and interval[0] <= rate <= interval[1] for k in range(n + 1)]
@@ -336,14 +336,14 @@ def wilson(rate: float, n: int) -> float:
 
 
 def change(rng: np.random.Generator, n: int, n_simulations: int) -> float:
-    """Items of which 25 % become right and 15 % wrong."""
+    """Items of which 25 % become correct and 15 % wrong."""
     values = rng.choice([1.0, -1.0, 0.0], (n_simulations, n), p=[0.25, 0.15, 0.6])
     intervals = [mean_interval(row, DIFFERENCE) for row in values]
     return float(np.mean([interval is not None and interval[0] <= 0.1 <= interval[1] for interval in intervals]))
 
 
 def agreement(rng: np.random.Generator, n: int, n_simulations: int) -> float:
-    """Three people who tell one of two equally frequent answers rightly in 90 %: alpha is 0.8 squared."""
+    """Three annotators, correct in 90 % of two equally frequent answers: alpha is 0.8 squared."""
     n_held = 0
     for _ in range(n_simulations):
         truth = rng.random(n) < 0.5
@@ -359,9 +359,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--simulations", type=int, default=2000)
     parser.add_argument("--scenes", type=int, nargs="+", default=[2, 3, 4, 8, 20, 100])
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", type=Path, metavar="FILE", help="put the tables between the marks in this page")
+    parser.add_argument("--write", type=Path, metavar="FILE", help="update the tables between the markers in this page")
     given = parser.parse_args(arguments)
-    instance_ap.MANY_ROWS = 0  # the compiled loops of large runs, ten times as fast, also for few rows
+    instance_ap.MANY_ROWS = 0  # use the compiled loops of large runs, ten times as fast
     lines = [*over_scenes(given.scenes, given.simulations, given.seed), *over_items(given.simulations, given.seed)]
     text = "\n".join(lines)
     print(text)

@@ -1,4 +1,4 @@
-"""Draw docs/pictures/relations.png: every rule of relations on both sides of its threshold, as the code answers.
+"""Draw docs/pictures/relations.png: every relation rule on both sides of its threshold, as computed by the code.
 
 python benchmarks draw_relations docs/pictures/relations.png
 """
@@ -13,15 +13,15 @@ import numpy as np
 
 from su3d_bench.numerics.relations import RELATIONS, Relation, Relations, is_between, may_be_between
 
-SIDE, TOP = (0, 2), (0, 1)  # the axes that a panel shows
+SIDE, TOP = (0, 2), (0, 1)  # the axes of a panel
 GREEN, RED, ORANGE, GREY, BLUE = "#2a8a4a", "#c0392b", "#b86a00", "#d9d9d9", "#4a6fa5"
-NARROW = 0.3  # m: a box that no word fits into
+NARROW = 0.3  # m: a box too narrow for a word
 Box = tuple[float, float, float, float, float, float]  # lowest corner and sizes, metres
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair: does the first stand in ``relation`` to the second? ``others`` are grey."""
+    """A pair: is the first in ``relation`` to the second? ``others`` are drawn in grey."""
 
     relation: str
     text: str
@@ -35,22 +35,22 @@ class Panel:
 TABLE: Box = (0, 0, 0, 1, 1, 0.7)
 PICTURE: Box = (0.2, 0.97, 1.1, 0.6, 0.03, 0.5)
 PANELS = (
-    Panel("on", "rests on its top,\n0.04 m at most apart", SIDE, (0.4, 0.4, 0.72, 0.2, 0.2, 0.2), TABLE),
+    Panel("on", "rests on its top,\nat most 0.04 m apart", SIDE, (0.4, 0.4, 0.72, 0.2, 0.2, 0.2), TABLE),
     Panel("on", "0.06 m of air", SIDE, (0.4, 0.4, 0.76, 0.2, 0.2, 0.2), TABLE),
     Panel("on", "0.4 of its footprint", SIDE, (0.88, 0.4, 0.7, 0.3, 0.3, 0.2), TABLE),
     Panel("on", "0.2 of its footprint", SIDE, (0.94, 0.4, 0.7, 0.3, 0.3, 0.2), TABLE),
     Panel("on", "an inner board",
           SIDE, (0.2, 0.05, 0.5, 0.2, 0.2, 0.3), (0, 0, 0, 1, 0.3, 1.4), (), ("a", "shelf")),
-    Panel("on", "an inner board of\nno shelf and no seat",
+    Panel("on", "an inner board, but\nno shelf or seat",
           SIDE, (0.2, 0.05, 0.2, 0.2, 0.2, 0.2), (0, 0, 0, 1, 0.3, 0.6), (), ("a", "stand")),
-    Panel("in", "a container may be\nstuck out of",
+    Panel("in", "may stick out of\na container",
           SIDE, (0.36, 0.1, 0.1, 0.2, 0.2, 0.8), (0, 0, 0, 0.6, 0.5, 0.6), (), ("a", "basket")),
-    Panel("under", "bears it", SIDE, TABLE, (0.4, 0.4, 0.7, 0.2, 0.2, 0.2)),
+    Panel("under", "supports it", SIDE, TABLE, (0.4, 0.4, 0.7, 0.2, 0.2, 0.2)),
     Panel("under", "not through a slab",
           SIDE, (0, 0, 0, 1, 1, 0.6), (0.4, 0.4, 0.7, 0.2, 0.2, 0.2), ((-0.2, 0, 0.6, 1.4, 1, 0.1),)),
-    Panel("under", "0.9 of its ground\nis covered", SIDE, (0.73, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
-    Panel("under", "0.4 of its ground\nis covered", SIDE, (0.88, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
-    Panel("above", "hangs over it,\na metre at most", SIDE, PICTURE, TABLE),
+    Panel("under", "0.9 of its footprint\nis covered", SIDE, (0.73, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
+    Panel("under", "0.4 of its footprint\nis covered", SIDE, (0.88, 0.3, 0, 0.3, 0.3, 0.4), TABLE),
+    Panel("above", "hangs over it,\nat most 1 m", SIDE, PICTURE, TABLE),
     Panel("above", "1.4 m of air", SIDE, (0.2, 0.97, 2.1, 0.6, 0.03, 0.5), TABLE),
     Panel("above", "neither half of it\nnor its middle", SIDE, (0.9, 0.97, 1.1, 0.6, 0.03, 0.5), TABLE),
     Panel("above", "something is between", SIDE, PICTURE, TABLE, ((0.2, 0.72, 0.7, 0.6, 0.26, 0.3),)),
@@ -67,7 +67,7 @@ PANELS = (
           TOP, (0.95, 0.15, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
     Panel("between", "in the lane",
           TOP, (0.95, 0.42, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
-    Panel("between", "aside of the lane",
+    Panel("between", "outside the lane",
           TOP, (0.95, 0.75, 0, 0.2, 0.2, 0.4), (0, 0, 0, 0.5, 0.5, 0.5), ((1.6, 0, 0, 0.5, 0.5, 0.5),)),
 )  # fmt: skip
 
@@ -78,7 +78,7 @@ def bounds(box: Box) -> np.ndarray:
 
 
 def answer(panel: Panel) -> str:
-    """What the code says of a panel: "is", "is not" or "may be"."""
+    """The code's answer for a panel: "is", "is not" or "may be"."""
     boxes = [bounds(box) for box in (panel.subject, panel.other, *panel.others)]
     if panel.relation == "between":
         return "is" if is_between(*boxes) else "may be" if may_be_between(*boxes) else "is not"
@@ -92,9 +92,9 @@ def answer(panel: Panel) -> str:
 
 
 def place_of_name(panel: Panel, box: Box, name: str) -> tuple[tuple[float, float], dict[str, str]]:
-    """Where a name stands so that nothing lies over it, and how it is aligned there.
+    """Position and alignment of a name so that nothing overlaps it.
 
-    In the middle of its box; above one that is narrower than the name; in the corner of one that the other lies in.
+    In the centre of its box; above a box narrower than the name; in the corner of a box that contains the other.
     """
     x, y = panel.view
     low, high = bounds(box)
@@ -130,7 +130,7 @@ def draw(path: Path) -> None:
         axes.set_title(f"{word} {panel.relation}", fontsize=9, color=colour, fontweight="bold")
         axes.set_xlabel(f"{panel.text}\n({'side' if panel.view == SIDE else 'from above'})", fontsize=7.5)
         axes.margins(0.16)
-        axes.set_aspect("equal", adjustable="datalim")  # so that all panels are of one size
+        axes.set_aspect("equal", adjustable="datalim")  # so that all panels have one size
         axes.set_xticks([])
         axes.set_yticks([])
     figure.savefig(path, dpi=110)

@@ -1,6 +1,6 @@
-"""The embedded encoder on whole objects of rooms that it was not trained on: class of 69, and of 40 drawn from them.
+"""The embedded encoder on whole objects of rooms not used in training: class of 69, and of 40 drawn from them.
 
-``python benchmarks encoder_whole_objects`` renders 18 rooms. An object counts where it has 400 pixels or more, does
+``python benchmarks encoder_whole_objects`` renders 18 rooms. An object counts if it has at least 400 pixels, does
 not touch the image's edge, and fills 60 % of the rectangle that its box projects to; crops are its mask's bounding box.
 """
 
@@ -44,7 +44,7 @@ def whole_objects(rooms: Rooms, scene: str) -> Iterator[tuple[str, UInt8Array]]:
 
 
 def _projected_area(one: RoomObject, camera_to_world: Float64Array, intrinsics: Float64Array) -> float:
-    """Area in pixels of the rectangle around the object's projected box; infinite where the box reaches the camera."""
+    """Area in pixels of the rectangle around the object's projected box; infinite if the box reaches the camera."""
     corners = np.stack(np.meshgrid(*zip(one.box_min, one.box_max, strict=True)), axis=-1).reshape(-1, 3)
     world_to_camera = np.linalg.inv(camera_to_world)
     seen = (corners @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]) @ intrinsics.T

@@ -1,4 +1,4 @@
-"""How much of a run's score the labels earn: the same masks under one label, and under labels drawn at random.
+"""Contribution of labels to a run's score: the same masks with one label, and with random labels.
 
 ``python benchmarks label_floor RUN`` prints a Markdown table of OpenSU3D's headline metrics on the rooms as run,
 with the class of most objects as the only label, and with random labels (the mean of 3 draws).
@@ -33,7 +33,7 @@ Labels = Callable[[int], Sequence[str]] | None
 def scored(
     rules: ProtocolRules, scenes: dict[str, tuple[GroundTruth, Instances]], labels: Labels, encoder: EmbeddedEncoder
 ) -> list[float]:
-    """Headline values with the labels that ``labels`` gives for so many instances, or the map's own."""
+    """Headline values with the labels that ``labels`` returns for that many instances, or the map's own labels."""
     scores = {}
     for scene, (truth, instances) in scenes.items():
         named = instances if labels is None else replace(instances, labels=tuple(labels(len(instances))))
@@ -43,7 +43,7 @@ def scored(
 
 
 def _most_common(rules: ProtocolRules, truths: Sequence[GroundTruth]) -> str:
-    """The scored class of most objects."""
+    """The scored class with most objects."""
     name_of = {entry.id: entry.name for entry in rules.scored}
     counts: Counter[str] = Counter()
     for truth in truths:

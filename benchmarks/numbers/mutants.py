@@ -1,12 +1,12 @@
-"""Small faults planted in metrics, statistics, comparison and gate, one at a time: do the tests of the module notice?
+"""Mutation testing of metrics, statistics, comparison and regression check: do the module's tests notice a fault?
 
     python benchmarks mutants --mutants 600
     python benchmarks mutants --mutants 40 --seed 3 --modules analysis/regression_check.py
 
-Every place of a module where one operator, constant, condition or statement can be another is a mutant; a sample of all
-of them is drawn by ``--seed``. Each is written into a copy of what git tracks here, and the tests of the module are run
-there until one fails. A mutant that passes them all survives. ``mutants.toml`` beside this file has the reasons of
-survivors that no test can or need kill; the exit status is 1 where a survivor has none there, or where more than
+Every place in a module where one operator, constant, condition or statement can be replaced is a mutant; a sample of
+them is drawn by ``--seed``. Each is written into a copy of the files tracked by git, and the module's tests are run
+there until one fails. A mutant that passes all tests survives. ``mutants.toml`` next to this file explains
+survivors that no test can or need kill; the exit status is 1 if a survivor has no explanation, or if more than
 ``MAX_SURVIVE`` survive. Uncommitted changes of tracked files count.
 """
 
@@ -35,7 +35,7 @@ from planted_faults import Mutant, mutants_of, planted
 REASONS = Path(__file__).with_suffix(".toml")
 PACKAGE = "su3d_bench"
 MAX_SURVIVE = 0.05
-LONGEST = 10.0  # times what the tests of the module take as they are: beyond it a mutant runs for ever, and is noticed
+LONGEST = 10.0  # times the normal duration of the module's tests: longer is an infinite loop, which is noticed
 MIN_S = 60.0
 
 _EVERY = ("test_every_protocol", "test_counts")
@@ -50,7 +50,7 @@ _QUESTIONS = (
 _PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
 _COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_pairs", ""))
 _GATE = tuple(f"analysis/regression_check/test_regression_check{name}" for name in ("", "_costs"))
-# Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
+# For each module, or all in a folder, the tests that must notice: the fast ones first. Names without a folder are
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/graphs.py": ("test_hovsg_graphs", "test_counts"),
@@ -84,12 +84,12 @@ GUARDS: dict[str, tuple[str, ...]] = {
 
 
 def _turn(mutant: Mutant, seed: int) -> str:
-    """Its place in the draw: a number of its own, so that other code may change and the draw is the same."""
+    """Its position in the draw: a separate number, so that changes in other code do not affect the draw."""
     return hashlib.sha256(repr((seed, *mutant.key)).encode()).hexdigest()
 
 
 def guards_of(module: str) -> tuple[str, ...]:
-    """The test files that must notice a fault in a module of the package."""
+    """The test files that must notice a fault in a module."""
     inside = module.removeprefix(f"{PACKAGE}/")
     row = max((one for one in GUARDS if inside == one or (one.endswith("/") and inside.startswith(one))), key=len)
     return tuple(_test_file(name) for name in dict.fromkeys(GUARDS[row]))
@@ -102,7 +102,7 @@ def _test_file(name: str) -> str:
 
 
 def modules_of(wanted: Sequence[str]) -> list[str]:
-    """The guarded modules whose path holds one of ``wanted``, or all."""
+    """The guarded modules whose path contains one of ``wanted``, or all."""
     found = []
     for row in GUARDS:
         path = ROOT / PACKAGE / row
@@ -116,7 +116,7 @@ def modules_of(wanted: Sequence[str]) -> list[str]:
 
 
 def copy_tree(target: Path) -> None:
-    """What git tracks here, as it is on the disk, links as links."""
+    """Copy the files tracked by git as they are on disk, links as links."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout.decode()
     for name in filter(None, listed.split("\0")):
         source = ROOT / name
@@ -127,7 +127,7 @@ def copy_tree(target: Path) -> None:
 
 
 class Copy:
-    """A copy of the tree in which one fault at a time is planted."""
+    """A copy of the tree into which one fault at a time is planted."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -137,12 +137,12 @@ class Copy:
     def write(self, module: str, text: str) -> None:
         path = self.folder / module
         path.write_text(text, encoding="utf-8")
-        # compiled modules are told apart by size and whole seconds of this time, and mutants follow fast
+        # compiled modules are identified by size and this time in whole seconds, and mutants follow fast
         self._stamp += 2
         os.utime(path, (self._stamp, self._stamp))
 
     def passes(self, tests: Sequence[str], limit_s: float) -> bool | None:
-        """Whether all ``tests`` pass; None where they take longer than ``limit_s``."""
+        """Whether all ``tests`` pass; None if they take longer than ``limit_s``."""
         options = ["-x", "-q", "-p", "no:cacheprovider", f"--basetemp={self.folder / '.tests'}"]
         environment = os.environ | {"PYTHONPATH": str(self.folder), "HYPOTHESIS_STORAGE_DIRECTORY": os.devnull}
         process = subprocess.Popen(
@@ -165,7 +165,7 @@ class Copy:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a mutant: ``killed``, ``timed out`` (and so noticed) or ``survived``."""
+    """The result of a mutant: ``killed``, ``timed out`` (and so noticed) or ``survived``."""
 
     mutant: Mutant
     outcome: str
@@ -173,7 +173,7 @@ class Verdict:
 
 
 def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Iterator[Verdict]:
-    """A verdict a mutant, as they come; ``RuntimeError`` where the tests fail without any fault."""
+    """Verdicts as they come; ``RuntimeError`` if the tests fail without any fault."""
     copies: queue.Queue[Copy] = queue.Queue()
     for index in range(n_copies):
         copies.put(Copy(folder / f"copy{index}"))
@@ -182,7 +182,7 @@ def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Itera
     for tests in dict.fromkeys(guards_of(mutant.module) for mutant in mutants):
         begin = time.monotonic()
         if not first.passes(tests, 3600.0):
-            raise RuntimeError(f"without a fault these fail: {' '.join(tests)}")
+            raise RuntimeError(f"these fail without a fault: {' '.join(tests)}")
         limits[tests] = max(MIN_S, LONGEST * (time.monotonic() - begin))
     copies.put(first)
 
@@ -207,7 +207,7 @@ def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Itera
 
 
 def read_reasons(path: Path) -> dict[tuple[str, str, str, str], str]:
-    """Why a survivor may survive, by its key."""
+    """Explanations of survivors, by key."""
     if not path.is_file():
         return {}
     rows = tomllib.loads(path.read_text(encoding="utf-8")).get("survivor", [])
@@ -216,12 +216,12 @@ def read_reasons(path: Path) -> dict[tuple[str, str, str, str], str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mutants", type=int, default=600, help="how many are drawn from all")
-    parser.add_argument("--seed", type=int, default=0, help="of the drawing")
-    parser.add_argument("--modules", nargs="+", default=[], help="only modules whose path holds one of these")
-    parser.add_argument("--copies", type=int, default=os.cpu_count() or 1, help="how many are judged at a time")
-    parser.add_argument("--json", type=Path, help="where the table is written")
-    parser.add_argument("--list", action="store_true", help="print the drawn mutants and stop")
+    parser.add_argument("--mutants", type=int, default=600, help="number of mutants to draw")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--modules", nargs="+", default=[], help="only modules whose path contains one of these")
+    parser.add_argument("--copies", type=int, default=os.cpu_count() or 1, help="number of parallel copies")
+    parser.add_argument("--json", type=Path, help="JSON file for the table")
+    parser.add_argument("--list", action="store_true", help="print the drawn mutants and exit")
     arguments = parser.parse_args()
     every = [
         mutant
@@ -245,7 +245,7 @@ def main() -> int:
 
 
 def report(verdicts: Sequence[Verdict], arguments: argparse.Namespace) -> int:
-    """Print what survived and why it may; 1 where it may not."""
+    """Print survivors with their explanations; 1 if one has none or there are too many."""
     reasons = read_reasons(REASONS)
     survivors = [verdict.mutant for verdict in verdicts if verdict.outcome == "survived"]
     unexplained = [mutant for mutant in survivors if mutant.key not in reasons]

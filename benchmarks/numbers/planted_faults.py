@@ -1,4 +1,4 @@
-"""The small faults that can be planted in a module: one operator, constant, condition or statement made another."""
+"""Small faults that can be planted in a module: one operator, constant, condition or statement replaced."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ast
 import builtins
 from dataclasses import dataclass
 
-ROUNDING = 1e-6  # a constant below it is a guard against rounding, whose size nobody sees
+ROUNDING = 1e-6  # smaller constants are guards against rounding, whose size has no visible effect
 _SWAPPED_OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
@@ -17,11 +17,11 @@ _PAIRS = (
     ("min", "max"), ("any", "all"), ("argmin", "argmax"), ("minimum", "maximum"), ("zeros", "ones"),
     ("zeros_like", "ones_like"), ("floor", "ceil"), ("left", "right"), ("start", "end"), ("ascending", "descending"),
 )  # fmt: skip
-# Keywords that say how a thing is done, not what comes out.
+# Keywords that affect how something is computed, not the result.
 _NO_NUMBER = frozenset(
     {"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil", "assume_unique"}
 )
-# Sizes that say in what portions, or in which of two equal ways, a thing is computed: assignments with them stay.
+# Sizes of portions, or choices between equivalent algorithms: assignments with them are skipped.
 _PORTIONS = frozenset({
     "AT_ONCE", "MANY_ROWS", "MAX_SHARED", "ROWS_AT_ONCE", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
     "_MAX_NEIGHBOURS",
@@ -32,9 +32,9 @@ _SWAPPED_NAMES = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault: the bytes ``start`` to ``end`` of a module become ``text``; ``where`` is the function it lies in.
+    """A fault: the bytes ``start`` to ``end`` of a module become ``text``; ``where`` is the enclosing function.
 
-    ``before`` and ``after`` are the lines from ``line`` on that it lies in, on one line.
+    ``before`` and ``after`` are the affected lines from ``line`` on, joined into one line.
     """
 
     module: str
@@ -48,7 +48,7 @@ class Mutant:
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """What names it whatever lines stand above it."""
+        """An identifier independent of the lines above it."""
         return self.module, self.where, self.before, self.after
 
     def __str__(self) -> str:
@@ -56,7 +56,7 @@ class Mutant:
 
 
 class _Faults(ast.NodeVisitor):
-    """Every mutant of one module; texts, types, decorators and what is only said in errors are left alone."""
+    """Every mutant of one module, except in texts, types, decorators and error messages."""
 
     def __init__(self, module: str, source: str) -> None:
         self.found: list[Mutant] = []
@@ -83,7 +83,7 @@ class _Faults(ast.NodeVisitor):
         where = ".".join(self._names) or "module"
         self.found.append(Mutant(self._module, where, node.lineno, start, end, text, before, after_line))
 
-    # what holds others
+    # compound nodes
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         self._names.append(node.name)
@@ -99,7 +99,7 @@ class _Faults(ast.NodeVisitor):
             self.visit(statement)
         self._names.pop()
 
-    # what is left alone
+    # skipped nodes
 
     def visit(self, node: ast.AST) -> None:
         is_portion = isinstance(node, ast.Assign | ast.AnnAssign) and any(
@@ -117,7 +117,7 @@ class _Faults(ast.NodeVisitor):
             self.visit(node.value)
 
     def visit_Subscript(self, node: ast.Subscript) -> None:
-        # ``dict[str, int]`` in an assignment is a type; numbers are taken out of names in lower case
+        # ``dict[str, int]`` in an assignment is a type; lower-case names are indexed by numbers
         if not (isinstance(node.value, ast.Name) and (hasattr(builtins, node.value.id) or node.value.id[0].isupper())):
             self.generic_visit(node)
 
@@ -191,7 +191,7 @@ class _Faults(ast.NodeVisitor):
             self._add(function, _SWAPPED_NAMES[name])
         self.visit(function)
         for argument in (*node.args, *node.keywords):
-            # any negative size of a new shape is "what is left"
+            # any negative size in a new shape is inferred
             if not (name == "reshape" and isinstance(argument, ast.UnaryOp)):
                 self.visit(argument)
 
@@ -212,7 +212,7 @@ def _is_text(node: ast.expr) -> bool:
 
 
 def mutants_of(module: str, source: str) -> list[Mutant]:
-    """All faults that can be planted in ``source``, each once, as they stand there."""
+    """All faults that can be planted in ``source``, each once, in order of position."""
     return list(dict.fromkeys(_Faults(module, source).found))
 
 

@@ -1,8 +1,8 @@
-"""How many objects some 3D proposals cover: the bound that they set to whatever describes them.
+"""Recall of 3D proposals: the upper bound for methods that describe them.
 
-``python benchmarks proposal_recall rooms/living0 rooms/office0`` prints a Markdown table with a row for the
-weight-free proposals of each method that works on proposals, and with ``--folder DIR`` one for those in files. An
-object counts where it is scored and large enough in the protocol, and is covered where a proposal has the IoU.
+``python benchmarks proposal_recall rooms/living0 rooms/office0`` prints a Markdown table with one row for the
+weight-free proposals of each method based on proposals and, with ``--folder DIR``, one for those in files. An
+object counts if it is scored and large enough in the protocol, and is covered if a proposal has the IoU.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LIMITS = (0.25, 0.5, 0.75)
 
 
 def best_ious(rules: ProtocolRules, truth: GroundTruth, proposals: Proposals) -> Float64Array:
-    """For each counted object (O,) the largest IoU of a proposal with it, on the points of the truth."""
+    """For each counted object (O,) the largest IoU of a proposal with it, on the points of the ground truth."""
     scored = [entry.id for entry in rules.scored]
     ids, first, n = np.unique(truth.instance, return_index=True, return_counts=True)
     counts = (ids > 0) & np.isin(truth.semantic[first], scored) & (n >= (rules.min_region_size or 1))
@@ -46,7 +46,7 @@ def best_ious(rules: ProtocolRules, truth: GroundTruth, proposals: Proposals) ->
 
 
 def measured(config: ProposalConfig, scenes: list[str], rules: ProtocolRules, dataset_of: Callable[[str], Any]) -> str:
-    """A row of the table, after the name: number, recalls, mean IoU, seconds a scene."""
+    """A row of the table, after the name: number, recalls, mean IoU, seconds per scene."""
     found, n_proposals, seconds = [], 0, []
     for scene in scenes:
         name, _, own = scene.partition("/")
@@ -84,7 +84,7 @@ def main() -> int:
     ]
     if arguments.folder is not None:
         rows.append((str(arguments.folder), ProposalConfig(proposals_folder=arguments.folder)))
-    print("| proposals | number | objects | recall at IoU 0.25, % | at 0.5 | at 0.75 | mean best IoU | s a scene |")
+    print("| proposals | number | objects | recall at IoU 0.25, % | at 0.5 | at 0.75 | mean best IoU | s per scene |")
     print("|---|---|---|---|---|---|---|---|")
     for name, config in rows:
         print(f"| {name} | {measured(config, arguments.scenes, rules, dataset_of)} |", flush=True)

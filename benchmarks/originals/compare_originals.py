@@ -1,12 +1,12 @@
-"""Made problems answered by an original evaluator, run unedited from a checkout of it, and by this program.
+"""Synthetic problems, answered by an original evaluator run unedited from a checkout, and by this program.
 
     python benchmarks compare_originals scannet200-instance ~/openmask3d --problems 1000 --cases 30
 
-The checkout is one of the repository that the protocol names in its table [original], at the commit there. Nothing of
-it is edited but for versions: Python 2 is turned into Python 3, what numpy has dropped is put back, ``.cuda()`` stays
-on the processor, and modules that it imports and never calls need not be installed. Problems at which it stops are
-counted and left out. ``--cases`` brings its answers to some problems into tests/cases, where a test replays them. Exit
-code 1 where a number differs by more than 1e-7, the last bits of float32. Without a checkout: the list of originals.
+The checkout is of the repository in the protocol's [original] table, at the commit given there. It is only
+adapted to versions: Python 2 is converted to Python 3, names removed from numpy are restored, ``.cuda()`` stays
+on the processor, and modules that are imported but never called need not be installed. Problems at which it stops are
+counted and skipped. ``--cases`` stores its answers to some problems in tests/cases, where a test replays them. Exit
+code 1 if a number differs by more than 1e-7, the last bits of float32. Without a checkout: the list of originals.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in fa
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """The largest of any number; infinite where one has a value and the other none."""
+    """The largest difference of any number; infinite if one has a value and the other none."""
     if ours.shape != theirs.shape or (np.isnan(ours) != np.isnan(theirs)).any():
         return math.inf
     return float(np.nanmax(np.abs(ours - theirs), initial=0.0))
@@ -50,9 +50,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("protocol", nargs="?")
     parser.add_argument("checkout", nargs="?", type=Path)
-    parser.add_argument("--problems", type=int, default=1000, help="how many both must answer")
+    parser.add_argument("--problems", type=int, default=1000, help="number of problems that both must answer")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cases", type=int, default=0, help="how many go into tests/cases with the original's answers")
+    parser.add_argument("--cases", type=int, default=0, help="number of answers to store in tests/cases")
     words = parser.parse_args()
     if words.checkout is None:
         for one in ORIGINALS:
@@ -60,12 +60,12 @@ def main() -> int:
         return 0
     fits = [one for one in ORIGINALS if words.protocol in one.protocols and (words.checkout / one.file).is_file()]
     if not fits:
-        parser.error(f"no original of '{words.protocol}' is in {words.checkout}; without words they are listed")
+        parser.error(f"no original of '{words.protocol}' in {words.checkout}; run without arguments for a list")
     return compared(fits[0], words)
 
 
 def compared(original: Original, words: argparse.Namespace) -> int:
-    """Both over problem after problem; what came of it is printed."""
+    """Compare both on problem after problem and print the result."""
     rules, started = load_protocol(words.protocol), time.monotonic()
     stops: Counter[str] = Counter()
     n_answered, n_same, worst, worst_index = 0, 0, 0.0, -1

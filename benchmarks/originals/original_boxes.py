@@ -1,4 +1,4 @@
-"""VoteNet's evaluation of boxes over made problems."""
+"""VoteNet's evaluation of boxes on synthetic problems."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from su3d_bench.metrics.instance.boxes import PLACES, THRESHOLDS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine
 
-OFF = 0.0002  # sides of true boxes lie on half millimetres
+OFF = 0.0002  # sides of true boxes are on half millimetres
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: boxes near the true ones, beside them, twice, of other classes, none, of a missing one.
+    """Problem ``index``: boxes near the true ones, next to them, duplicates, other classes, none, a missing class.
 
-    No side of a found box lies on one of a true box: there the clipping of the original goes wrong, and a box has an
+    No side of a predicted box coincides with one of a true box: there the original clips wrongly, and a box has an
     IoU of 3.6 with itself.
     """
     rng = np.random.default_rng([seed, index])
@@ -52,7 +52,7 @@ def _drawn_scene(rng: np.random.Generator, confidences: Any) -> Scene:
             "sizes": _short(of["sizes"] * np.exp(by * rng.normal(size=3))),
         }
         if found and rng.random() < 0.15:
-            one = {**found[-1]}  # the same box again, under another confidence
+            one = {**found[-1]}  # the same box again, with another confidence
         found.append({**one, "score": float(next(confidences))})
     return {"heading": float(rng.choice([0.0, round(rng.uniform(0, 3), 3)])), "true": true, "found": found}
 
@@ -62,10 +62,10 @@ def _short(metres: Float64Array) -> list[float]:
 
 
 def votenet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """AP and recall at each threshold of each slot that is true and their means, by VoteNet's calculator.
+    """AP and recall at each threshold of each true slot, and their means, by VoteNet's calculator.
 
-    Its processes are threads. Of a class that is called and nowhere true it divides by zero, and the mean over the
-    classes is then no number.
+    Its processes are replaced by threads. For a class that is called but nowhere true it divides by zero, and the mean
+    over the classes is undefined.
     """
     absent = ["trimesh", "plyfile", "matplotlib"]
     module = load(checkout / "models/ap_helper.py", [checkout / "utils", checkout / "models"], absent=absent)
@@ -95,13 +95,13 @@ def votenet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def _is_whole(problem: Problem) -> bool:
-    """Whether every class that is called is true somewhere."""
+    """Whether every called class is true somewhere."""
     called, true = ({one["slot"] for scene in problem for one in scene[kind]} for kind in ("found", "true"))
     return called <= true
 
 
 def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The same of this program."""
+    """The same by this program."""
     found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
     names = [name for _, name in names_of(rules).values()]
     answer = []
@@ -113,7 +113,7 @@ def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` drawn problems that it answers."""
+    """The original's answers to the first ``n`` problems that it answers."""
     kept, index = list[dict[str, object]](), 0
     while len(kept) < n:
         problem = drawn(seed, index)

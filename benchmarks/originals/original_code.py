@@ -1,4 +1,4 @@
-"""Code of others run as it stands: Python 2 turned into Python 3, what numpy has dropped put back, no GPU."""
+"""Run original code unmodified: Python 2 converted to Python 3, removed numpy names restored, no GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
-Problem = Any  # of a family of originals; their numbers are one array (N,), NaN where undefined
+Problem = Any  # of a family of originals; numbers are one array (N,), NaN where undefined
 Ask = Callable[[Problem], "np.ndarray"]
 STOPS = (
     ArithmeticError,
@@ -27,16 +27,16 @@ STOPS = (
     RuntimeError,
     TypeError,
     ValueError,
-)  # as which an original ends at some problems
+)  # errors with which an original ends at some problems
 DROPPED = {"float": float, "int": int, "bool": bool, "in1d": lambda a, b: np.isin(np.ravel(a), b)}
 
 
 @dataclass(frozen=True)
 class Original:
-    """An evaluator: the ``protocols`` that it answers for and its ``file`` in a checkout.
+    """An evaluator: the ``protocols`` that it covers and its ``file`` in a checkout.
 
-    ``start(rules, checkout, folder)`` gives what asks it, with a folder to write in; ``drawn(seed, index)`` a problem,
-    ``ours(rules, problem)`` what this program answers, ``keep(rules, ask, seed, n)`` brings ``n`` answers to the cases.
+    ``start(rules, checkout, folder)`` returns a function to query it; ``drawn(seed, index)`` a problem,
+    ``ours(rules, problem)`` this program's answer, ``keep(rules, ask, seed, n)`` stores ``n`` answers in the cases.
     """
 
     protocols: tuple[str, ...]
@@ -48,7 +48,7 @@ class Original:
 
 
 class _Unused:
-    """Stands for what an original imports and never calls."""
+    """Stand-in for a module that an original imports and never calls."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -75,8 +75,8 @@ def load(
 ) -> types.ModuleType:
     """The module in ``file``, imported with ``roots`` on the path and ``words`` as its command line.
 
-    ``absent``: modules that it imports and never calls here; where one is not installed, a stand-in takes its place.
-    ``replaced``: modules that need what is not here, such as a GPU, and what they hold instead.
+    ``absent``: modules that are imported but never called; stand-ins replace those not installed.
+    ``replaced``: modules that need something unavailable, such as a GPU, and their replacements.
     """
     for name, value in DROPPED.items():
         if not hasattr(np, name):
@@ -114,7 +114,7 @@ def _is_installed(name: str) -> bool:
 
 
 def of_python_3(folder: Path, copy: Path) -> Path:
-    """A copy of the Python files of a folder, turned from Python 2 by lib2to3 and not otherwise."""
+    """A copy of the Python files of a folder, only converted from Python 2 by lib2to3."""
     import warnings
 
     with warnings.catch_warnings():
@@ -123,7 +123,7 @@ def of_python_3(folder: Path, copy: Path) -> Path:
 
         fixers = [
             one for one in get_fixers_from_package("lib2to3.fixes") if "itertools" not in one
-        ]  # they ask for both
+        ]  # requested in both forms
         tool = RefactoringTool(fixers)
         for file in folder.rglob("*.py"):
             text = file.read_text() + "\n"
@@ -137,13 +137,13 @@ def of_python_3(folder: Path, copy: Path) -> Path:
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """What an original prints is not shown."""
+    """Suppress the output of an original."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         yield
 
 
 def recorded(module: types.ModuleType | type, name: str) -> list[Any]:
-    """The answers of the function ``name`` of a module or class, which go on as they were; filled as it is called."""
+    """Record the results of the function ``name`` of a module or class, which otherwise works as before."""
     whole: Callable[..., Any] = getattr(module, name)
     answers: list[Any] = []
 
@@ -156,7 +156,7 @@ def recorded(module: types.ModuleType | type, name: str) -> list[Any]:
 
 
 def without_gpu() -> None:
-    """``.cuda()`` of torch gives the tensor itself."""
+    """Make ``.cuda()`` of torch return the tensor itself."""
     import torch
 
     torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign, assignment, misc]

@@ -1,4 +1,4 @@
-"""The original evaluators of instances, each over the same made problems."""
+"""Original evaluators of instances, each on the same synthetic problems."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 
 SCANNET = "BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py"
 SHORT = (",", ":")
-MAX_CLASSES = 200  # of a list of classes
+MAX_CLASSES = 200  # classes in a list
 Answer = Float64Array  # AP, AP50, AP25, then the AP of each slot at each threshold
 
 
@@ -44,7 +44,7 @@ def _drawn_scene(rng: np.random.Generator, one_score: np.float32) -> Scene:
     masks: list[dict[str, Any]] = []
     for _ in range(rng.choice([0, 1, 2, 4, 6, 8])):
         if masks and rng.random() < 0.15:
-            mask = {**masks[int(rng.integers(len(masks)))]}  # a duplicate, under its own or another score
+            mask = {**masks[int(rng.integers(len(masks)))]}  # a duplicate, with the same or another score
         else:
             run = int(rng.integers(len(truth)))
             slot = (
@@ -70,7 +70,7 @@ def _drawn_runs(rng: np.random.Generator, starts: list[int], run: int) -> list[l
 
 @dataclass(frozen=True)
 class Given:
-    """A scene as evaluators want it: ``values`` (N,) class * 1000 + number, and K masks with classes and scores."""
+    """A scene in the evaluators' form: ``values`` (N,) class * 1000 + number, and K masks with classes and scores."""
 
     values: Int64Array
     masks: BoolArray
@@ -93,14 +93,14 @@ class Given:
 
 
 def emptied(folder: Path) -> Path:
-    """The folder, new."""
+    """The folder, emptied."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
 
 
 def answered(table: Any, averages: dict[str, Any], rows: list[int]) -> Answer:
-    """An answer from an original's table (1, C, T) and its averages."""
+    """An answer from an original's table (1, C, T) and averages."""
     means = [averages[name] for name in ("all_ap", "all_ap_50%", "all_ap_25%")]
     return np.array([*means, *np.asarray(table)[0][rows].ravel()], float)
 
@@ -133,7 +133,7 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def _of_arrays(module: types.ModuleType, folder: Path, ids: dict[int, int], classes: list[int], **named: Any) -> Ask:
-    """Scripts that are handed masks, scores and classes as arrays."""
+    """Scripts that take masks, scores and classes as arrays."""
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
 
     def ask(problem: Problem) -> Answer:
@@ -161,20 +161,20 @@ def openmask3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def maskclustering(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """MaskClustering's script, with --no_class where the protocol has no classes; every confidence 1."""
+    """MaskClustering's script, with --no_class if the protocol has no classes; every confidence 1."""
     without_gpu()
     is_plain = rules.class_agnostic is None
     of_data = "scannetpp" if "scannetpp" in rules.datasets else "scannet"
     words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt"), "--dataset", of_data]
     words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if is_plain else ["--no_class"])]
     module = load(checkout / "evaluation/evaluate.py", [checkout], words)
-    # of ScanNet++ it goes over 1,554 classes in squares, seconds a problem; a class that no problem has is undefined
+    # for ScanNet++ it is quadratic in 1,554 classes, seconds per problem; classes in no problem are undefined
     module.CLASS_LABELS, module.VALID_CLASS_IDS = (
         module.CLASS_LABELS[:MAX_CLASSES],
         module.VALID_CLASS_IDS[:MAX_CLASSES],
     )
     known = list(module.VALID_CLASS_IDS)
-    ids = {VOID: 0, LEFT_OUT: 2, **{k: known[7 * k + 3] for k in SCORED}}  # 2 is none of its classes
+    ids = {VOID: 0, LEFT_OUT: 2, **{k: known[7 * k + 3] for k in SCORED}}  # 2 is not one of its classes
     rows = [known.index(ids[one]) for one in SCORED] if is_plain else [0]
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
 
@@ -234,7 +234,7 @@ def open3dis(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def ours(rules: ProtocolRules, problem: Problem) -> Answer:
-    """What this program answers."""
+    """This program's answer."""
     counts: list[Any] = [scored(rules, scene).counts for scene in problem]
     curve = average_precision.combine(counts, rules.thresholds)
     rows = [0]
@@ -245,7 +245,7 @@ def ours(rules: ProtocolRules, problem: Problem) -> Answer:
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` problems of the file of cases that it answers."""
+    """The original's answers to the first ``n`` problems in the file of cases that it answers."""
     file = CASES / "originals_instance.json"
     content = json.loads(file.read_text())
     kept: dict[str, list[float | None]] = {}

@@ -1,4 +1,4 @@
-"""OVO's evaluation over made problems of objects that vote for the vertices near them, or of a class a vertex."""
+"""OVO's evaluation on synthetic problems of objects that vote for nearby vertices, or with one class per vertex."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LISTS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for what is unnamed: void, missing classes, objects of no class."""
+    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class."""
     rng = np.random.default_rng([seed, index, 5])
     scenes = []
     for _ in range(rng.integers(1, 4)):
@@ -38,7 +38,7 @@ def drawn(seed: int, index: int) -> Problem:
             continue
         n_objects, n_points = int(rng.integers(1, 6)), int(rng.integers(7, 20))
         owner = rng.integers(-1, n_objects, n_points)
-        owner[:5] = rng.integers(0, n_objects, 5)  # it ends in an error where fewer than five points vote
+        owner[:5] = rng.integers(0, n_objects, 5)  # it fails if fewer than five points vote
         scenes.append(
             scene
             | {
@@ -52,7 +52,7 @@ def drawn(seed: int, index: int) -> Problem:
 
 
 def ovo(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """The script over files of a class a vertex, those of objects as run_eval.py makes them; its lists of classes are
+    """The script on files with one class per vertex, written for objects as by run_eval.py; its lists of classes are
     read from its own settings."""
     import torch
     import yaml
@@ -61,8 +61,8 @@ def ovo(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     module = load(checkout / FILE, [checkout], absent=["seaborn", "matplotlib", "pandas"])
     info = yaml.safe_load((checkout / f"data/working/configs/{LISTS[rules.name]}.yaml").read_text())
     info.setdefault("num_classes", len(info["class_names_reduced"]))
-    void = -1 if -1 in info["map_to_reduced"] else 0  # no vertex's label in ScanNet
-    ids = [entry.id if entry.id in info["map_to_reduced"] else None for entry in rules.classes]  # background is none
+    void = -1 if -1 in info["map_to_reduced"] else 0  # not a vertex label in ScanNet
+    ids = [entry.id if entry.id in info["map_to_reduced"] else None for entry in rules.classes]  # not the background
     place = np.array([info["map_to_reduced"].get(one, info["num_classes"] - 1) for one in ids] + [-1])
 
     def labels_of(scene: dict[str, Any]) -> Float64Array:
@@ -98,7 +98,7 @@ def ovo(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` drawn problems to which it answers something new."""
+    """The original's answers to the first ``n`` problems with a new answer."""
     kept: dict[str, str] = {}
     names = [*OVERALL, *(f"{group} {key}" for group in GROUPS for key in OVERALL[:2])]
     for problem in (drawn(seed, index) for index in itertools.count()):
@@ -117,7 +117,7 @@ def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
 
 
 def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The same of this program."""
+    """The same by this program."""
     return our_means(rules, slots_of(rules, problem))
 
 

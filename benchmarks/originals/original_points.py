@@ -1,4 +1,4 @@
-"""The original evaluators of one class a point, each over the same made problems."""
+"""Original evaluators with one class per point, each on the same synthetic problems."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OF_CONCEPTGRAPHS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` on the points themselves: missing classes, void, nothing called, wrong classes."""
+    """Problem ``index`` on identical points: missing classes, void, no predictions, wrong classes."""
     rng = np.random.default_rng([seed, index])
     scenes = []
     for _ in range(rng.integers(1, 4)):
@@ -40,9 +40,9 @@ def drawn(seed: int, index: int) -> Problem:
 
 
 def drawn_in_space(seed: int, index: int) -> Problem:
-    """Problem ``index`` with three clouds: points of the truth, of the prediction and to be scored; some coincide.
+    """Problem ``index`` with three clouds (ground truth, prediction, points to score); some points coincide.
 
-    The prediction has classes that are scored and true in the scene alone.
+    The prediction only has classes that are scored and true in the scene.
     """
     rng = np.random.default_rng([seed, index, 3])
     scenes = []
@@ -64,7 +64,7 @@ def drawn_in_space(seed: int, index: int) -> Problem:
 
 
 def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """ScanNet's script, over text files; with the lists of BenchmarkScripts/ScanNet200 where the protocol has 200."""
+    """ScanNet's script on text files; with the lists of BenchmarkScripts/ScanNet200 if the protocol has 200."""
     code = of_python_3(checkout / "BenchmarkScripts", folder / "code")
     script = code / "3d_evaluation/evaluate_semantic_label.py"
     module = load(script, [code], ["--pred_path", str(folder), "--gt_path", str(folder)], ["plyfile", "imageio"])
@@ -98,10 +98,10 @@ def _ours(rules: ProtocolRules, problem: Problem) -> ProtocolResult:
 
 
 def conceptgraphs(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """ConceptGraphs' script, from files of maps and clouds on.
+    """ConceptGraphs' script, starting from files of maps and clouds.
 
-    In place of the text encoder each class has an axis of its own; the clouds are handed over rather than read from
-    HDF5, and the nearest neighbours, which it asks of a GPU, are found one after another in float32.
+    Instead of the text encoder, each class has its own axis; the clouds are passed in rather than read from
+    HDF5, and the GPU's nearest-neighbour search is replaced by a sequential float32 search.
     """
     import torch
 
@@ -144,21 +144,21 @@ def conceptgraphs(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
             _write_map(folder / f"maps/{s}/pcd_saves/full_pcd_made.pkl.gz", scene, place, n_classes)
         n_before = len(answers)
         before = Path.cwd()
-        os.chdir(folder)  # where it writes its tables
+        os.chdir(folder)  # it writes its tables here
         try:
             module.main(words)
         finally:
             os.chdir(before)
         rows = [[np.mean(one[key]) for key in OF_CONCEPTGRAPHS.values()] for one in answers[n_before:]]
         if np.isnan(rows[-1]).any():
-            raise ArithmeticError("its means are of no class where no scene has a scored point")
-        return np.array(rows[-1:] + rows[:-1], float)  # that of all scenes first
+            raise ArithmeticError("its means cover no class if no scene has a scored point")
+        return np.array(rows[-1:] + rows[:-1], float)  # all scenes first
 
     return ask
 
 
 def _nearest(of: Any, to: Any, **_: Any) -> Any:
-    """What the GPU's search for one neighbour gives: squared distances in float32, of equals the first."""
+    """The result of the GPU's search for one neighbour: squared distances in float32, the first in a tie."""
     squared = ((of[0][:, None] - to[0][None]) ** 2).sum(-1)
     return types.SimpleNamespace(idx=squared.argmin(dim=1)[None, :, None])
 
@@ -192,7 +192,7 @@ def our_means(rules: ProtocolRules, problem: Problem) -> Float64Array:
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` drawn problems that it answers, no two alike."""
+    """The original's answers to the first ``n`` problems that it answers, all different."""
     kept, index, is_of_space = list[dict[str, Any]](), 0, rules.metric == "conceptgraphs"
     while len(kept) < n:
         problem = (drawn_in_space if is_of_space else drawn)(seed, index)
@@ -208,7 +208,7 @@ def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
 
 
 def rewritten(name: str, kept: list[dict[str, Any]]) -> None:
-    """The file of cases of points with those of one protocol in place of what it had of it."""
+    """The file of point cases with those of one protocol replaced."""
     file = CASES / "originals_semantic.json"
     content = {**json.loads(file.read_text()), name: kept}
     blocks = [

@@ -1,4 +1,4 @@
-"""ScanNet's script over made problems of text queries, each query of a scene as a scene of its own."""
+"""ScanNet's script on synthetic text query problems, with each query of a scene as a separate scene."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from synthetic_queries import Problem, objects_of, scored
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
-ASKED, OTHER = 3, 4  # labels of the two classes; what is not asked for is no void, so that masks on it are wrong
+ASKED, OTHER = 3, 4  # labels of the two classes; other objects are not void, so masks on them are wrong
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: objects of several queries and of none, equal cosines, masks twice, on nothing."""
+    """Problem ``index``: objects of several queries or none, equal cosines, duplicate or empty masks."""
     rng = np.random.default_rng([seed, index])
     scenes = []
     for _ in range(rng.integers(1, 3)):
         ids = [int(one) for one in rng.permutation(rng.integers(2, 7))]
         objects = [[one if rng.random() < 0.85 else -1, int(rng.integers(1, 12))] for one in ids]
         starts = np.cumsum([0, *(length for _, length in objects)]).tolist()
-        there = [one for one, _ in objects if one >= 0] or [99]  # an object that no point has
+        there = [one for one, _ in objects if one >= 0] or [99]  # an object without points
         queries = [sorted(rng.choice(there, min(len(there), n), replace=False).tolist()) for n in rng.integers(1, 4, 3)]
         masks: list[list[int]] = []
         for _ in range(rng.choice([0, 2, 4, 7])):
@@ -41,7 +41,7 @@ def drawn(seed: int, index: int) -> Problem:
 
 
 def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """AP, AP50, AP25 and the AP at each threshold of what is asked for, with the protocol's minimum size."""
+    """AP, AP50, AP25 and the AP at each threshold of the query's objects, with the protocol's minimum size."""
     code = of_python_3(checkout / "BenchmarkScripts", folder / "code")
     words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt")]
     module = load(code / "3d_evaluation/evaluate_semantic_instance.py", [code], words, ["plyfile", "imageio"])
@@ -61,7 +61,7 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
                 np.savetxt(truth / names[-1], values, fmt="%d")
                 lines = []
                 cosines = [row[q] for row in scene["cosines"]]
-                for k in np.argsort(-np.array(cosines), kind="stable").tolist():  # as a submission ranks its masks
+                for k in np.argsort(-np.array(cosines), kind="stable").tolist():  # in a submission's ranking order
                     mask = scene["masks"][k]
                     file = f"masks/{s}_{q}_{k:03d}.txt"
                     np.savetxt(pred / file, np.isin(np.arange(len(objects)), np.arange(*mask)), fmt="%d")
@@ -77,13 +77,13 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The same of this program."""
+    """The same by this program."""
     curve = scored(rules, problem)
     return np.array([curve.ap, curve.ap50, curve.ap25, *curve.table[0]], float)
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` drawn problems to which it answers something new."""
+    """The original's answers to the first ``n`` problems with a new answer."""
     kept: dict[str, str] = {}
     for problem in (drawn(seed, index) for index in itertools.count()):
         with silence():

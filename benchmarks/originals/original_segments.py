@@ -1,4 +1,4 @@
-"""panopticapi, the evaluator of COCO's panoptic task, over made problems of labelled points."""
+"""panopticapi, the evaluator of COCO's panoptic task, on synthetic problems of labelled points."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OVERALL = ("pq", "sq", "rq")
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: crowds, void, points that are left out, masks of no scored class, overlaps of one half."""
+    """Problem ``index``: crowds, void, excluded points, masks without a scored class, overlaps of one half."""
     rng = np.random.default_rng([seed, index, 7])
     scenes = []
     for _ in range(rng.integers(1, 4)):
@@ -59,7 +59,7 @@ def drawn(seed: int, index: int) -> Problem:
 
 
 def panopticapi(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
-    """The script over pairs of images of one line, a pixel a point, each scene in a process of its own."""
+    """The script on pairs of one-line images, one pixel per point, each scene in a separate process."""
     from PIL import Image
 
     module = load(checkout / FILE, [checkout])
@@ -111,7 +111,7 @@ def panopticapi(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
-    """The original's answers to the first ``n`` drawn problems to which it answers something new."""
+    """The original's answers to the first ``n`` problems with a new answer."""
     file = CASES / "panoptic03_labelled_points.json"
     kept: dict[str, dict[str, Any]] = {}
     for problem in (drawn(seed, index) for index in itertools.count()):

@@ -1,6 +1,6 @@
-"""Runs of the command as forked processes, for scripts that disturb them, and what their folders hold afterwards.
+"""Runs of the command as forked processes, for scripts that disturb them, and the resulting content of their folders.
 
-Each run is a process forked from one that has its modules loaded, so that what strikes it strikes the work, not the
+Each run is forked from a process with loaded modules, so that disturbances hit the work, not the
 start.
 """
 
@@ -35,7 +35,7 @@ SUBJECTS = {
         "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
     ),
 }  # fmt: skip
-# The method ``command``; ``command.command`` follows once there is a prediction that the program can leave.
+# The method ``command``; ``command.command`` is set once there is a prediction for the program to write.
 SUBJECTS["program"] = (
     *RUN, "--scenes", *(f"{SCENES}/kill_subject.py:Painted/{scene}" for scene in "ab"),
     "--methods", "command", "--set", "painted.n_frames=2",
@@ -51,7 +51,7 @@ COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
 
 class ForkedProcess:
-    """The command line ``words``, carried out in the folder ``at`` by a process group of its own."""
+    """The command line ``words``, executed in the folder ``at`` by a separate process group."""
 
     def __init__(self, words: Sequence[str], log: Path, at: Path | None = None) -> None:
         self._log = log
@@ -75,18 +75,18 @@ class ForkedProcess:
             code = main(words)
             sys.stdout.flush()
             sys.stderr.flush()
-        except KeyboardInterrupt:  # in the moment before or after the command
+        except KeyboardInterrupt:  # just before or after the command
             code = 130
         finally:
             os._exit(code)
 
     def finish(self) -> int:
-        """The exit code; minus the signal where one ended it."""
+        """The exit code; the negative signal number if a signal ended it."""
         _, status = os.waitpid(self.pid, 0)
         return os.waitstatus_to_exitcode(status)
 
     def has_ended(self) -> bool:
-        """Whether it is over; its exit code can still be had."""
+        """Whether it has ended; its exit code remains available."""
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def output(self) -> str:
@@ -94,21 +94,21 @@ class ForkedProcess:
 
 
 class Run(ForkedProcess):
-    """A run into ``folder``, carried out beside it."""
+    """A run into ``folder``, executed next to it."""
 
     def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
         super().__init__((*request, "--out", str(folder)), log or folder.with_suffix(".log"), folder.parent)
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """What every file of a run folder holds, without what a clock or a meter put there."""
+    """Content of every file of a run folder, without times and measurements."""
     return {
         path.relative_to(folder).as_posix(): _timeless(path) for path in sorted(folder.rglob("*")) if path.is_file()
     }
 
 
 def program_of(ready: Path) -> str:
-    """The setting by which the method ``command`` starts another program's other program and leaves ``ready``."""
+    """The setting by which the method ``command`` starts a program that starts another one and writes ``ready``."""
     words = [sys.executable, str(Path(__file__).with_name("kill_program.py")), "{output}", str(ready)]
     return f"command.command={json.dumps(words)}"
 
@@ -125,7 +125,7 @@ def _timeless(path: Path) -> Any:
         for step in record["steps"].values():
             step["files"].pop("updates.csv", None)
             step["remarks"].pop("costs", None)
-            if path.parent.name == "command":  # its log tells times and folders
+            if path.parent.name == "command":  # its log contains times and folders
                 step["files"].pop("log.txt", None)
                 step["remarks"].pop("log", None)
         return record
@@ -133,7 +133,7 @@ def _timeless(path: Path) -> Any:
 
 
 def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
-    """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
+    """Files covered by a completion record, or by a run read as finished, that differ from those of a complete run."""
     from su3d_bench.core.digests import digest_file
     from su3d_bench.core.errors import Su3dError
     from su3d_bench.runs.finished import read_run
@@ -158,7 +158,7 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
 
 
 def load_modules(subject: str) -> None:
-    """What a run imports, in this one process, which must stay without threads of its own."""
+    """Import a run's modules in this process, which must not start threads."""
     from su3d_bench.runs.executors import limit_threads
 
     limit_threads()

@@ -1,11 +1,11 @@
-"""Damage for every reader of others' files, by the table of fuzzing/fuzz_targets.py, in processes that may die.
+"""Damaged input for every file reader in fuzzing/fuzz_targets.py, in processes that may die.
 
     python benchmarks fuzz --inputs 100000 --seed 1 --json build/measured/fuzz.json
 
-Inputs are spread over the readers by weight; the damage number k of a reader is the same on every machine, so that
-``--only NAME --first K --inputs 1 --seed S`` shows a fault again. A reader whose process dies (a crash in a native
-library, a loop that no alarm stops) is a fault like an untyped error; its input is saved below ``--save``.
-``--minutes`` bounds the whole; what was not reached is said. Exit code 1 where there was a fault.
+Inputs are distributed over the readers by weight; damage number k of a reader is the same on every machine, so that
+``--only NAME --first K --inputs 1 --seed S`` reproduces a fault. A reader whose process dies (a crash in a native
+library, an uninterruptible loop) counts as a fault like an untyped error; its input is saved below ``--save``.
+``--minutes`` limits the total; unreached inputs are reported. Exit code 1 on a fault.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from typing import Any
 from folders import BENCHMARKS
 from measured import write_measured
 
-HANG_S = 120.0  # without a word of a process: far beyond the alarm of one input
-STARTS_S = 300.0  # until the first word: imports and the sample
+HANG_S = 120.0  # silence of a process: far beyond the alarm of one input
+STARTS_S = 300.0  # until the first output: imports and the sample
 
 
 @dataclass
 class Tally:
-    """What became of a reader's inputs."""
+    """Results of a reader's inputs."""
 
     name: str
     n_read: int = 0
@@ -61,7 +61,7 @@ class Tally:
 
 
 def work() -> None:
-    """For each order on stdin, meet a reader with damage and say a line of JSON on each input."""
+    """For each order on stdin, run a reader on damaged input and print one JSON line per input."""
     from damage import bounded_addresses
     from fuzz_targets import TARGETS
     from fuzzing import MAX_ADDRESSES_BYTES, Sample
@@ -69,11 +69,11 @@ def work() -> None:
     output, null = os.fdopen(os.dup(1), "w"), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     sys.stderr = os.fdopen(os.dup(2), "w")
-    os.dup2(null, 2)  # native libraries complain there, one line an input
+    os.dup2(null, 2)  # native libraries print errors there, one line per input
     for line in sys.stdin:
         order = json.loads(line)
         with tempfile.TemporaryDirectory(prefix="fuzz") as folder:
-            os.chdir(folder)  # a reader that writes where it stands does no harm
+            os.chdir(folder)  # a reader that writes to the working folder does no harm
             os.environ["SU3D_DATA"] = folder
             sample = Sample(TARGETS[order["name"]], Path(folder, "sample").resolve())
             with bounded_addresses(MAX_ADDRESSES_BYTES):
@@ -86,7 +86,7 @@ def work() -> None:
 
 
 class Worker:
-    """A process that does the work of order after order, and may die of one."""
+    """A process that executes orders, any of which may kill it."""
 
     def __init__(self) -> None:
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the process
@@ -104,7 +104,7 @@ class Worker:
         self._lines.put(None)
 
     def told(self, name: str, seed: int, first: int, end: int) -> Iterator[dict[str, Any]]:
-        """What became of each input; ends early where the process dies or hangs."""
+        """Results of each input; ends early if the process dies or hangs."""
         assert self._process.stdin is not None
         print(
             json.dumps({"name": name, "seed": seed, "first": first, "end": end}), file=self._process.stdin, flush=True
@@ -119,7 +119,7 @@ class Worker:
             yield json.loads(line)
 
     def end(self) -> tuple[int, str]:
-        """Its exit code and last words; it is ended where it still runs."""
+        """Exit code and last output; kills the process if it still runs."""
         try:
             self._process.wait(timeout=1)
         except subprocess.TimeoutExpired:
@@ -132,13 +132,13 @@ class Worker:
 
 
 class Crew:
-    """The worker of the moment."""
+    """The current worker process."""
 
     def __init__(self) -> None:
         self._worker: Worker | None = None
 
     def meet(self, name: str, seed: int, first: int, end: int, save: Path, ends: float) -> Tally:
-        """All inputs of a reader, by as many processes as it takes."""
+        """All inputs of a reader, using as many processes as needed."""
         tally = Tally(name)
         while first < end and time.monotonic() < ends:
             self._worker = self._worker or Worker()
@@ -151,7 +151,7 @@ class Crew:
                 self._bury(tally, seed, first, save, is_over=time.monotonic() > ends)
                 first += 1
                 if tally.faults and tally.faults[-1]["fault"].startswith("harness"):
-                    break  # it would fail of every input
+                    break  # it would fail on every input
         for fault in tally.faults[:20]:
             fault["file"] = _saved(name, seed, fault["index"], save)
         return tally
@@ -170,7 +170,7 @@ class Crew:
 
 
 def _saved(name: str, seed: int, index: int, save: Path) -> str:
-    """Where the bytes of an input now lie."""
+    """Path of the saved bytes of an input."""
     from fuzz_targets import TARGETS
     from fuzzing import Sample
 
@@ -187,10 +187,10 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=100_000, help="in all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of each reader's first input")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="readers; 'scannet*' for all that begin so")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="readers; 'scannet*' for a prefix")
     parser.add_argument("--minutes", type=float, default=600.0)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="where the table goes")
-    parser.add_argument("--save", type=Path, default=Path("fuzz-faults"), help="where inputs of faults go")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table to FILE")
+    parser.add_argument("--save", type=Path, default=Path("fuzz-faults"), help="folder for inputs of faults")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker:
@@ -201,7 +201,7 @@ def main() -> int:
     wanted = arguments.only or ["*"]
     names = [name for name in TARGETS if any(Path(name).match(one) if "*" in one else name == one for one in wanted)]
     if not names:
-        parser.error(f"no reader is called so; known: {', '.join(TARGETS)}")
+        parser.error(f"unknown reader; known: {', '.join(TARGETS)}")
     started = time.monotonic()
     ends = started + 60 * arguments.minutes
     tallies, crew = [], Crew()
@@ -231,7 +231,7 @@ def _summed_up(tallies: list[Tally], arguments: argparse.Namespace, elapsed_s: f
         f"{n} inputs for {len(tallies)} readers with seed {arguments.seed} in {elapsed_s / 60:.1f} min: "
         f"{sum(one.n_read for one in tallies)} read, {sum(one.n_refused for one in tallies)} refused, "
         f"{n_faults} faults; slowest {slowest.slowest_s:.2f} s ({slowest.name} {slowest.slowest_index}), "
-        f"most memory +{largest.max_grown_bytes >> 20} MiB ({largest.name})"
+        f"largest memory growth +{largest.max_grown_bytes >> 20} MiB ({largest.name})"
     )
     print(summary)
     if arguments.json is not None:

@@ -1,21 +1,21 @@
-"""Runs and verbs killed at random moments, last written files spoilt as by a power cut, then taken up again.
+"""Runs and verbs killed at random moments, last written files corrupted as by a power cut, then resumed.
 
     python benchmarks kill_at_random --kills 200
     python benchmarks kill_at_random --kills 20 --seed 7 --only processes export
 
 A run of two methods on three tiny painted scenes (``--subject opensu3d``: OpenSU3D and two baselines) is started and
-killed, with signal 9 or with what terminals, schedulers and users send, at a moment drawn evenly from the time that a
-whole run takes; after half of the kills with signal 9 each file of the second before is cut short, emptied, filled with
-zeros or taken back. Half of the runs that take it up again are killed too. After every kill nothing that a seal vouches
-for may differ from the undisturbed run and the folder may not stay locked; in the end every file must have the bytes of
-the undisturbed run, columns of times aside. So are runs of a program of somebody else that starts another program
+killed, with signal 9 or with those sent by terminals, schedulers and users, at a random moment of the duration of a
+complete run; after half of the kills with signal 9 each file of the last second is truncated, emptied, filled with
+zeros or reverted. Half of the runs that resume it are killed too. After every kill no file covered by a completion
+record may differ from the undisturbed run and the folder may not stay locked; finally every file must have the bytes of
+the undisturbed run, except columns of times. The same holds for runs of a user program that starts another program
 (``program``, ``programs`` in workers), and ``export``, ``sheets make``, ``sheets score`` and ``report html``.
 
-Three things are counted and must be none: faults; orphans, processes that still work for what was killed seconds ago;
-and leftovers, files and folders that nothing finished owns once the same command was let go to its end.
+Three counts must be zero: faults; orphans, processes that still work for a run killed seconds ago;
+and leftovers, files and folders without an owner once the same command has completed.
 
-Each run is a process forked from one that has its modules loaded, so that the kills strike the work, not the start.
-``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run to meet, ``worker`` kills
+Each run is forked from a process with loaded modules, so that kills hit the work, not the start.
+``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run, ``worker`` kills
 one worker of a run. With ray, the workers are those of a cluster that is started here and outlives the runs.
 """
 
@@ -49,7 +49,7 @@ from killed_commands import VERBS, load_verbs, try_verbs
 from killing import SIGNALS, Tally, check_end, clear_leftovers, cut_power, end_of, end_orphans, kill, workers_below
 from measured import write_measured
 
-# What is run, and by which executor; ``--subject`` names what the first three run.
+# What is run, and by which executor; ``--subject`` selects what the first three run.
 RUNS = {
     "inline": (None, "inline"),
     "processes": (None, "processes"),
@@ -58,22 +58,22 @@ RUNS = {
     "programs": ("program", "processes"),
 }
 VICTIMS = {"inline": ("group", "driver"), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
-# Of the kills: a run in workers takes many times as long.
+# Shares of the kills: a run in workers takes much longer.
 SHARES = dict.fromkeys(VERBS, 2) | {"inline": 8, "processes": 3, "ray": 2, "program": 4, "programs": 2}
 COLUMNS = (
     "kills", "of a group", "of a driver", "of a worker", "SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "power cuts",
-    "files spoilt", "compared",
+    "files corrupted", "compared",
 )  # fmt: skip
 COUNTED = ("faults", "orphans", "leftovers")
 NOTE = (
-    "compared: what was taken up again to its end and had the bytes of the undisturbed one; a fault is a file that "
-    "differs, a half-written one taken for whole, a lock that stayed, a traceback or another end than the signal's; an "
-    "orphan is a process that works on 5 s after its run was killed, a leftover a file or folder that nothing owns."
+    "compared: resumed to completion with the bytes of the undisturbed run; a fault is a file that "
+    "differs, a partial one accepted as complete, a remaining lock, a traceback or an unexpected exit code; an "
+    "orphan is a process still working 5 s after its run was killed, a leftover a file or folder without an owner."
 )
 
 
 class Cluster:
-    """A Ray cluster of two machines on this one, the second of which takes jobs; a process of its own holds it."""
+    """A Ray cluster of two machines on this one, the second of which takes jobs; a separate process runs it."""
 
     CODE = (
         "import sys; from ray.cluster_utils import Cluster\n"
@@ -91,7 +91,7 @@ class Cluster:
         self.pid = self._process.pid
 
     def processes(self) -> list[int]:
-        """All processes that are of the cluster, and end with it."""
+        """All processes of the cluster, which end with it."""
         import psutil
 
         return [one.pid for one in psutil.Process(self.pid).children(recursive=True)]
@@ -101,7 +101,7 @@ class Cluster:
 
 
 class Trial:
-    """Runs of one kind: the undisturbed one, and as many killed ones as are asked for."""
+    """Runs of one kind: the undisturbed one, and as many killed ones as requested."""
 
     def __init__(
         self, scratch: Path, subject: str, executor: str, cluster: Cluster | None, seed: str, tally: Tally
@@ -126,12 +126,12 @@ class Trial:
         self._whole_s = time.monotonic() - run.started
         self.expected = outcome(whole)
         if outcome(scratch / "timed") != self.expected:
-            raise SystemExit("two undisturbed runs differ; nothing can be said of killed ones")
+            raise SystemExit("two undisturbed runs differ; killed ones cannot be compared")
         shutil.rmtree(scratch / "timed")
-        self._kept = {path.name for path in self._temporary.iterdir()}  # as a cluster keeps
+        self._kept = {path.name for path in self._temporary.iterdir()}  # as for a cluster
 
     def _ready(self) -> Path:
-        """A map for the program to leave."""
+        """A map for the program to write."""
         run = Run(self._scratch / "light", (*SUBJECTS["light"], *EXECUTORS["inline"]))
         if run.finish() != COMPLETE:
             raise SystemExit(f"the run before those of a program failed: {run.output()}")
@@ -160,19 +160,19 @@ class Trial:
         if not was_hit:
             self._tally.done["nobody there"] += 1
             if code != COMPLETE:
-                self._tally.fault(f"a run that nobody killed ended with {code}: {run.output()}")
+                self._tally.fault(f"a run that was not killed ended with {code}: {run.output()}")
             return False
         if victim == "worker" or sent != signal.SIGKILL:
             check_end(run, code, sent, (COMPLETE, INCOMPLETE), self._tally)
         if victim == "driver" and sent == signal.SIGKILL:
-            self._tally.kill(victim, sent, None)  # its workers may live on for a moment: the next run meets them
+            self._tally.kill(victim, sent, None)  # its workers may live on briefly: the next run encounters them
             return True
         self._end_orphans()
         is_cut = sent == signal.SIGKILL and self._moments.random() < 0.5
         spoilt = cut_power([folder, self._cache], self._moments) if is_cut else None
         if folder.is_dir():
             for name in false_seals(folder, self.expected):
-                self._tally.fault(f"taken for whole after the kill of a {victim}: {name}")
+                self._tally.fault(f"accepted as complete after the kill of a {victim}: {name}")
             self._lock(folder)
         self._tally.kill(victim, sent, spoilt)
         return True
@@ -190,7 +190,7 @@ class Trial:
             with RunFolder(folder).locked():
                 pass
         except StoreError as error:
-            self._tally.fault(f"a lock stayed: {error}")
+            self._tally.fault(f"a lock remained: {error}")
 
     def _resume(self, folder: Path) -> None:
         run = Run(folder, self._request)
@@ -198,14 +198,14 @@ class Trial:
         self._tally.done["compared"] += 1
         self._end_orphans()
         if code != COMPLETE:
-            self._tally.fault(f"taken up again it ended with {code}: {run.output()}")
+            self._tally.fault(f"after resuming it ended with {code}: {run.output()}")
             return
         found = outcome(folder)
         for name in sorted(found.keys() | self.expected.keys()):
             if name not in self.expected:
                 self._tally.leftover(name)
             elif name not in found or found[name] != self.expected[name]:
-                self._tally.fault(f"taken up again: {name} {'differs' if name in found else 'is missing'}")
+                self._tally.fault(f"resumed: {name} {'differs' if name in found else 'is missing'}")
         for path in self._cache.rglob("*"):
             if path.is_file() and path.suffix != ".npz":
                 self._tally.leftover(f"in the cache: {path.name}")
@@ -214,15 +214,13 @@ class Trial:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--kills", type=int, default=200, help="at least so many; most are of runs inline (default: 200)"
-    )
+    parser.add_argument("--kills", type=int, default=200, help="minimum number; most are of inline runs (default: 200)")
     parser.add_argument("--seed", default="0")
     parser.add_argument("--only", nargs="+", choices=list(SHARES), default=list(SHARES), help="what is killed")
     parser.add_argument(
-        "--subject", choices=("light", "opensu3d"), default="light", help="what most runs run (default: light)"
+        "--subject", choices=("light", "opensu3d"), default="light", help="subject of most runs (default: light)"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table there too")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the table to FILE")
     given = parser.parse_args(arguments)
     load_modules(given.subject)
     started = time.monotonic()

@@ -1,6 +1,6 @@
-"""A program of somebody else that starts another one and takes its time; killed runs must not leave either behind.
+"""A user program that starts another one and is slow; killed runs must not leave either behind.
 
-Once nobody waits for it any more it goes on for a minute, so that it is seen.
+If no one waits for it any more it continues for a minute, so that it is detected.
 """
 
 import os

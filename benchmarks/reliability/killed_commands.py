@@ -1,4 +1,4 @@
-"""Verbs that make something of a finished run, killed at random moments and given again."""
+"""Verbs that process a finished run, killed at random moments and repeated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from killing import SIGNALS, Tally, check_end, clear_leftovers, end_of, end_orph
 
 @dataclass(frozen=True)
 class KilledVerb:
-    """What is killed, in a folder with copies of ``needs``; ``after``: what must still work there."""
+    """A verb to kill, in a folder with copies of ``needs``; ``after``: a command that must still work there."""
 
     words: tuple[str, ...]
     needs: tuple[str, ...]
@@ -45,7 +45,7 @@ VERBS = {
 
 
 def load_verbs() -> None:
-    """What these verbs import, in this one process."""
+    """Import these verbs' modules in this process."""
     import matplotlib.figure  # noqa: F401
     import openpyxl  # noqa: F401
 
@@ -66,17 +66,17 @@ def make_inputs(folder: Path) -> None:
 
 
 class VerbTrial:
-    """One verb: what it leaves undisturbed, and as many killed ones as are asked for."""
+    """One verb: its undisturbed result, and as many killed ones as requested."""
 
     def __init__(self, scratch: Path, inputs: Path, name: str, seed: str, tally: Tally) -> None:
         self._verb, self._inputs, self._tally = VERBS[name], inputs, tally
         self._moments = random.Random(f"{seed} {name}")
         self._place, self._log, self._temporary = scratch / "place", scratch / "log", scratch.parent / "temporary"
         scratch.mkdir()
-        self._kept = {path.name for path in self._temporary.iterdir()}  # as Ray keeps of a cluster that has ended
+        self._kept = {path.name for path in self._temporary.iterdir()}  # as left by a finished Ray cluster
         found = [self._undisturbed() for _ in range(2)]
         if found[0] != found[1]:
-            raise SystemExit(f"two undisturbed ones of {name} differ; nothing can be said of killed ones")
+            raise SystemExit(f"two undisturbed results of {name} differ; killed ones cannot be compared")
         self._expected = found[1]
 
     def _undisturbed(self) -> dict[str, Any]:
@@ -95,7 +95,7 @@ class VerbTrial:
             shutil.copytree(source, copy) if source.is_dir() else shutil.copyfile(source, copy)
 
     def kills(self, n: int) -> None:
-        """Episodes until ``n`` kills struck, each of up to a few, and then one that is let go to its end."""
+        """Episodes until ``n`` kills struck, each with up to a few kills, then one that completes."""
         struck = 0
         while struck < n:
             self._prepare()
@@ -122,7 +122,7 @@ class VerbTrial:
         return True
 
     def _restore(self) -> None:
-        """An export that was whole before the signal came would be refused the next time."""
+        """An export completed before the signal would be rejected the next time."""
         if self._verb.after:
             shutil.rmtree(self._place / "run/exported", ignore_errors=True)
 
@@ -131,25 +131,25 @@ class VerbTrial:
         for words in filter(None, (self._verb.words, self._verb.after)):
             one = ForkedProcess(words, self._log, self._place)
             if (code := one.finish()) != COMPLETE:
-                self._tally.fault(f"given again, {words[0]} ended with {code}: {one.output()}")
+                self._tally.fault(f"repeated, {words[0]} ended with {code}: {one.output()}")
         end_orphans(self._place, self._tally)
         found = everything(self._place)
         for name in sorted(found.keys() | self._expected.keys()):
             if name not in self._expected:
                 self._tally.leftover(name)
             elif name not in found or found[name] != self._expected[name]:
-                self._tally.fault(f"given again: {name} {'differs' if name in found else 'is missing'}")
+                self._tally.fault(f"repeated: {name} {'differs' if name in found else 'is missing'}")
         clear_leftovers(self._temporary, self._kept, self._tally)
 
 
 def everything(folder: Path) -> dict[str, Any]:
-    """What every file holds that ``outcome`` knows, and every folder, by name."""
+    """Content of every file in ``outcome``, and every folder, by name."""
     folders = {path.relative_to(folder).as_posix(): None for path in folder.rglob("*") if path.is_dir()}
     return outcome(folder) | folders
 
 
 def try_verbs(scratch: Path, counts: dict[str, int], seed: str, tallies: dict[str, Tally]) -> None:
-    """So many kills of each verb."""
+    """That many kills of each verb."""
     os.environ["SU3D_CACHE"] = str(scratch / "cache-of-verbs")
     make_inputs(scratch / "inputs")
     for name, n in counts.items():

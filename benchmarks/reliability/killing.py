@@ -15,18 +15,18 @@ from pathlib import Path
 
 from forked_runs import ForkedProcess
 
-# The one that nothing can answer, and what a terminal, a scheduler and a user send.
+# The signal that cannot be handled, and those of a terminal, a scheduler and a user.
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 WORKER_COMMANDS = ("spawn_main", "ray::_on_node")  # in the command lines of workers
-GRACE_S = 5.0  # in which what a killed process started must have ended
-MAX_S = 120.0  # in which a process that got a signal it can answer must have ended
+GRACE_S = 5.0  # until the children of a killed process must have ended
+MAX_S = 120.0  # until a process that received a signal it can handle must have ended
 LAST_SECOND_NS = 1_000_000_000
 PAGE = 4096
 
 
 @dataclass
 class Tally:
-    """What was done and what came of it; ``faults``, ``orphans`` and ``leftovers`` must stay empty."""
+    """What was done and the results; ``faults``, ``orphans`` and ``leftovers`` must stay empty."""
 
     name: str
     done: collections.Counter[str] = field(default_factory=collections.Counter)
@@ -48,13 +48,13 @@ class Tally:
         print(f"{kind} {lines[-1]}", flush=True)
 
     def kill(self, victim: str, sent: signal.Signals, spoilt: int | None) -> None:
-        """Count one that struck; ``spoilt`` files where the power was cut too."""
+        """Count an effective kill; ``corrupted`` files if a power cut was simulated."""
         self.done["kills"] += 1
         self.done[f"of a {victim}"] += 1
         self.done[sent.name] += 1
         if spoilt is not None:
             self.done["power cuts"] += 1
-            self.done["files spoilt"] += spoilt
+            self.done["files corrupted"] += spoilt
         if self.done["kills"] % 10 == 0:
             print(f"{self.name}: {dict(self.done)}", flush=True)
 
@@ -73,7 +73,7 @@ def workers_below(pid: int) -> list[int]:
 
 
 def kill(run: ForkedProcess, victim: str, sent: signal.Signals, workers: Sequence[int], moments: random.Random) -> bool:
-    """Send a signal to ``victim`` of ``run``; whether it was there."""
+    """Send a signal to ``victim`` of ``run``; return whether it existed."""
     if run.has_ended():
         return False
     if victim == "worker" and not workers:
@@ -83,17 +83,17 @@ def kill(run: ForkedProcess, victim: str, sent: signal.Signals, workers: Sequenc
             os.killpg(run.pid, sent)
         else:
             os.kill(moments.choice(workers) if victim == "worker" else run.pid, sent)
-    except ProcessLookupError:  # not a group yet, or a worker no more
+    except ProcessLookupError:  # not a group yet, or no longer a worker
         return False
     return True
 
 
 def end_of(run: ForkedProcess, tally: Tally) -> int:
-    """The exit code of what got a signal; one that goes on for ever is a fault, and ended."""
+    """The exit code after a signal; a process that does not end is a fault, and is killed."""
     limit = time.monotonic() + MAX_S
     while not run.has_ended():
         if time.monotonic() > limit:
-            tally.fault(f"goes on {MAX_S:.0f} s after the signal: {run.output()}")
+            tally.fault(f"still runs {MAX_S:.0f} s after the signal: {run.output()}")
             os.killpg(run.pid, signal.SIGKILL)
             break
         time.sleep(0.01)
@@ -101,7 +101,7 @@ def end_of(run: ForkedProcess, tally: Tally) -> int:
 
 
 def check_end(run: ForkedProcess, code: int, sent: signal.Signals, usual: Collection[int], tally: Tally) -> None:
-    """That who got ``sent`` ended by it, or as ever (``usual``), and without a traceback."""
+    """Check that the process ended by ``sent`` or as usual (``usual``), without a traceback."""
     if code not in (-sent, 128 + sent, *usual):
         tally.fault(f"ended with {code} after {sent.name}: {run.output()}")
     if "Traceback" in run.output():
@@ -109,7 +109,7 @@ def check_end(run: ForkedProcess, code: int, sent: signal.Signals, usual: Collec
 
 
 def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None:
-    """Count, and end, the processes that work below ``place``, once those that are ending have had the time to."""
+    """Count and kill processes that work below ``place``, after giving ending ones time to finish."""
     limit = time.monotonic() + GRACE_S
     while (found := _working_below(place, spared)) and time.monotonic() < limit:
         time.sleep(0.05)
@@ -120,7 +120,7 @@ def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None
 
 
 def _working_below(place: Path, spared: Collection[int]) -> list[tuple[int, str]]:
-    """Processes but this one whose folder, or a word of whose command line, is below ``place``."""
+    """Other processes whose working folder, or a word of whose command line, is below ``place``."""
     import psutil
 
     found = []
@@ -135,7 +135,7 @@ def _working_below(place: Path, spared: Collection[int]) -> list[tuple[int, str]
 
 
 def clear_leftovers(folder: Path, known: Collection[str], tally: Tally) -> None:
-    """Count, and remove, what is in ``folder`` under other names than those of ``known``."""
+    """Count and remove entries of ``folder`` not in ``known``."""
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if path.name not in known:
             tally.leftover(f"in {folder.name}: {path.name}")
@@ -143,7 +143,7 @@ def clear_leftovers(folder: Path, known: Collection[str], tally: Tally) -> None:
 
 
 def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
-    """Spoil the files of the last second as an unlucky file system would; how many were."""
+    """Corrupt the files of the last second as a power cut might; return their number."""
     from su3d_bench.core.files.locks import beside
 
     since = time.time_ns() - LAST_SECOND_NS
@@ -157,11 +157,11 @@ def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
         if way == "whole":
             continue
         spoilt += 1
-        if way == "undone":  # the bytes reached the disk in part, the new name did not
+        if way == "undone":  # the bytes partly reached the disk, the rename did not
             path.rename(beside(path))
         elif way == "cut":
             path.write_bytes(content[:at])
-        elif way == "tail":  # whole pages that were promised but not written
+        elif way == "tail":  # whole pages that were allocated but not written
             kept = at // PAGE * PAGE
             path.write_bytes(content[:kept] + bytes(len(content) - kept))
         else:

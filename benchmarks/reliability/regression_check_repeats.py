@@ -1,9 +1,9 @@
-"""Whether the gate passes unchanged repeats of a real run, with the times that this machine really takes.
+"""Check that unchanged repeats of a real run pass the regression check, with real timings of this machine.
 
-``python benchmarks regression_check_repeats [--repeats 50] [--json build/measured/gate_repeats.json]``: the same small run again
-and again, OpenSU3D with perfect masks on the forty updates of a room; the first five teach the reference, the
-others are checked against it, and each once more with a method slower by half, which must fail. Some seconds a run.
-Exit code 1 where a repeat fails or a slower one passes.
+``python benchmarks regression_check_repeats [--repeats 50] [--json build/measured/gate_repeats.json]``: a small run
+repeatedly, OpenSU3D with perfect masks on the forty updates of a room; the first five create the reference, the
+others are checked against it, and each once more with a method made slower by half, which must fail. A few seconds per
+run. Exit code 1 if a repeat fails or a slower one passes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TAUGHT, N_UPDATES, SLOWER = 5, 40, 1.5
 
 
 def made(scene: str, folder: Path) -> Path:
-    """One run of the request, made anew."""
+    """One run of the request."""
     words = ["run", "--scenes", scene, "--methods", "opensu3d", "--profile", "oracle", "--limit", str(N_UPDATES)]
     words += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1", "--quiet"]
     with contextlib.redirect_stdout(io.StringIO()):
@@ -39,10 +39,10 @@ def made(scene: str, folder: Path) -> Path:
 
 
 def slowed(folder: Path) -> Path:
-    """The run with its method made slower, as if it had been written so."""
+    """The run with its method made slower, as if recorded that way."""
     for path in folder.rglob("updates.csv"):
         rows = list(csv.DictReader(path.open()))
-        if not rows:  # of a method that looks at no frame
+        if not rows:  # of a method without updates
             continue
         for row in rows:
             row["method_ms"] = str(SLOWER * float(row["method_ms"]))
@@ -58,7 +58,7 @@ def slowed(folder: Path) -> Path:
 
 
 def updates_of(folder: Path) -> float:
-    """What the updates of the run cost."""
+    """The cost of the run's updates."""
     cost = method_cost(read_run(folder), "opensu3d")
     assert cost is not None, "the run has no cost"
     return cost.updates
@@ -71,9 +71,9 @@ def verdict_of(folder: Path, reference: Reference) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=50, help="checked runs (default: 50)")
+    parser.add_argument("--repeats", type=int, default=50, help="number of checked runs (default: 50)")
     parser.add_argument("--scene", default="rooms/bathroom0", help="(default: rooms/bathroom0)")
-    parser.add_argument("--json", type=Path, help="write what was measured there")
+    parser.add_argument("--json", type=Path, help="also write the table to FILE")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -87,15 +87,13 @@ def main() -> int:
             n_caught += bool(verdict_of(slowed(run), reference))
     low, high = min(ratios), max(ratios)
     print("\n".join([*failed, f"{arguments.repeats} repeats, {len(failed) // 2} failed; cost {low:.2f} to {high:.2f}"]))
-    print(f"{n_caught} of them are caught when made slower by half")
+    print(f"{n_caught} of them are detected when made slower by half")
     if arguments.json is not None:
         rows = [["unchanged", str(arguments.repeats), str(len(failed) // 2), f"{low:.2f} to {high:.2f}"]]
         rows.append([f"the method {SLOWER:g} times slower", str(arguments.repeats), str(n_caught), "-"])
-        notes = [
-            f"The first {TAUGHT} of the runs taught the reference; a cost up to {COST_LIMIT:g} times its own passes."
-        ]
+        notes = [f"The first {TAUGHT} runs created the reference; costs up to {COST_LIMIT:g} times its own pass."]
         write_measured(
-            arguments.json, "The gate and repeats of one run", "python benchmarks regression_check_repeats",
+            arguments.json, "Regression check on repeats of one run", "python benchmarks regression_check_repeats",
             ["runs", "number", "failed", "cost of the updates, times the reference's"], rows, notes,
         )  # fmt: skip
     return int(bool(failed) or n_caught < arguments.repeats)

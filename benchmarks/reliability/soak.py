@@ -3,10 +3,10 @@
     python benchmarks soak --hours 3 --out soak.csv
     python benchmarks soak --summarise soak.csv
 
-A round calls the command's own entry in this process: a short run of OpenSU3D and two baselines on a room, the same
-run again (nothing to do), a query and the tables; now and then a page, a run in worker processes, and the command as a
-process of its own. Every folder that is used lies below one scratch folder, which is also where temporary files go, so
-that whatever stays behind is counted. The answer is one line a quantity: its slope an hour with a 95 % interval, over
+A round calls the command's entry point in this process: a short run of OpenSU3D and two baselines on a room, the same
+run again (nothing to do), a query and the tables; sometimes a page, a run in worker processes, and the command in a
+separate process. All folders, including temporary files, are below one scratch folder, so
+that leftovers are counted. The result is one line per quantity: its slope per hour with a 95 % interval, over
 the medians of 12 equal spans after the warm-up, and whether it grows.
 """
 
@@ -34,10 +34,10 @@ METHODS = ("opensu3d", "sam3d", "conceptgraphs")
 SCENES = ("rooms/living0", "rooms/office0")
 RUN = ("run", "--methods", *METHODS, "--protocols", "rooms-semantic", "rooms-instance", "--limit", "3", "--quiet")
 FRESH_CACHE_EVERY, PAGE_EVERY, WORKERS_EVERY, COMMAND_EVERY = 4, 6, 8, 10
-COLUMNS = ("quantity", "median", "range", "slope an hour with 95 % interval", "verdict")
+COLUMNS = ("quantity", "median", "range", "slope per hour with 95 % interval", "verdict")
 N_SPANS = 12
-T_95 = 2.228  # Student's t, 97.5 %, of the 10 degrees of freedom that 12 spans leave a line
-# What counts as growth over the whole time, beside an interval above zero: a share of the level, or things.
+T_95 = 2.228  # Student's t, 97.5 %, for the 10 degrees of freedom of a line through 12 spans
+# Growth over the whole time also requires this, besides an interval above zero: a share of the level, or a count.
 TOLERANCE: dict[str, Callable[[float], float]] = {
     "rss_mib": lambda level: 0.02 * level,
     "objects": lambda level: 0.02 * level,
@@ -90,7 +90,7 @@ class Round:
 
 
 def measure(scratch: Path) -> dict[str, float]:
-    """What this process holds and what lies about, after all garbage is collected."""
+    """Resources of this process and files on disk, after garbage collection."""
     import psutil
 
     gc.collect()
@@ -112,7 +112,7 @@ def measure(scratch: Path) -> dict[str, float]:
 
 
 def soak(scratch: Path, hours: float, table: Path) -> None:
-    """Rounds until ``hours`` are over, a line each in ``table``."""
+    """Rounds until ``hours`` are over, one line each in ``table``."""
     for name in ("cache", "temporary"):
         (scratch / name).mkdir()
     os.environ |= {"SU3D_CACHE": str(scratch / "cache"), "TMPDIR": str(scratch / "temporary")}
@@ -135,14 +135,14 @@ def soak(scratch: Path, hours: float, table: Path) -> None:
 
 
 def summarise(table: Path, json_file: Path | None) -> bool:
-    """Print how each quantity went after the first tenth of the time, and write it down; whether none grows."""
+    """Print and store the trend of each quantity after the first tenth of the time; return whether none grows."""
     with table.open(newline="") as stream:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
     hours = np.array([row["hours"] for row in rows])
-    # A tenth, but all kinds of rounds at least once.
+    # A tenth, but every kind of round at least once.
     is_warm = (hours > 0.1 * hours[-1]) & (np.arange(len(rows)) >= COMMAND_EVERY)
     if is_warm.sum() < 2 * N_SPANS:
-        raise SystemExit(f"{table}: {len(rows)} rounds are too few; let it run longer")
+        raise SystemExit(f"{table}: {len(rows)} rounds are too few; run it longer")
     span = hours[-1] - hours[is_warm][0]
     print(f"{len(rows)} rounds in {hours[-1]:.2f} h; after the warm-up {int(is_warm.sum())} in {span:.2f} h")
     lines: list[list[str]] = []
@@ -169,7 +169,7 @@ def summarise(table: Path, json_file: Path | None) -> bool:
 
 
 def line(hours: Any, values: Any) -> tuple[float, float]:
-    """Slope an hour and half of its 95 % interval, from the medians of equal spans, which one odd round cannot move."""
+    """Slope per hour and half of its 95 % interval, from medians of equal spans, which are robust to single rounds."""
     spans = np.array_split(np.arange(len(values)), N_SPANS)
     x = np.array([hours[span].mean() for span in spans])
     y = np.array([np.median(values[span]) for span in spans])
@@ -183,9 +183,9 @@ def line(hours: Any, values: Any) -> tuple[float, float]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hours", type=float, default=3.0)
-    parser.add_argument("--out", type=Path, default=Path("soak.csv"), help="a line a round (default: soak.csv)")
-    parser.add_argument("--summarise", type=Path, metavar="CSV", help="only read such a table")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table of the answer there too")
+    parser.add_argument("--out", type=Path, default=Path("soak.csv"), help="CSV file of the rounds (default: soak.csv)")
+    parser.add_argument("--summarise", type=Path, metavar="CSV", help="only summarise this file")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the result table to FILE")
     given = parser.parse_args(arguments)
     if given.summarise is not None:
         return 0 if summarise(given.summarise, given.json) else 1

@@ -1,11 +1,11 @@
-"""What a map of 20 million points and 5,000 instances costs: update, finish, write, read, score.
+"""Costs of a map of 20 million points and 5,000 instances: update, finish, write, read, score.
 
     python benchmarks big_map
     python benchmarks big_map --points 1000000 --instances 250 --json build/measured/big_map.json
 
-Objects stand on a grid: boxes with a point every 2 cm or closer on their faces, each seen in three images; one is
-clustered as one. After them the wall of ``wall.py`` is fused, all of it again and again: those are the updates
-that are timed. Memory is the resident set, at its highest in each step.
+Objects are on a grid: boxes with points at most 2 cm apart on their faces, each seen in three images; one is
+clustered as one. Then the wall of ``wall.py`` is fused repeatedly: those updates
+are timed. Memory is the peak resident set in each step.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Rows = list[list[str]]
 
 @contextmanager
 def measured(rows: Rows, step: str) -> Iterator[list[str]]:
-    """Add a row: the step, its seconds, its peak memory and what the block leaves in the list that it is given."""
+    """Add a row: the step, its seconds, its peak memory and the remarks that the block appends to the yielded list."""
     found: list[str] = []
     start_memory_watch()
     start = time.perf_counter()
@@ -62,7 +62,7 @@ def faces(generator: np.random.Generator, n: int) -> Float64Array:
 
 
 def detections_of(position: int, objects: range, features: Float32Array, names: tuple[str, ...]) -> Detections:
-    """An image's worth of ``objects``; nothing but what the map keeps of them is filled in."""
+    """One image of ``objects``; only fields used by the map are filled."""
     n = len(objects)
     own = features[[k % len(features) for k in objects]]
     return Detections(
@@ -79,7 +79,7 @@ def detections_of(position: int, objects: range, features: Float32Array, names: 
 
 
 def fill(method: OpenSU3D, n_points: int, n_instances: int) -> GroundTruth:
-    """Put the objects into the map of ``method``, as many updates would have; gives the truth at each 20th."""
+    """Put the objects into the map of ``method``, as many updates would have; returns the ground truth at each 20th."""
     generator = np.random.default_rng(0)
     names = tuple(entry.name for entry in CLASSES)
     features = RandomDirections(DIMENSIONS).encode_texts([RULES.texts_of(name)[0] for name in names])
@@ -98,7 +98,7 @@ def fill(method: OpenSU3D, n_points: int, n_instances: int) -> GroundTruth:
         for part in range(N_VIEWS):
             position = len(method._images)
             found = detections_of(position, objects, features, names)
-            seen = slice(part, None, 2 * N_VIEWS)  # half of its points in all
+            seen = slice(part, None, 2 * N_VIEWS)  # half of its points in total
             record = record_of(found, method.config.fusion, segment[seen], np.concatenate(hits)[seen], method._scratch)
             method._images.append(record)
             for row, k in enumerate(objects):
@@ -134,7 +134,7 @@ def main() -> None:
             start = time.perf_counter()
             method.update(frame, detections, Timer())
             spent.append(time.perf_counter() - start)
-        found.append(f"the median of the last 20 takes {np.median(spent[2:]) * 1e3:.0f} ms")
+        found.append(f"the median of the last 20 is {np.median(spent[2:]) * 1e3:.0f} ms")
     with measured(rows, "finish") as found:
         instances = method.finish()
         found.append(f"{len(instances.points):,} points, {len(instances.ids):,} instances")
@@ -154,10 +154,10 @@ def main() -> None:
     if arguments.json:
         title = f"A map of {arguments.points / 1e6:g} million points and {arguments.instances:,} instances"
         notes = [
-            "Memory is the resident set at its highest in each step. The score is that of rooms-semantic; for instance "
-            "AP the truth of a scene may hold 999 instances at most."
+            "Memory is the peak resident set in each step. The score is that of rooms-semantic; for instance "
+            "AP the ground truth of a scene may have at most 999 instances."
         ]
-        columns = ["step", "time", "peak memory, MiB", "what came out"]
+        columns = ["step", "time", "peak memory, MiB", "result"]
         write_measured(arguments.json, title, "python benchmarks big_map", columns, rows, notes)
 
 

@@ -2,10 +2,10 @@
 
 ``python benchmarks busy_cores --json build/measured/busy_cores.json``, five minutes: the four demo rooms under
 opensu3d through the command line, with as many workers as cores and without the perception cache; before that one frame
-of each room alone, so that what a data root keeps of a room is there. Processor time of the whole process tree is
-sampled every 50 ms. *While jobs wait*: until the first update of the last room begins. A core is *idle* where nothing
-of the run even waits for it: on a machine that does nothing else, all time is used or idle; on a busy one the share of
-the two that was used stays a fair guess of it. Work starts with the first stage of the first update; the best of
+of each room, so that cached data of the rooms exist. Processor time of the whole process tree is
+sampled every 50 ms. *While jobs wait*: until the first update of the last room begins. A core is *idle* if no part
+of the run waits for it: on an otherwise idle machine, all time is used or idle; on a busy one the share of
+the two that was used is still a fair estimate. Work starts with the first stage of the first update; the best of
 ``--starts`` runs of one frame of the first room.
 """
 
@@ -30,8 +30,8 @@ from measured import write_measured
 
 SCENES = ("rooms/living0", "rooms/bedroom0", "rooms/kitchen0", "rooms/office0")
 EVERY_S = 0.05
-WINDOW = 4  # samples over which what is wanted is held to what the cores have: several threads may wait for one
-# The command line as it is, but for its progress: a line of JSON an event.
+WINDOW = 4  # samples over which demand is capped at the cores' capacity: several threads may wait for one
+# The command line, but with one JSON line per progress event.
 COMMAND = """
 import json, sys
 from contextlib import contextmanager
@@ -51,7 +51,7 @@ BEFORE, UPDATES, AFTER, DONE = "before its first frame", "at its updates", "afte
 
 @dataclass(frozen=True)
 class Sample:
-    """Seconds since the command began; processor seconds that its tree used and waited for; what is known of scenes."""
+    """Seconds since the command began; processor seconds used and waited for by its tree; the state of the scenes."""
 
     at_s: float
     used_s: float
@@ -64,15 +64,15 @@ class Sample:
         return len(self.phases)
 
     def doing(self, n_workers: int) -> str:
-        """What the workers are at; one that has told nothing yet is starting, if there are scenes left for it."""
+        """The states of the workers; one without a message is starting, if there are scenes left for it."""
         now = [phase for phase in self.phases.values() if phase != DONE]
         if not self.phases:
-            return "starting, and before that none"
+            return "starting, none before that"
         return ", ".join(sorted(now) + ["starting"] * (n_workers - len(now)))
 
 
 class Tree:
-    """The processor time of a process and all that it starts; what has ended keeps what it had when last seen."""
+    """The processor time of a process and its descendants; ended ones keep their last value."""
 
     def __init__(self, pid: int) -> None:
         self._root = psutil.Process(pid)
@@ -93,7 +93,7 @@ class Tree:
 
 
 def watch(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tuple[list[Sample], float]:
-    """Samples of the run ``words`` until it ends, and its wall time; its events go to ``log``."""
+    """Samples of the run ``words`` until it ends, and its wall time; its events are written to ``log``."""
     samples = []
     start = time.perf_counter()
     with log.open("w") as stream:
@@ -109,7 +109,7 @@ def watch(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tu
 
 
 def progress(log: Path) -> tuple[dict[str, str], int]:
-    """What each scene that is begun is at, and the updates done, from the events that ``COMMAND`` prints."""
+    """The state of each started scene, and the updates done, from the events printed by ``COMMAND``."""
     phases: dict[str, str] = {}
     n_updates = 0
     for line in log.read_text().splitlines():
@@ -125,7 +125,7 @@ def progress(log: Path) -> tuple[dict[str, str], int]:
 
 
 def idle_s(samples: Sequence[Sample]) -> list[float]:
-    """Of the time of the cores, what nobody wanted between one sample and the next."""
+    """The unused capacity of the cores between one sample and the next."""
     cores = os.cpu_count() or 1
     found = []
     for k in range(len(samples) - 1):
@@ -138,7 +138,7 @@ def idle_s(samples: Sequence[Sample]) -> list[float]:
 
 
 def shares(samples: Sequence[Sample]) -> tuple[float, float]:
-    """What was used of the cores' time over ``samples``, and of the time that they were used or idle."""
+    """The share of the cores' time used over ``samples``, and its share of used and idle time."""
     used_s = samples[-1].used_s - samples[0].used_s
     available_s = (os.cpu_count() or 1) * (samples[-1].at_s - samples[0].at_s)
     return used_s / available_s, used_s / (used_s + sum(idle_s(samples)))
@@ -149,7 +149,7 @@ def rates(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]]
     fed = next(k for k, one in enumerate(samples) if one.n_updates)
     last = next(k for k, one in enumerate(samples) if one.n_begun == n_scenes)
     spans = {"from the command until no job waits": samples[: last + 1]}
-    if last > fed:  # with fewer scenes than workers none ever waits
+    if last > fed:  # with fewer scenes than workers no job waits
         spans["from the first update until no job waits"] = samples[fed : last + 1]
     spans["to the end of the last job"] = samples
     for name, span in spans.items():
@@ -160,7 +160,7 @@ def rates(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]]
 
 
 def idling(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]]:
-    """Where the cores' time that nobody wanted went, while jobs waited: by what the workers were at, most first."""
+    """Idle time of the cores while jobs waited, by the states of the workers, most first."""
     cores = os.cpu_count() or 1
     all_s, idle = defaultdict[str, float](float), defaultdict[str, float](float)
     last = next(k for k, one in enumerate(samples) if one.n_begun == n_scenes)
@@ -173,7 +173,7 @@ def idling(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]
 
 
 def first_starts(rounds: Sequence[Sequence[Sample]]) -> Iterator[tuple[str, str]]:
-    """When one scene alone is taken up, the best of ``rounds``."""
+    """The start time of a single scene, the best of ``rounds``."""
     begins = [next(one for one in samples if one.n_begun) for samples in rounds]
     done = [next(one for one in samples if one.n_updates) for samples in rounds]
     for name, found in (("begins", begins), ("is done", done)):
@@ -208,9 +208,9 @@ def main() -> None:
         notes = (
             f"{n} rooms under opensu3d, embedded profile, no perception cache, {os.cpu_count()} workers; processor "
             "time of the whole process tree over cores times wall time. Idle: nothing of the run waited for the core. "
-            "The marks: 85 % while jobs wait, and work that starts in 2 s.",
+            "The targets: 85 % while jobs wait, and work that starts in 2 s.",
         )
-        write_measured(arguments.json, "A run keeps the cores busy", command, ("what", "value"), rows, notes)
+        write_measured(arguments.json, "Core utilization of a run", command, ("what", "value"), rows, notes)
 
 
 if __name__ == "__main__":

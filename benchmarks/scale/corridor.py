@@ -1,12 +1,12 @@
-r"""An endless corridor as a dataset: the map grows with every frame, and the cost of an update stands against it.
+r"""An endless corridor as a dataset: the map grows with every frame, for measuring update cost against map size.
 
     su3d-bench run --scenes benchmarks/scale/corridor.py:Corridor/400m --profile oracle --stride 1 --methods all \
         --out runs/corridor
     su3d-bench report timing runs/corridor --out build/corridor
 
-A corridor of 2.4 x 2.6 m with things along both walls, walked at 2 m a frame; at a voxel of 0.02 m a metre of it holds
-about 28,000 points. Its scan has about 5,000 vertices a metre: a method that works on the scan has all of them from the
-first frame on, so it is run on corridors of several lengths, of which the first frames tell (``--limit``).
+A corridor of 2.4 x 2.6 m with objects along both walls, traversed at 2 m per frame; at a voxel of 0.02 m, a metre has
+about 28,000 points. Its scan has about 5,000 vertices per metre: a method based on the scan has all of them from the
+first frame, so it is run on corridors of several lengths, using the first frames (``--limit``).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Corridor:
     variants: ClassVar[tuple[str, ...]] = ()
 
     class Options(BaseModel):
-        """The camera's image size in pixels; its steps and the longest side of a square of the scan, in m."""
+        """The camera's image size in pixels; the step per frame and the longest side of a scan cell, in m."""
 
         model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -79,13 +79,13 @@ class Corridor:
         return Walk(_length_m(scene), self._options, stride)
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        raise GroundTruthMissing(f"corridor/{scene}: is there to be timed, not to be scored")
+        raise GroundTruthMissing(f"corridor/{scene}: for timing only, cannot be scored")
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return corridor_mesh(_length_m(scene))
 
     def surface(self, scene: str) -> Surface:
-        """The scan: what is cast, in squares; no edge leads from one face of a box to the next."""
+        """The scan: the ray-cast surface in cells; no edge connects faces of a box."""
         mesh = self.instance_mesh(scene)
         corners = mesh.vertices[mesh.triangles.reshape(-1, 2, 3)[:, 0]]  # a face is the triangles abc and acd
         return in_squares(corners, self._options.surface_edge_m)
@@ -94,7 +94,7 @@ class Corridor:
 def _length_m(scene: str) -> int:
     found = re.fullmatch(r"([1-9][0-9]{0,5})m", scene)
     if found is None or int(found[1]) > MAX_LENGTH_M:
-        raise DataError(f"corridor/{scene}: is no length such as 400m")
+        raise DataError(f"corridor/{scene}: is not a length such as 400m")
     return int(found[1])
 
 
@@ -103,7 +103,7 @@ def _box(low: Sequence[float], high: Sequence[float]) -> Float64Array:
 
 
 def corridor_mesh(length_m: int) -> InstanceMesh:
-    """The four surfaces and, on every metre of either side, a thing of random size and class."""
+    """The four surfaces and, on every metre of either side, an object of random size and class."""
     generator = np.random.default_rng(length_m)
     boxes = [_box((-2.0, -WIDTH_M / 2, 0.0), (length_m + 12.0, WIDTH_M / 2, HEIGHT_M))]
     classes = [1]
@@ -145,7 +145,7 @@ def in_squares(corners: Float32Array, edge_m: float) -> Surface:
 
 
 class Walk(Sequence[Frame]):
-    """The frames of a walk along the corridor, cast when they are asked for."""
+    """The frames of a trajectory along the corridor, ray cast on access."""
 
     def __init__(self, length_m: int, options: Corridor.Options, stride: int) -> None:
         self._length_m = length_m
@@ -183,7 +183,7 @@ class Walk(Sequence[Frame]):
         return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
     def _pose(self, number: int) -> Float64Array:
-        """Camera looks along x: its z is the world's x, its x the world's -y, its y the world's -z."""
+        """The camera looks along x: its z is the world's x, its x the world's -y, its y the world's -z."""
         pose = np.eye(4)
         pose[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
         pose[:3, 3] = number * self._options.step_m, 0.0, 1.5
@@ -205,7 +205,7 @@ class Walk(Sequence[Frame]):
 
 
 def _paint(owner: Int32Array, points: Float32Array) -> Any:
-    """A colour an instance, in squares of 0.1 m that tell places apart."""
+    """One colour per instance, in squares of 0.1 m that distinguish places."""
     hues = (owner[..., None].astype(np.int64) * np.array([7919, 104729, 1299709])) % 160 + 60
     squares = np.floor(points / 0.1).astype(np.int64).sum(axis=-1) % 2
     return (hues - 25 * squares[..., None]).astype(np.uint8)

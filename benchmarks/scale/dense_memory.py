@@ -1,11 +1,11 @@
-"""Memory that a dense map takes from the first image to its score: fused, written, read again, scored.
+"""Memory of a dense map from the first image to its score: fused, written, read again, scored.
 
     python benchmarks dense_memory
     python benchmarks dense_memory --points 400000 --dimensions 256 --features-in memory
 
-Images of a long wall are fused by ConceptFusion, each twice, so that every point is made once and averaged once: with
-features on disk, and in memory, as the peer. A process of its own does each, which reports the most that it held in
-each step (resident set, maps of files included) and before the first; one line of JSON a step.
+Images of a long wall are fused by ConceptFusion, each twice, so that every point is created once and averaged once:
+with features on disk and, for comparison, in memory. A separate process for each reports its peak memory in
+each step (resident set, including mapped files) and before the first; one line of JSON per step.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ WHERE = {"disk": "features on disk", "memory": "features in memory"}
 
 @dataclass
 class RandomDirections:
-    """An encoder that gives every text a direction of its own."""
+    """An encoder that gives every text a distinct direction."""
 
     dim: int
     name: str = "random-directions"
     digest: str = "random-directions"
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise AssertionError("nothing here looks at images")
+        raise AssertionError("images are not used here")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         rows = [np.random.default_rng(list(text.encode())).normal(size=self.dim) for text in texts]
@@ -66,7 +66,7 @@ def stripes(n_dimensions: int) -> tuple[tuple[str, ...], Float32Array]:
 
 
 def update(index: int, n_dimensions: int) -> tuple[Frame, Detections]:
-    """Image ``index`` of a camera that goes along the wall without an overlap, and its stripes as regions."""
+    """Image ``index`` of a camera moving along the wall without overlap, and its stripes as regions."""
     pose = np.eye(4)
     pose[0, 3] = index * SIDE_PX / FOCAL_PX * WALL_M
     centre = (SIDE_PX - 1) / 2
@@ -108,7 +108,7 @@ def truth_of(n_images: int) -> GroundTruth:
 
 @contextmanager
 def reported(step: str) -> Iterator[dict[str, Any]]:
-    """Print what the step took once it is done, with what it found."""
+    """Print the step's costs once it is done, with its results."""
     start_memory_watch()
     start = time.perf_counter()
     found: dict[str, Any] = {}
@@ -122,7 +122,7 @@ def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> No
     n_images = -(-n_points // SIDE_PX**2)
     config: Callable[..., ConceptFusionConfig] = ConceptFusionConfig
     method = ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in=features_in))
-    warm_up(ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in="memory")))  # as a run does
+    warm_up(ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in="memory")))  # as in a run
     method.start(SceneInfo("made", "wall", 2 * n_images, 1, "rendered-rooms"))
     with reported("start"):
         pass
@@ -142,7 +142,7 @@ def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> No
 
 
 def in_a_process(features_in: str, n_points: int, n_dimensions: int, folder: Path) -> list[dict[str, Any]]:
-    """What each step reported, in order; the prediction stays in ``folder``."""
+    """The report of each step, in order; the prediction stays in ``folder``."""
     words = ["--points", str(n_points), "--dimensions", str(n_dimensions), "--features-in", features_in]
     command = [sys.executable, str(BENCHMARKS), "dense_memory", *words, "--folder", str(folder), "--here"]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=2_000_000)
     parser.add_argument("--dimensions", type=int, default=1024)
     parser.add_argument("--features-in", nargs="+", default=["disk", "memory"], choices=("disk", "memory"))
-    parser.add_argument("--folder", type=Path, help="where the prediction is written; it must exist and is kept")
+    parser.add_argument("--folder", type=Path, help="existing folder for the prediction, which is kept")
     parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()

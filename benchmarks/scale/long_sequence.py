@@ -1,11 +1,11 @@
-"""Memory over a long sequence: 5,578 frames (those of ScanNet's scene0000_00) at stride 1, the camera going to and fro.
+"""Memory over a long sequence: 5,578 frames (as in ScanNet's scene0000_00) at stride 1, the camera going to and fro.
 
     python benchmarks long_sequence
     python benchmarks long_sequence --frames 1200 --features 64
 
-Once the camera has been everywhere the map stops growing, and so should memory. Frames are made (160x120, from 20 m of
-the corridor of ``corridor.py``, masks without a fault, features as long as CLIP's) and go the way of a run: read ahead,
-fed to OpenSU3D, timed. Every 500 frames: points of the map, resident set, what lies in the scratch file.
+Once the camera has been everywhere the map stops growing, and so should memory. Frames are synthetic (160x120; 20 m
+of the corridor of ``corridor.py``, perfect masks, features as long as CLIP's) and processed as in a run: read ahead,
+fed to OpenSU3D, timed. Every 500 frames: points of the map, resident set, size of the scratch file.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from su3d_bench.runs.frame_loop import Feeding, ReadAhead
 N_FRAMES = 5578
 LENGTH_M, STEP_M = 20, 0.25
 N_PLACES = round(LENGTH_M / STEP_M)
-N_THINGS = 300  # more than the corridor holds
+N_THINGS = 300  # more than the corridor has
 MAX_MASKS, MIN_PIXELS = 24, 40
 SAMPLE_EVERY, SHOW_EVERY = 100, 500
 
 
 @dataclass(frozen=True)
 class Place:
-    """What the camera sees from one place: a frame, and the masks of the largest things in it with their numbers."""
+    """The view from one place: a frame, and the masks of the largest objects in it with their numbers."""
 
     frame: Frame
     masks: BoolArray
@@ -56,7 +56,7 @@ def seen_from(walk: Walk, number: int) -> Place:
 
 
 class Pacing(Sequence[Frame]):
-    """Frames of a camera that walks to the end of the corridor and back, again and again, looking the same way."""
+    """Frames of a camera that moves to the end of the corridor and back repeatedly, with fixed orientation."""
 
     def __init__(self, n_frames: int) -> None:
         self._n_frames = n_frames
@@ -75,7 +75,7 @@ class Pacing(Sequence[Frame]):
 
 
 class Faultless:
-    """Perception that knows every thing: its mask, and a feature of its own with noise in every view."""
+    """Perception that knows every object: its mask, and its feature with noise in every view."""
 
     def __init__(self, frames: Pacing, n_dimensions: int) -> None:
         self._frames = frames
@@ -101,7 +101,7 @@ class Faultless:
 
 
 def bytes_per_frame(frames: Sequence[int], rss_bytes: Sequence[int]) -> float:
-    """Slope of a straight line through what memory was at ``frames``."""
+    """Slope of a straight line through memory at ``frames``."""
     return float(np.polyfit(frames, rss_bytes, 1)[0])
 
 
@@ -139,8 +139,8 @@ def main() -> None:
     start = time.perf_counter()
     instances = method.finish()
     notes = [
-        f"In the second half memory grows by {slope:,.0f} bytes a frame (a straight line through every "
-        f"{SAMPLE_EVERY}th): its row of the update table and {MAX_MASKS} or fewer views of things.",
+        f"In the second half memory grows by {slope:,.0f} bytes per frame (a straight line through every "
+        f"{SAMPLE_EVERY}th): its row of the update table and at most {MAX_MASKS} views of objects.",
         f"The map at the end: {len(instances.ids):,} instances after {time.perf_counter() - start:.1f} s.",
     ]
     method.close()

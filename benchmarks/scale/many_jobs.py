@@ -1,11 +1,11 @@
-"""How long 10,000 jobs in one run folder take to list, to take up again, to aggregate and to report.
+"""Time to list, resume, aggregate and report 10,000 jobs in one run folder.
 
     python benchmarks many_jobs --json build/measured/many_jobs.json
 
-The folder is simulated: one real job (opensu3d on 20 frames of rooms/bathroom0) stands in it 10,000 times, as 1,250
-scenes under 8 methods, each with the timings, log and seals of the real one and with counts of its own, without its
-map. What is timed is what a user types, each command in a process of its own; to aggregate is what a run does after
-its last job, timed here for each of the two protocols alone. Takes about two minutes on two cores.
+The folder is simulated: one real job (opensu3d on 20 frames of rooms/bathroom0) is copied 10,000 times, as 1,250
+scenes under 8 methods, each with the timings, log and completion records of the real one and its own counts, but no
+map. Timed are commands as a user types them, each in a separate process; aggregation is what a run does after
+its last job, timed here for each of the two protocols separately. Takes about two minutes on two cores.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ PROTOCOLS = ("rooms-semantic", "rooms-instance")
 
 
 class Many:
-    """As many scenes as one likes, of which only the names and the number of frames are there."""
+    """Any number of scenes, with only names and numbers of frames."""
 
     name = "many"
     label_space = "replica"
@@ -62,7 +62,7 @@ class Many:
     image_domain: ClassVar[ImageDomain] = "rendered-rooms"
 
     class Options(BaseModel):
-        """How many scenes there are."""
+        """Number of scenes."""
 
         model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -90,7 +90,7 @@ def words(n_scenes: int, out: Path) -> list[str]:
 
 
 def plan_of(n_scenes: int, out: Path) -> Plan:
-    """The plan that the command ``words`` makes too."""
+    """The plan created by the command ``words``."""
     values = {
         ("scenes",): [f"{Path(__file__)}:Many/*"],
         ("methods",): list(METHODS),
@@ -102,7 +102,7 @@ def plan_of(n_scenes: int, out: Path) -> Plan:
 
 
 def simulate(plan: Plan, source: RunFolder) -> None:
-    """Write every job of ``plan`` after that of ``source``, with numbers of its own."""
+    """Write every job of ``plan`` like that of ``source``, with its own numbers."""
     real = source.job(SOURCE, "opensu3d")
     scores = unpack_scores(real.counts.read_bytes())
     contents = {path.name: path.read_bytes() for path in (real.updates, real.log)}
@@ -128,7 +128,7 @@ def simulate(plan: Plan, source: RunFolder) -> None:
 
 
 def varied(score: SceneScore, generator: np.random.Generator) -> SceneScore:
-    """``score`` with other confidences, or with confusions drawn anew."""
+    """``score`` with other confidences, or with confusions drawn again."""
     counts = score.counts
     if isinstance(counts, InstanceCounts):
         return replace(score, counts=replace(counts, score=generator.random(len(counts.score))))
@@ -137,7 +137,7 @@ def varied(score: SceneScore, generator: np.random.Generator) -> SceneScore:
 
 
 def seconds_of(command: Sequence[str]) -> float:
-    """How long ``su3d-bench`` takes in a process of its own."""
+    """Duration of ``su3d-bench`` in a separate process."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "su3d_bench", *command], stdout=subprocess.PIPE, text=True)
     assert done.returncode == 0, command
@@ -145,7 +145,7 @@ def seconds_of(command: Sequence[str]) -> float:
 
 
 def measure(n_scenes: int, folder: Path) -> Iterator[tuple[str, float]]:
-    """What each of the commands takes, as it is known."""
+    """Duration of each command, as measured."""
     out = folder / "run"
     limited = ["--limit", str(N_FRAMES), "--no-pictures", "--jobs", "1", "--quiet", "--stride", "1"]
     asked = ["run", "--scenes", SOURCE, "--methods", "opensu3d", "--protocols", *PROTOCOLS, *limited]
@@ -153,7 +153,7 @@ def measure(n_scenes: int, folder: Path) -> Iterator[tuple[str, float]]:
     plan = plan_of(n_scenes, out)
     simulate(plan, RunFolder(folder / "real"))
     yield "list: run --dry-run", seconds_of([*words(n_scenes, out), "--dry-run"])
-    yield "take up the finished run: run, both protocols", seconds_of(words(n_scenes, out))
+    yield "resume the finished run: run, both protocols", seconds_of(words(n_scenes, out))
     for protocol in PROTOCOLS:
         yield f"of which aggregate: {protocol}", aggregation_s(plan, protocol)
     yield "report tables", seconds_of(["report", "tables", str(out)])
@@ -163,7 +163,7 @@ def measure(n_scenes: int, folder: Path) -> Iterator[tuple[str, float]]:
 
 
 def aggregation_s(plan: Plan, protocol: str) -> float:
-    """How long the numbers under one protocol take, reading the counts included."""
+    """Time to aggregate one protocol, including reading the counts."""
     scenes = FinishedScenes()
     outcomes = [outcome for job in plan.jobs for outcome in scenes.outcomes(job) or ()]
     alone = replace(plan, jobs=tuple(replace(job, protocols=(protocol,)) for job in plan.jobs))
@@ -174,8 +174,8 @@ def aggregation_s(plan: Plan, protocol: str) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=1250, help="under 8 methods each")
-    parser.add_argument("--json", type=Path, help="write the table there")
+    parser.add_argument("--scenes", type=int, default=1250, help="number of scenes (8 methods each)")
+    parser.add_argument("--json", type=Path, help="write the table to FILE")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="su3d-many-") as folder:
         rows = []
@@ -183,7 +183,7 @@ def main() -> None:
             print(f"{name:<42} {seconds:6.1f} s", flush=True)
             rows.append((name, seconds))
     if arguments.json is not None:
-        from measured import write_measured  # beside this file, which the commands read as a plug-in too
+        from measured import write_measured  # next to this file, which the commands also read as a plug-in
 
         n_jobs = arguments.scenes * len(METHODS)
         write_measured(
@@ -192,7 +192,7 @@ def main() -> None:
             "python benchmarks many_jobs --json build/measured/many_jobs.json",
             ["what", "seconds"],
             [[name, f"{seconds:.1f}"] for name, seconds in rows],
-            ["The jobs have the size of one real job, without its map; each command is a process of its own."],
+            ["The jobs have the size of one real job, without its map; each command is a separate process."],
         )
 
 

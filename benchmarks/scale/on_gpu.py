@@ -1,12 +1,12 @@
-"""Results on a GPU beside those of the CPU: similarity, every kind of model, a run; differences and times.
+"""Results on a GPU compared with the CPU: similarity, every kind of model, a run; differences and times.
 
     python benchmarks on_gpu --json build/measured/on_gpu.json
     python benchmarks on_gpu --device cpu
 
-Some two minutes on a machine with a GPU; without one it ends at once, in one line, with code 2. ``--device cpu`` has
-torch compute on the CPU, so that all but the GPU itself is tried. Models have the tests' small configurations and
-random weights; ``paper_profile_speed.py --device cuda`` has the full sizes. The code is 1 where a difference is larger
-than its tolerance. Times are the best of five (of the whole run: the second), arrays of the host to arrays of the host.
+About two minutes on a machine with a GPU; without one it ends immediately with one line and code 2. ``--device cpu``
+uses torch on the CPU, which tests everything but the GPU. Models have the tests' small configurations and
+random weights; ``paper_profile_speed.py --device cuda`` has the full sizes. The code is 1 if a difference is larger
+than its tolerance. Times are the best of five (of the whole run: the second), from host arrays to host arrays.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 
 REPEATS = 5
-TORCH_ON_CPU = "cpu:0"  # not "cpu", for which the package does without torch
+TORCH_ON_CPU = "cpu:0"  # not "cpu", for which the package does not use torch
 CLIP = "clip-vit-h-14"
 TEXTS = ("a chair in a scene", "the lamp", "tv screen", "a red cup on the table")
 Arrays = Iterable[NDArray[Any]]
@@ -52,7 +52,7 @@ Arrays = Iterable[NDArray[Any]]
 
 @dataclass(frozen=True)
 class Comparison:
-    """``on(device)`` gives the work there; ``tolerance`` bounds the largest difference, or the share that differs."""
+    """``on(device)`` returns the work there; ``tolerance`` limits the largest difference, or the share that differs."""
 
     what: str
     on: Callable[[str], Callable[[], Arrays]]
@@ -75,7 +75,7 @@ def difference(one: Comparison, here: Arrays, there: Arrays) -> float:
 
 
 def measured(work: Callable[[], Arrays], repeats: int) -> tuple[Arrays, float]:
-    """What ``work`` gives, and its best time in milliseconds after one run that does not count."""
+    """The result of ``work``, and its best time in milliseconds after one warm-up run."""
     best = float("inf")
     for k in range(repeats + 1):
         synchronise_device()
@@ -117,7 +117,7 @@ def encoders(folder: Path) -> Iterator[Comparison]:
     def clip(**settings: Any) -> Callable[[str], Callable[[], Arrays]]:
         def on(device: str) -> Callable[[], Arrays]:
             place = {"device": "cpu" if device.startswith("cpu") else device}
-            if device == "cpu":  # what all are compared with
+            if device == "cpu":  # the reference for all
                 place["precision"] = "float32"
             config = ModelsConfig(encoder=CLIP, folder=folder, **(settings | place))
             return lambda: (load_encoder(config).encode_images(images), load_encoder(config).encode_texts(TEXTS))
@@ -150,7 +150,7 @@ def networks(folder: Path) -> Iterator[Comparison]:
 
 
 def runs(folder: Path) -> Iterator[Comparison]:
-    """Metrics of a whole run of five updates, by the command line."""
+    """Metrics of a complete run of five updates, by the command line."""
 
     def run(device: str) -> Callable[[], Arrays]:
         name = "cpu" if device.startswith("cpu") else device
@@ -170,7 +170,7 @@ def runs(folder: Path) -> Iterator[Comparison]:
 
 
 def numbers(content: Any) -> Iterator[float]:
-    """Every number in JSON, in its order, but times."""
+    """All numbers in JSON, in order, except times."""
     if isinstance(content, dict):
         for key, value in content.items():
             if not key.endswith(("_ms", "_s", "_bytes")):
@@ -226,10 +226,10 @@ def main() -> int:
         notes = [
             f"torch {torch.__version__}, {os.cpu_count()} CPU cores.",
             "RAM++ is not among the models: its architecture is in its own package.",
-            "The networks are small: their times are those of starting work on the device.",
+            "The networks are small: their times are dominated by starting work on the device.",
         ]
         words = f"python benchmarks on_gpu --device {arguments.device}"
-        write_measured(arguments.json, f"{where} beside the CPU", words, columns, rows, notes)
+        write_measured(arguments.json, f"{where} compared with the CPU", words, columns, rows, notes)
     return 0 if is_within else 1
 
 

@@ -1,12 +1,12 @@
-"""How large the page of 20 scenes under 8 methods is, and how long a browser takes to open it.
+"""Size of the page of 20 scenes under 8 methods, and its loading time in a browser.
 
 ``python benchmarks page_opening [RUN] [--opens 5] [--json build/measured/page_opening.json]``: the maps, tables and
-times of a finished run (default: ``runs/demo``) stand for those of other scenes and methods, thinned as such a page
-thins them, so that the page has the size and the tables of a real one. Chromium opens it as a file, each time with an
+times of a finished run (default: ``runs/demo``) are reused for all scenes and methods, thinned as in such a page,
+so that the page has a realistic size and tables. Chromium opens it as a file, each time with an
 empty profile, without a graphics card. Milliseconds from the start of the navigation: first paint; usable: the summary
-stands and every control answers; whole: all sections are made; loaded: the last map is parsed; first map: it is drawn,
-after the view was scrolled to. Exit code 1 where the page has 30 MB or more, or is not loaded and whole within 3 s.
-``--page page.html`` opens a page that is there, and its exit code is 1 where it is not usable within a second.
+is shown and every control works; whole: all sections exist; loaded: the last map is parsed; first map: it is drawn,
+after scrolling to the view. Exit code 1 if the page has at least 30 MB, or is not loaded and whole within 3 s.
+``--page page.html`` opens an existing page, with exit code 1 if it is not usable within a second.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from su3d_bench.runs.finished import read_run
 
 N_SCENES, N_METHODS = 20, 8
 MAX_BYTES, MAX_MS = 30_000_000, 3000.0
-MAX_USABLE_MS = 1000.0  # of a page of one run, as it is
+MAX_USABLE_MS = 1000.0  # of an existing page of one run
 METHODS = [f"method{k}" for k in range(N_METHODS)]
 SCENES = [f"rooms/room{k}" for k in range(N_SCENES)]
 NOTE = (
-    "Processor time: what the page's process took until it was whole, whatever else the machine did. "
-    "Usable: the summary stands and every control answers. Whole: all sections are made. Loaded: the last map is "
-    "parsed. First map: it is drawn, from the moment at which the view is scrolled to."
+    "Processor time: used by the page's process until it was whole, independent of other load. "
+    "Usable: the summary is shown and every control works. Whole: all sections exist. Loaded: the last map is "
+    "parsed. First map: it is drawn, from the moment of scrolling to the view."
 )
 TIMES = """(() => {
   const page = performance.getEntriesByType('navigation')[0], marks = performance.getEntriesByType('mark');
@@ -65,7 +65,7 @@ def simulated_page(run: Path) -> str:
 
 
 def _of_all_methods(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows of the first method under the names of all, their scenes under those of all."""
+    """The rows of the first method repeated for all methods and scenes."""
     first = rows[0]["method"] if rows else None
     return [_renamed(row, method) for row in rows if row["method"] == first for method in METHODS]
 
@@ -86,7 +86,7 @@ def _spread(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _comparisons(known: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """All pairs of methods, each with the differences of the first pair that is known."""
+    """All pairs of methods, each with the differences of the first known pair."""
     whole = next((one for one in known if one["protocols"]), None)
     if whole is None:
         return []
@@ -132,10 +132,10 @@ def measured(page: Path, n_opens: int) -> tuple[list[dict[str, float]], list[lis
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", nargs="?", type=Path, default=Path("runs/demo"), help="(default: runs/demo)")
-    parser.add_argument("--opens", type=int, default=5, help="how often it is opened (default: 5)")
-    parser.add_argument("--out", type=Path, help="keep the page there")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="open this page as it is, and make none")
-    parser.add_argument("--json", type=Path, help="write what was measured there")
+    parser.add_argument("--opens", type=int, default=5, help="number of openings (default: 5)")
+    parser.add_argument("--out", type=Path, help="keep the page in this file")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="open this page instead of creating one")
+    parser.add_argument("--json", type=Path, help="write the table to FILE")
     arguments = parser.parse_args()
     limit_threads()
     command, about = "python benchmarks page_opening runs/demo", f"{N_SCENES} scenes under {N_METHODS} methods"

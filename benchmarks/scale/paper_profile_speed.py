@@ -1,7 +1,7 @@
-"""Frames a second of each stage of the profile ``paper`` at full size, with random weights: speed ignores their values.
+"""Frames per second of each stage of the profile ``paper`` at full size, with random weights, which suffice for speed.
 
 ``python benchmarks paper_profile_speed --device cuda`` builds SAM ViT-H, GroundingDINO Swin-T and CLIP ViT-H-14 from
-their configurations, and shows them one image of a room. RAM++ is not built: its architecture is in its own package.
+their configurations, and runs them on one image of a room. RAM++ is not built: its architecture is in its own package.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, Groundi
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam, sam_config
 from su3d_bench.runs.scenes import data_root
 
-N_BOXES, N_RATIOS = 15, 3  # named things in an image of a room, and the paper's crops of each
+N_BOXES, N_RATIOS = 15, 3  # named objects in an image of a room, and the paper's crops of each
 N_TAGS = 20
 
 
 def device_model(model: Any, device: str, precision: str) -> Any:
-    """``model`` as the profile holds it."""
+    """``model`` in the form used by the profile."""
     import torch
 
     return model.eval().to(device=device, dtype=getattr(torch, precision))
 
 
 def tokenizer() -> Any:
-    """A BERT tokenizer of words that are one token each, with BERT's marks in their places."""
+    """A BERT tokenizer of single-token words, with BERT's special tokens at their ids."""
     transformers = require_transformers("this benchmark")
     marks = {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]", 1012: ".", 1029: "?"}
     words = marks | {2000 + k: f"tag{k}" for k in range(N_TAGS)}
@@ -61,7 +61,7 @@ def grounding_dino(device: str, precision: str) -> GroundingDino:
 
 
 def clip(device: str, precision: str, batch: int) -> TransformersTowers:
-    """The image tower of CLIP ViT-H-14, with the smallest text tower beside it."""
+    """The image tower of CLIP ViT-H-14, with the smallest text tower."""
     transformers = require_transformers("this benchmark")
     vision = {
         "hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16,
@@ -73,7 +73,7 @@ def clip(device: str, precision: str, batch: int) -> TransformersTowers:
 
 
 def seconds(work: Callable[[], object], device: str, repeats: int) -> float:
-    """The median time of ``work``; on a GPU after one run that is not counted."""
+    """The median time of ``work``; on a GPU after one warm-up run."""
     import torch
 
     def wait() -> None:
@@ -102,25 +102,25 @@ def detector_stages(device: str, precision: str, rgb: UInt8Array) -> list[Stage]
 
 
 def segmenter_stages(device: str, precision: str, rgb: UInt8Array) -> list[Stage]:
-    """The look at the image, masks of boxes, and masks of everything."""
+    """The image embedding, masks of boxes, and masks of everything."""
     transformers = require_transformers("this benchmark")
     sam = Sam(TorchSam(device_model(transformers.SamModel(sam_config("sam-vit-h")), device, precision)))
     image = sam.look(rgb)
     height, width = rgb.shape[:2]
     corners = np.sort(np.random.default_rng(0).uniform(0, 1, (N_BOXES, 2, 2)), axis=1).reshape(-1, 4)
     boxes: Float32Array = (corners * [width, height, width, height]).astype(np.float32)
-    # Random weights are sure of nothing: without this filter every mask grows to full size, which is the most work.
+    # Random weights are sure of nothing: without this filter every mask grows to full size, the worst case.
     settings = AUTOMATIC_MASKS["conceptgraphs"].model_copy(update={"pred_iou_thresh": 0.0})
     automatic = AutomaticMasks(sam, settings)
     return [
-        ("SAM ViT-H, look at the image", lambda: sam.look(rgb)),
+        ("SAM ViT-H, image embedding", lambda: sam.look(rgb)),
         (f"SAM ViT-H, masks of {N_BOXES} boxes", lambda: sam.from_boxes(image, boxes, is_single=False)),
         ("SAM ViT-H, automatic masks of 12 x 12 points", lambda: automatic.regions(rgb)),
     ]
 
 
 def encoder_stages(device: str, precision: str, rgb: UInt8Array) -> list[Stage]:
-    """The image and three crops of every thing in it."""
+    """The image and three crops of every object in it."""
     towers = clip(device, precision, 0)
     n_crops = N_BOXES * N_RATIOS + 1
     pixels = np.random.default_rng(0).normal(size=(n_crops, 3, 224, 224)).astype(np.float32)
@@ -136,7 +136,7 @@ PARTS = {"detector": detector_stages, "segmenter": segmenter_stages, "encoder": 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Frames a second of each stage of the profile 'paper'.")
+    parser = argparse.ArgumentParser(description="Frames per second of each stage of the profile 'paper'.")
     parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:1")
     parser.add_argument("--precision", default="auto", help="auto, float32, float16 or bfloat16")
     parser.add_argument("--repeats", type=int, default=0, help="runs of each stage; 0: 1 on the CPU, 5 on a GPU")
@@ -155,7 +155,7 @@ def main() -> int:
         else f"cpu, {torch.get_num_threads()} threads"
     )
     print(f"{what}, {precision}, image {rgb.shape[1]}x{rgb.shape[0]}, median of {repeats}\n")
-    print("| stage | s a frame | frames a second |\n|---|---|---|")
+    print("| stage | s per frame | frames per second |\n|---|---|---|")
     for part in wanted.parts:  # one network is in memory at a time
         for name, work in PARTS[part](wanted.device, precision, rgb):
             taken = seconds(work, wanted.device, repeats)

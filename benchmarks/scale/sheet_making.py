@@ -1,9 +1,9 @@
-"""How long the sheets of all three kinds take on the four demo rooms with the four fusion schemes.
+"""Time to create the sheets of all three kinds on the four demo rooms with the four fusion schemes.
 
 ``python benchmarks sheet_making [--run runs/demo-schemes] [--json build/measured/sheet_making.json]``: one command
-for all kinds, then one command each, as somebody would type them; wall and processor time of each with all its
-processes. The run is made first where it is not there (some minutes). Exit code 1 where the three kinds take two
-minutes or more, be it in one command or in three.
+for all kinds, then one command each, as a user would type them; wall and processor time of each including all its
+processes. The run is created first if missing (some minutes). Exit code 1 if the three kinds take at least two
+minutes, either in one command or in three.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_S = 120.0
 
 
 def timed(words: list[str]) -> tuple[float, float]:
-    """Seconds of wall and of processor of one command and its processes."""
+    """Wall and processor seconds of one command and its processes."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     subprocess.run([sys.executable, "-m", "su3d_bench", *words], check=True, stdout=subprocess.DEVNULL)
     wall_s, after = time.monotonic() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -55,7 +55,7 @@ def main() -> int:
         [(name, f"{wall:.1f}", f"{cpu:.1f}") for name, (wall, cpu) in found.items()],
         (f"Retrieval, annotation and reasoning in three commands take {apart_s:.1f} s.",),
     )
-    print(f"one after the other: {apart_s:.1f} s")
+    print(f"separately: {apart_s:.1f} s")
     return 0 if max(apart_s, found["all three"][0]) < MAX_S else 1
 
 

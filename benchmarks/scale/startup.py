@@ -1,9 +1,9 @@
-"""How soon the command line and the package answer, beside a Python that does nothing and one that imports numpy and
+"""Response time of the command line and the package, compared with an idle Python and one that imports numpy and
 pydantic.
 
-``python benchmarks startup --json build/measured/startup.json``, one minute. Every command is started in turn, ten
-rounds after one that is not counted; the best of each is what it takes undisturbed. Python's compiled modules are kept
-in a folder of the measurement, as an installed program has them, and libraries' data are in the page cache.
+``python benchmarks startup --json build/measured/startup.json``, one minute. Every command is started in turn, in ten
+rounds after a warm-up; the best time of each is reported. Python's compiled modules are cached
+in a folder of the measurement, as for an installed program, and libraries are in the page cache.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ def main() -> None:
     if arguments.json is not None:
         command = "python benchmarks startup --json build/measured/startup.json"
         notes = (
-            f"Best of {arguments.rounds} rounds, all commands in turn in each; the marks are 100 ms for `--help` and "
+            f"Best of {arguments.rounds} rounds, all commands in turn in each; the targets are 100 ms for `--help` and "
             "for the package, 400 ms for lists.",
         )
         write_measured(
-            arguments.json, "The command line answers", command, ("command", "wall ms", "processor ms"), rows, notes
+            arguments.json, "Command-line latency", command, ("command", "wall ms", "processor ms"), rows, notes
         )
 
 

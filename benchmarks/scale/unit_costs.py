@@ -1,10 +1,10 @@
-"""What a scene costs here, stage by stage, and what all of ScanNet and 100,000 scenes would cost at that price.
+"""Cost of a scene here, stage by stage, and estimated costs of all of ScanNet and of 100,000 scenes.
 
     python benchmarks unit_costs --json build/measured/unit_costs.json
 
 Measured: opensu3d under the embedded profile on two rooms with an empty cache and one job, the start of a worker, and
-the decoding of a frame of ScanNet's sizes. Not measured: the scans themselves, whose number and sizes are those that
-ScanNet states, and the network, whose speed is assumed; a room stands for a scan.
+the decoding of a frame at ScanNet's sizes. Not measured: the scans themselves, whose number and sizes are stated by
+ScanNet, and the network, whose speed is assumed; rooms are used instead of scans.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import numpy as np
 from measured import write_measured
 
 SCENES = ("rooms/living0", "rooms/office0")
-STRIDE = 40  # opensu3d's own
-N_CORES = 2  # of the machine that the plan counts in, one job each
+STRIDE = 40  # opensu3d's default
+N_CORES = 2  # per machine in the estimate, one job each
 SCANS = 1513
 SCANNET_FRAMES = 2_492_518  # in 1,513 scans (Dai et al., CVPR 2017, table 2)
 SCANNET_BYTES = 1.3e12  # "the entire ScanNet release (1.3TB)" in the instructions that come with download-scannet.py
@@ -49,7 +49,7 @@ class Costs:
     peak_bytes: int
 
     def seconds(self, n_updates: float) -> float:
-        """Of a scan on one core: its decoding instead of the rendering of a room."""
+        """Cost of a scan on one core, with decoding instead of rendering."""
         update_ms = sum(ms for stage, ms in self.stages_ms.items() if stage != "decode") + self.decode_ms
         return self.start_s + self.scene_s + n_updates * update_ms / 1e3
 
@@ -84,7 +84,7 @@ def _seconds(words: list[str], environment: dict[str, str]) -> float:
 
 
 def _decode_ms() -> float:
-    """A colour JPEG of 1296x968 and a depth image of 640x480, as they lie in a ``.sens``; the best of five."""
+    """A colour JPEG of 1296x968 and a depth image of 640x480, as stored in a ``.sens``; the best of five."""
     noise = np.random.default_rng(0)
     smooth = cv2.resize(noise.integers(0, 255, (121, 162, 3), np.uint8), (1296, 968), interpolation=cv2.INTER_CUBIC)
     colour = cv2.imencode(".jpg", smooth)[1]
@@ -136,7 +136,7 @@ def plan_rows(costs: Costs) -> list[list[str]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the table there")
+    parser.add_argument("--json", type=Path, help="write the table to FILE")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="su3d-costs-") as folder:
         costs = measure(Path(folder))
@@ -146,14 +146,14 @@ def main() -> None:
         units = "; ".join(f"{what} {value}" for what, value in unit_rows(costs))
         write_measured(
             arguments.json,
-            "All of ScanNet, and 100,000 scenes, on paper",
+            "All of ScanNet, and 100,000 scenes, estimated",
             "python benchmarks unit_costs --json build/measured/unit_costs.json",
             ["what", "machine hours (2 cores)", "hours", "storage: data + results + cache (TB)", "bottleneck"],
             plan_rows(costs),
             [
                 f"Unit costs, measured here: {units}.",
                 "Not measured: the scans (1,513 with 2,492,518 frames: Dai et al., CVPR 2017, table 2; 1.3 TB: the "
-                "instructions with ScanNet's download-scannet.py; every 40th frame is an update; a room stands for a "
+                "instructions with ScanNet's download-scannet.py; every 40th frame is an update; a room is used for a "
                 "scan) and the store's network (10 Gbit/s assumed).",
             ],
         )

@@ -1,8 +1,8 @@
-"""What an update's matching costs as the map grows: ours against the KD-trees that are rebuilt at each update.
+"""Cost of an update's matching as the map grows: ours compared with KD-trees rebuilt at each update.
 
-A frame of 204,000 points (1200x680, every second pixel each way) looks at a part of a floor-like surface of 10,000
-points a square metre; depth noise is 3 mm. All answers are exact. Open3D's KDTreeFlann answers one point a call: only
-one query in 40 is made, so its figure is a lower bound; against 5 million points every query is made too.
+A frame of 204,000 points (1200x680, every second pixel in both directions) sees part of a floor-like surface of 10,000
+points per square metre; depth noise is 3 mm. Results are exact. Open3D's KDTreeFlann answers one point per call: only
+one query in 40 is made, so its time is a lower bound; against 5 million points every query is made too.
 
     python -m pytest benchmarks/speed/bench_association.py --benchmark-only --benchmark-group-by=group
 """
@@ -22,7 +22,7 @@ from su3d_bench.opensu3d.voxel_map import VoxelMap
 EPS = 0.02
 SIZES = [100_000, 500_000, 1_000_000, 5_000_000]
 N_FRAME = 204_000
-VIEW_M = 4.5  # the side of the square that a frame sees
+VIEW_M = 4.5  # side of the square visible in a frame
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def case(n_scene: int) -> Case:
     view = min(side, VIEW_M)
     scene = np.column_stack([rng.uniform(0, side, (n_scene, 2)), rng.normal(0, 0.003, n_scene)])
     scene = scene[np.lexsort(np.floor(scene[:, :2] / 0.5).T)]  # patch by patch, as a map is filled
-    rows, columns = np.divmod(np.arange(N_FRAME), 600)  # row by row, as pixels come
+    rows, columns = np.divmod(np.arange(N_FRAME), 600)  # row by row, in pixel order
     pixels = np.column_stack([columns / 600, rows / 340]) * view
     return Case(scene, np.column_stack([pixels, rng.normal(0, 0.003, N_FRAME)]))
 
@@ -85,7 +85,7 @@ def test_cropped_ckdtree(benchmark: BenchmarkFixture, n_scene: int) -> None:
 
 
 def match_by_open3d(scene: Float64Array, frame: Float64Array) -> int:
-    """Builds the tree over the whole scene, as an update that finds a new map must; gives the number of matches."""
+    """Builds the tree over the whole scene, as needed after each change of the map; returns the number of matches."""
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene))

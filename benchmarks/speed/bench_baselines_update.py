@@ -1,7 +1,7 @@
-"""What an update of each incremental method costs, perception aside, with 0.1 to 5 million points in its map.
+"""Cost of an update of each incremental method, without perception, with 0.1 to 5 million points in its map.
 
-A 1200x680 image of a wall with 24 masks; the map holds that wall, far beyond the view, as the method itself would keep
-it: its voxels, its objects of a metre's side, its features (16 dimensions). Every round starts from the same map.
+A 1200x680 image of a wall with 24 masks; the map contains that wall, far beyond the view, in the method's own
+form: voxels, objects with a side of one metre, features (16 dimensions). Every round starts from the same map.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SIZES = (100_000, 1_000_000, 5_000_000)
 
 
 def view(method: Method) -> tuple[Frame, Detections]:
-    """The wall in 24 masks of 140x170 pixels, with the crops that the method asks for."""
+    """The wall in 24 masks of 140x170 pixels, with the crops that the method needs."""
     intrinsics = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
     depth_m = np.full((HEIGHT, WIDTH), DISTANCE_M, np.float32)
     masks = np.zeros((24, HEIGHT, WIDTH), np.bool_)
@@ -56,7 +56,7 @@ def view(method: Method) -> tuple[Frame, Detections]:
 
 
 def wall(n_points: int, spacing_m: float) -> tuple[Float64Array, Int64Array]:
-    """Points of a square wall before the camera, in rows, and the number of the square metre that each lies in."""
+    """Points of a square wall in front of the camera, in rows, and the square metre in which each lies."""
     side = round(n_points**0.5)
     y, x = np.divmod(np.arange(side * side), side)
     points = np.column_stack([x + 0.5, y + 0.5, np.zeros(side * side)]) * spacing_m
@@ -66,7 +66,7 @@ def wall(n_points: int, spacing_m: float) -> tuple[Float64Array, Int64Array]:
 
 
 def opensu3d(n_points: int) -> tuple[Method, Callable[[], None]]:
-    """Its map grows by what is new, and this view is not: nothing to undo."""
+    """Its map only grows with new areas, and this view is not new: nothing to undo."""
     method = OpenSU3D()
     method.start(SCENE)
     points, tile = wall(n_points, 0.02)
@@ -89,7 +89,7 @@ def sam3d(n_points: int) -> tuple[Method, Callable[[], None]]:
 
 
 def conceptgraphs(n_points: int) -> tuple[Method, Callable[[], None]]:
-    """Objects whose search trees are yet to be built, as those of the last view are after a merge."""
+    """Objects whose search trees are not built yet, like those of the last view after a merge."""
     method = ConceptGraphs()
     method.start(SCENE)
     points, tile = wall(n_points, method.config.downsample_voxel_size)
@@ -104,13 +104,13 @@ def conceptgraphs(n_points: int) -> tuple[Method, Callable[[], None]]:
 
     def reset() -> None:
         method._map._objects = [replace(one) for one in objects]
-        method._map._n_frames = 0  # no periodic clean-up in the update that is measured
+        method._map._n_frames = 0  # no periodic clean-up in the measured update
 
     return method, reset
 
 
 def conceptfusion(n_points: int) -> tuple[Method, Callable[[], None]]:
-    """Normals point away from the camera, as those of its own views of a wall do; all of the view is averaged in."""
+    """Normals point away from the camera, as in its own views of a wall; the whole view is averaged in."""
     method = ConceptFusion(ConceptFusionConfig(features_in="memory"))
     method.start(SCENE)
     points, _ = wall(n_points, 0.02)

@@ -1,9 +1,9 @@
-"""How long an evaluation of 8 scenes takes: 200,000 points, 150 masks each, 48 classes.
+"""Time of an evaluation of 8 scenes: 200,000 points, 150 masks each, 48 classes.
 
-From masks in memory beside a plain version with one bincount a mask, which must give the same bits; then the whole
-evaluation of the same masks in the text files of ScanNet's benchmark, with everything that stands beside the number:
-as a call, as a whole process, and beside a plain reading line by line, as the official script has it, with that plain
-version behind it. All give the same AP.
+From masks in memory, compared with a plain version (one bincount per mask, identical results); then the whole
+evaluation of the same masks in the text files of ScanNet's benchmark, including everything reported with the metric:
+as a call, as a separate process, and compared with line-by-line reading as in the official script, followed by that
+plain version. All give the same AP.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ MEMORY, FILES = (
 
 @dataclass(frozen=True)
 class Scene:
-    """``values`` a point, masks (K, N), and a label and a score each."""
+    """``values`` per point, masks (K, N), and a label and a score for each."""
 
     values: NDArray[np.int64]
     masks: NDArray[np.bool_]
@@ -55,7 +55,7 @@ class Scene:
 
 
 def make_scene(seed: int) -> Scene:
-    """Instances one after another, with walls between; masks cover parts of them and some of what is beside."""
+    """Instances one after another, with walls between; masks cover parts of them and of their surroundings."""
     rng = np.random.default_rng(seed)
     cuts = np.sort(rng.choice(N_POINTS, 2 * N_INSTANCES - 1, replace=False))
     classes = np.array(CLASS_IDS)[rng.integers(0, len(CLASS_IDS), N_INSTANCES)]
@@ -91,7 +91,7 @@ def ours(scenes: Sequence[Scene], masks: Sequence[tuple[NDArray[np.int64], NDArr
 
 
 def one_bincount_per_mask(scenes: Sequence[Scene]) -> InstanceAP:
-    """The shares by a bincount over the points of each mask in turn, from full masks; curves as in the other."""
+    """Overlaps by one bincount per mask over its points, from full masks; curves as in the other version."""
     counts = []
     for scene in scenes:
         values, row = np.unique(scene.values, return_inverse=True)
@@ -119,7 +119,7 @@ def concatenate_classes(parts: Sequence[InstanceCounts]) -> InstanceCounts:
 
 
 def write_files(folder: Path, scenes: Sequence[Scene]) -> None:
-    """The layout of the benchmark: a list a scene, a text file a mask, one digit a line; the truth beside it."""
+    """The layout of the benchmark: one list per scene, one text file per mask, one digit per line, and ground truth."""
     for part in ("gt", "pred/masks"):
         (folder / part).mkdir(parents=True)
     for name, scene in zip(SCENES, scenes, strict=True):
@@ -140,14 +140,14 @@ def test_from_binary_masks(benchmark: Any, scenes: Sequence[Scene]) -> None:
 
 
 @pytest.mark.benchmark(group=MEMORY)
-def test_one_bincount_a_mask(benchmark: Any, scenes: Sequence[Scene]) -> None:
+def test_one_bincount_per_mask(benchmark: Any, scenes: Sequence[Scene]) -> None:
     found = benchmark(one_bincount_per_mask, scenes)
     assert found.ap == ours(scenes, [sparse(scene) for scene in scenes]).ap
 
 
 @pytest.fixture(scope="module")
 def files(scenes: Sequence[Scene], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Half a gigabyte of text files, which go at the end."""
+    """Half a gigabyte of text files, deleted at the end."""
     folder = tmp_path_factory.mktemp("files")
     write_files(folder, scenes)
     yield folder

@@ -1,4 +1,4 @@
-"""How long the counts of one scene take, against one comparison for each pair of prediction and instance."""
+"""Time of the counts of one scene, compared with one comparison per pair of prediction and instance."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene(seed: int = 0) -> tuple[NDArray[Any], list[NDArray[Any]], NDArray[Any]
 
 
 def compare_every_pair(truth: NDArray[Any], masks: NDArray[np.bool_], labels: NDArray[Any]) -> int:
-    """Intersections as the official script finds them: full masks, one comparison for void and for each pair."""
+    """Intersections as in the official script: full masks, one comparison for void and for each pair."""
     total = 0
     is_void = ~np.isin(truth // 1000, CLASS_IDS)
     values = np.unique(truth)
@@ -49,7 +49,7 @@ def test_one_bincount(benchmark: Any) -> None:
 
 
 @pytest.mark.benchmark(group="instance AP, counts of one scene: 200 000 points, 150 predictions")
-def test_one_comparison_a_pair(benchmark: Any) -> None:
+def test_one_comparison_per_pair(benchmark: Any) -> None:
     truth, masks, labels, _ = scene()
     full = np.zeros((len(masks), len(truth)), bool)
     for row, mask in zip(full, masks, strict=True):

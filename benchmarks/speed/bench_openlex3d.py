@@ -1,7 +1,7 @@
-"""How long OpenLex3D's category frequencies of one scene take, against a walk over the points that compares all.
+"""Time of OpenLex3D's category frequencies of one scene, compared with a loop over the points.
 
-The walk does for each point what the original does: it counts the points of the object by comparing the whole array,
-looks its labels up one by one, and takes the similarities of each predicted point, not of each object.
+The loop does what the original does for each point: it counts the points of the object by comparing the whole array,
+looks up its labels one by one, and computes similarities for each predicted point instead of each object.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class TableEncoder:
     dim: int = DIM
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise AssertionError("scoring looks at no image")
+        raise AssertionError("scoring uses no image")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         return np.random.default_rng(7).normal(size=(len(texts), DIM)).astype(np.float32)
 
 
 def scene(n_points: int) -> tuple[OpenLexTruth, Partition]:
-    """Objects of 40 cm along a room, and a prediction on other points of them, with a feature for each."""
+    """Objects of 40 cm along a room, and a prediction on other points of them, with a feature each."""
     rng = np.random.default_rng(0)
     corners = rng.random((N_OBJECTS, 3)) * [8, 6, 2.5]
     ids = np.sort(rng.integers(0, N_OBJECTS, n_points))
@@ -64,7 +64,7 @@ def frequencies(truth: OpenLexTruth, prediction: Partition) -> dict[str, float]:
 
 
 def walk_over_points(truth: OpenLexTruth, prediction: Partition) -> dict[str, float]:
-    """The original's loops; the nearest predicted point and its top labels are found as above but for each point."""
+    """The original's loops; the nearest predicted point and its top labels are found as above but per point."""
     text = TableEncoder().encode_texts(truth.prompts).astype(np.float64)
     text /= np.linalg.norm(text, axis=1, keepdims=True)
     distance, found = nearest(prediction.points, truth.points)
@@ -97,9 +97,9 @@ def test_by_pairs_of_object_and_instance(benchmark: Any, n_points: int) -> None:
 
 
 @pytest.mark.benchmark(group="OpenLex3D, top 5 labels of each point of a scene: 200 objects, 3407 prompts")
-def test_a_walk_over_the_points(benchmark: Any) -> None:
+def test_loop_over_the_points(benchmark: Any) -> None:
     truth, prediction = scene(SMALL)
     values = benchmark.pedantic(walk_over_points, (truth, prediction), rounds=1)
     assert sum(values.values()) == pytest.approx(1.0)
-    ours = frequencies(truth, prediction)  # on a grid of 5 cm, where the walk takes every predicted point
+    ours = frequencies(truth, prediction)  # on a grid of 5 cm, while the loop uses every predicted point
     assert values["synonyms"] == pytest.approx(ours["synonyms"], abs=0.2)

@@ -1,4 +1,4 @@
-"""How long the page of a run takes the first time, and again when it was kept: two small rooms, one method."""
+"""Time to create the page of a run the first time, and again from the cache: two small rooms, one method."""
 
 from __future__ import annotations
 

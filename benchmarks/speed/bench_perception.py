@@ -1,4 +1,4 @@
-"""What the embedded profile takes for a frame of 640x480, and its encoder in batches beside one image at a time.
+"""Time of the embedded profile for a frame of 640x480, and its encoder in batches and image by image.
 
 ``python -m pytest benchmarks/speed/bench_perception.py --benchmark-only --benchmark-group-by=group``, one minute.
 Numerical libraries run on one thread, as in a run.
@@ -58,7 +58,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, frames: list[Frame]) -> Repl
 
 
 def note_rate(benchmark: BenchmarkFixture) -> None:
-    benchmark.extra_info["frames_a_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
+    benchmark.extra_info["frames_per_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
     benchmark.extra_info["at_best"] = round(N_FRAMES / benchmark.stats["min"], 2)
 
 
@@ -91,7 +91,7 @@ def test_perception_of_files_read_ahead(
 
 
 def test_rendering_and_perception_of_a_room(benchmark: BenchmarkFixture, room: Rooms, perception: Perception) -> None:
-    """As in a run on rooms: each frame is rendered when it is asked for."""
+    """As in a run on rooms: each frame is rendered on access."""
     benchmark.group = f"Embedded profile, {N_FRAMES} frames of 640x480"
     rendered = room.frames("living0", 1600 // N_FRAMES)
 

@@ -1,9 +1,9 @@
-"""What OpenSU3D's post-processing costs: clustering, views, boxes, features of 200 instances with 2 million points.
+"""Cost of OpenSU3D's post-processing: clustering, views, boxes, features of 200 instances with 2 million points.
 
     python -m pytest benchmarks/speed/bench_postprocess.py --benchmark-only --benchmark-columns=min,median,rounds
 
-Each instance is a box of 0.6 to 0.9 m with points on its faces, some 2 cm apart; one in ten is two boxes 1 m apart, of
-which the second becomes an instance of its own. The peer is scikit-learn's DBSCAN on the points of the instances alone.
+Each instance is a box of 0.6 to 0.9 m with points on its faces, about 2 cm apart; one in ten is two boxes 1 m apart,
+the second of which becomes a separate instance. The comparison is scikit-learn's DBSCAN on each instance's points.
 """
 
 from __future__ import annotations

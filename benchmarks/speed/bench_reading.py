@@ -1,11 +1,11 @@
-"""What a frame costs until it is there: one of Replica's, and recordings in ScanNet's ``.sens`` form.
+"""Cost of reading a frame: one of Replica's, and recordings in ScanNet's ``.sens`` format.
 
 ``python -m pytest benchmarks/speed/bench_reading.py --benchmark-only --benchmark-group-by=group``, one minute and 50 MB
-of disk. Ours reads as a run does, with two threads ahead of whoever takes the frames. Beside it, in one thread: for
-Replica OpenCV's plain reading of both files; for ``.sens`` a reader that loads the file whole as ScanNet's published
-Python reader does (SensReader/python/SensorData.py at commit 0459a70: struct for each byte, zlib, Pillow beneath
-imageio), and the fastest plain one, which slices the file and decodes with OpenCV. Every reader decodes the same images
-in full. ``peak_mb`` is what Python and NumPy held at most, the file in memory included.
+of disk. Ours reads as in a run, with two threads ahead of the consumer. Compared with, in one thread: for
+Replica, OpenCV's plain reading of both files; for ``.sens``, a reader that loads it whole like ScanNet's published
+Python reader (SensReader/python/SensorData.py at commit 0459a70: struct for each byte, zlib, Pillow under
+imageio), and the fastest simple one: it slices the file and decodes with OpenCV. All readers decode the same images
+in full. ``peak_mb`` is the peak of Python and NumPy memory, including the file in memory.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.runs.frame_loop import ReadAhead
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
-N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames that are read; images that they repeat
+N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames to read; distinct images
 UPDATE_S = 0.06  # of a map
 N_LONG = 5_578  # frames of scene0000_00
 LONG_STRIDE = 100
@@ -50,14 +50,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def replica(folder: Path) -> ReplicaFrames:
-    """Frames of a room as large as Replica's, in its files."""
+    """Frames of a room at Replica's size, in its files."""
     room = Rooms(folder, RoomOptions(width=1200, height=680, n_frames=800))
     views = room.frames("living0", 800 // N_DIFFERENT)
     return write_replica(folder, [views[i] for i in range(N_DIFFERENT)], N_REPLICA)
 
 
 class PlainReplica(Sequence[tuple[UInt8Array, Float32Array]]):
-    """The same files read as most programs read them."""
+    """The same files, read as by most programs."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -95,12 +95,12 @@ def test_replica_frames(benchmark: BenchmarkFixture, folder: Path, replica: Repl
         "ours, 2 threads ahead": lambda: read_ahead(replica, 2),
     }
     benchmark.pedantic(work[how], rounds=7, warmup_rounds=1)
-    benchmark.extra_info["ms_a_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
+    benchmark.extra_info["ms_per_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
     benchmark.extra_info["best_ms"] = round(benchmark.stats["min"] / N_REPLICA * 1e3, 2)
 
 
 def test_what_an_update_waits_for_its_frame(benchmark: BenchmarkFixture, replica: ReplicaFrames) -> None:
-    """Between two frames the calling thread sorts and sums, as long as a slow update of a map takes."""
+    """Between two frames the calling thread sorts and sums, for the duration of a slow map update."""
     benchmark.group = f"{N_REPLICA} Replica frames of 1200x680 read ahead of a pipeline"
     benchmark.name = "frames and updates"
     waits_ms: list[float] = []
@@ -121,7 +121,7 @@ def test_what_an_update_waits_for_its_frame(benchmark: BenchmarkFixture, replica
 
 @dataclass(frozen=True)
 class Stored:
-    """One frame as a whole-file reader keeps it."""
+    """One frame as stored by a whole-file reader."""
 
     colour: bytes
     depth: bytes
@@ -131,7 +131,7 @@ HEADER_PARTS = struct.Struct("<IQ"), struct.Struct("<64f2i4IfQ")
 
 
 class PublishedReader:
-    """Everything is read at once, byte by byte through ``struct``; Pillow decodes."""
+    """Reads everything at once, byte by byte through ``struct``; decoding by Pillow."""
 
     def __init__(self, path: Path) -> None:
         self.frames: list[Stored] = []
@@ -150,7 +150,7 @@ class PublishedReader:
 
 
 class SlicingReader:
-    """Everything is read at once and cut into frames; OpenCV decodes."""
+    """Reads everything at once and cuts it into frames; decoding by OpenCV."""
 
     def __init__(self, path: Path) -> None:
         self.frames: list[Stored] = []
@@ -180,7 +180,7 @@ def _n_frames(file: io.BufferedReader) -> int:
 
 
 class Chosen(Sequence[Images]):
-    """The images of frames ``indices`` of an opened recording."""
+    """The images of frames ``indices`` of an open recording."""
 
     def __init__(self, file: SensFile, indices: Sequence[int]) -> None:
         self._file, self._indices = file, indices
@@ -204,7 +204,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def long_recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """As many frames as scene0000_00 has; where images are not going to be read there are holes in the file."""
+    """As many frames as scene0000_00; images that will not be read are holes in the file."""
     path = tmp_path_factory.mktemp("recording") / "long.sens"
     colour, depth = stored_images(0)
     record = np.zeros((), FRAME_RECORD)
@@ -223,7 +223,7 @@ def long_recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def stored_images(seed: int) -> tuple[bytes, bytes]:
-    """Smooth images with a little noise: about half a megabyte a frame, as ScanNet's recordings have on average."""
+    """Smooth images with a little noise: about half a megabyte per frame, as in ScanNet's recordings on average."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(0, 6, COLOUR[0]), np.linspace(0, 6, COLOUR[1]))
     waves = np.stack([np.sin(x + seed), np.cos(y * x), np.sin(y)], 2) * 90 + 128 + rng.normal(0, 3, (*x.shape, 3))
@@ -257,7 +257,7 @@ READERS: dict[str, Callable[[Path, range], None]] = {
 
 
 def test_the_readers_agree(recording: Path) -> None:
-    """The published form goes through another JPEG decoder: colours may differ by rounding, depth may not."""
+    """The published reader uses another JPEG decoder: colours may differ by rounding, depth may not."""
     ours, published, sliced = SensFile(recording, "bench"), PublishedReader(recording), SlicingReader(recording)
     assert np.array_equal(ours.colour(7), sliced.images(7)[0])
     assert np.abs(ours.colour(7).astype(int) - published.images(7)[0]).max() <= 8
@@ -277,7 +277,7 @@ def test_sens(benchmark: BenchmarkFixture, recording: Path, reader: str, stride:
 
 
 def test_long_sens(benchmark: BenchmarkFixture, long_recording: Path) -> None:
-    """In how much memory: a reader that loads the file whole would need that of the file."""
+    """Reports memory: a reader that loads the whole file would need the size of the file."""
     indices = range(0, N_LONG, LONG_STRIDE)
     benchmark.group = f".sens, {N_LONG} frames of 1296x968 and 640x480: open and read one frame in {LONG_STRIDE}"
     benchmark.name = "ours, 2 threads ahead"
@@ -286,7 +286,7 @@ def test_long_sens(benchmark: BenchmarkFixture, long_recording: Path) -> None:
 
 
 def peaks(path: Path, read: Callable[[], None]) -> dict[str, float]:
-    """What ``read`` holds at most beside the size of the file; it is the warm-up, too."""
+    """The peak memory of ``read``, apart from the size of the file; also serves as warm-up."""
     tracemalloc.start()
     read()
     peak = tracemalloc.get_traced_memory()[1]

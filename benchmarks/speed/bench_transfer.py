@@ -1,4 +1,4 @@
-"""How long nearest neighbours take between clouds of a scene's size, beside SciPy's tree asked the plain way."""
+"""Time of nearest neighbours between clouds of a scene's size, compared with plain use of SciPy's tree."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What a whole update of OpenSU3D costs, perception aside, with 0.1 to 10 million points in the map.
+"""Cost of a complete update of OpenSU3D, without perception, with 0.1 to 10 million points in the map.
 
     python -m pytest benchmarks/speed/bench_update.py --benchmark-only --benchmark-group-by=group
 
-A 1200x680 image of a wall with 24 masks; the map holds that wall, far beyond the view, at one point a 2 cm voxel.
-Either every pixel is back-projected and reduced to voxels, as is the default, or every second one each way is: 204,000
+A 1200x680 image of a wall with 24 masks; the map contains that wall, far beyond the view, at one point per 2 cm voxel.
+Either every pixel is back-projected and reduced to voxels (the default), or every second one each way: 204,000
 points with 3 mm of depth noise that are all matched and inserted (``frame_voxel`` 0).
 """
 
@@ -58,4 +58,4 @@ def test_update_of_204_000_points(benchmark: BenchmarkFixture, n_points: int) ->
     method = filled(OpenSU3D(OpenSU3DConfig(frame_voxel=0.0)), n_points)
     frame, detections = every_second_pixel(*view())
     benchmark.pedantic(lambda: method.update(frame, detections, Timer()), rounds=10, warmup_rounds=2)
-    assert method.n_points < n_points + 204_000  # nearly every point fell into a voxel that was taken
+    assert method.n_points < n_points + 204_000  # nearly every point fell into an occupied voxel

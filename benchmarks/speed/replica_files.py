@@ -11,11 +11,11 @@ import numpy as np
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.replica.frames import Camera, ReplicaFrames, colour_name, depth_name
 
-SCALE = 6553.5  # depth units in a metre of Replica's render
+SCALE = 6553.5  # depth units per metre of Replica's render
 
 
 def write_replica(folder: Path, frames: Sequence[Frame], n: int) -> ReplicaFrames:
-    """``n`` frames, ``frames`` over and over, as JPEG and 16-bit PNG below ``folder``."""
+    """``n`` frames, repeating ``frames``, as JPEG and 16-bit PNG below ``folder``."""
     (folder / "results").mkdir()
     for i in range(n):
         frame = frames[i % len(frames)]

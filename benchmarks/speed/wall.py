@@ -1,4 +1,4 @@
-"""A 1200x680 image of a wall with 24 masks, which several benchmarks fuse."""
+"""A 1200x680 image of a wall with 24 masks, used by several benchmarks."""
 
 from __future__ import annotations
 

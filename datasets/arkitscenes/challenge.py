@@ -1,6 +1,6 @@
-"""What the OpenSUN3D challenge says of scenes of ARKitScenes: its lists, the query of each, the vertices that answer.
+"""The OpenSUN3D challenge's files for ARKitScenes: scene lists, the query of each scene, the vertices that answer it.
 
-It is read from a checkout of OpenSun3D/cvpr24-challenge as it stands: ``challenge_track_1`` with
+Read from an unmodified checkout of OpenSun3D/cvpr24-challenge: ``challenge_track_1`` with
 ``benchmark_file_lists/`` and ``benchmark_data/gt_development_scenes/``.
 """
 
@@ -43,7 +43,7 @@ MAX_CHARACTERS = 1000  # of a query
 
 @dataclass(frozen=True)
 class ChallengeQuery:
-    """What a scene is searched for: the one text, and the numbers of the objects that answer it."""
+    """The query of a scene: its text, and the numbers of the objects that answer it."""
 
     text: str
     answers: tuple[int, ...]
@@ -52,25 +52,25 @@ class ChallengeQuery:
 
 @dataclass(frozen=True)
 class Challenge:
-    """The part of the challenge that lies in ``folder``; None where there is none."""
+    """The part of the challenge in ``folder``; None if there is none."""
 
     folder: Path | None
 
     @cached_property
     def queries(self) -> Mapping[str, str]:
-        """The text of each scene, of the development and the test scenes, as far as their lists are here."""
+        """The text of each development and test scene whose list is available."""
         found: dict[str, str] = {}
         for path in self._lists("queries"):
             for at, scene, text in read_list(path, QUERIES_COLUMNS):
                 if not text.strip() or len(text) > MAX_CHARACTERS or not text.isprintable():
-                    raise DataError(f"{at}: '{printable(text, 40)}' is no query; expected the words to search for")
+                    raise DataError(f"{at}: '{printable(text, 40)}' is not a query; expected the words to search for")
                 if found.setdefault(scene, text) != text:
-                    raise DataError(f"{at}: scene {scene} has two queries; the challenge has one a scene")
+                    raise DataError(f"{at}: scene {scene} has two queries; the challenge has one per scene")
         return found
 
     @cached_property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """The scenes of each part; those of the development set are known without its list."""
+        """The scenes of each part; the development scenes are known even without their list."""
         found: dict[str, tuple[str, ...]] = {GROUPS["development"]: DEVELOPMENT_SCENES}
         for path in self._lists("challenge"):
             part = path.name.removeprefix("challenge_").removesuffix("_scenes.csv")
@@ -78,21 +78,21 @@ class Challenge:
         return found
 
     def files(self, scene: str) -> tuple[Path, ...]:
-        """What is read of a scene, as far as it is there."""
+        """The files that are read for a scene, if available."""
         truth = self._truth_file(scene)
         return (*self._lists("queries"), *(() if truth is None else (truth,)))
 
     def query(self, scene: str) -> str:
-        """The text of a scene; ``GroundTruthMissing`` where no list has one."""
+        """The text of a scene; ``GroundTruthMissing`` if no list has one."""
         if scene not in self.queries:
             wanted = f"{LISTS_FOLDER}/queries_development_scenes.csv"
             raise GroundTruthMissing(f"arkitscenes/{scene}: no query in {wanted}; {self._advice}")
         return self.queries[scene]
 
     def ground_truth(self, scene: str, vertices: Float32Array) -> GroundTruth:
-        """The objects that answer the query of a scene, on the ``vertices`` (V, 3) m of its mesh in their order.
+        """The objects that answer the query of a scene, for the ``vertices`` (V, 3) m of its mesh in file order.
 
-        ``GroundTruthMissing`` where the challenge publishes none.
+        ``GroundTruthMissing`` if the challenge publishes none.
         """
         path, where = self._truth_file(scene), f"arkitscenes/{scene}"
         if path is None:
@@ -105,16 +105,16 @@ class Challenge:
             values = integer_lines(read_bytes(path, where, self._advice), where).astype(np.int64)
         if len(values) != len(vertices):
             raise DataError(
-                f"{where} has {len(values)} lines, the mesh has {len(vertices)} vertices; both must be of one scene"
+                f"{where} has {len(values)} lines, the mesh has {len(vertices)} vertices; both must belong to one scene"
             )
         if len(values) and values.min() < 0:
             line = int(values.argmin())
-            raise DataError(f"{where}:{line + 1}: {values[line]} is no number of an object; {self._advice}")
+            raise DataError(f"{where}:{line + 1}: {values[line]} is not an object number; {self._advice}")
         coded = values_of_numbers(values)
         number = np.maximum(coded - INSTANCES_PER_CLASS, 0)
-        if (coded == INSTANCES_PER_CLASS).any():  # an object to the challenge's script, whose number 0 is none here
+        if (coded == INSTANCES_PER_CLASS).any():  # an object in the challenge's script, but 0 means none here
             number = np.unique(np.append(coded, 0), return_inverse=True)[1][:-1]
-        source = f"vertices of the mesh with the numbers of {path.name} of the OpenSUN3D challenge"
+        source = f"vertices of the mesh with the object numbers in {path.name} of the OpenSUN3D challenge"
         is_object = (coded > 0).astype(np.int32)
         return GroundTruth(vertices, is_object, number.astype(np.int32), OBJECT, VARIANT, source)
 
@@ -123,7 +123,7 @@ class Challenge:
         if self.folder is not None:
             return f"copy it from {CHALLENGE_URL} into {self.folder}"
         return (
-            f"clone {CHALLENGE_URL} beside the scenes, or name the clone: --set "
+            f"clone {CHALLENGE_URL} next to the scenes, or name the clone: --set "
             f"arkitscenes.challenge=path/to/{CHECKOUT}"
         )
 
@@ -138,7 +138,7 @@ class Challenge:
 
 
 def find_challenge(root: Path, named: Path | None) -> Challenge:
-    """The challenge's files at ``named``, a clone of its repository or the folder of its first track, or below
+    """The challenge's files at ``named`` (a clone of its repository or the folder of its first track), or below
     ``root``."""
     if named is not None:
         found = _first_track((named, named / TRACK))
@@ -157,7 +157,7 @@ def _first_track(places: Sequence[Path]) -> Path | None:
 
 
 def read_list(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    """Where each row stands, its video and its last column; empty rows end no list."""
+    """Position, video and last column of each row; empty rows are skipped."""
     where = f"arkitscenes: {path.name}"
     try:
         rows = separated_rows(read_text(path, where))
@@ -169,11 +169,11 @@ def read_list(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, str, st
         if not "".join(row).strip():
             continue
         if len(row) != len(columns) or re.fullmatch(SCENE_NAMES, row[0]) is None:
-            raise DataError(f"{where}: row {number}: expected {','.join(columns)}, the video of eight digits")
+            raise DataError(f"{where}: row {number}: expected {','.join(columns)}, with an eight-digit video")
         yield f"{where}: row {number}", row[0], row[2]
 
 
 def answered(truth: GroundTruth, text: str) -> ChallengeQuery:
-    """The query of a scene with the numbers of all its objects; without any, every mask is wrong."""
+    """The query of a scene with the numbers of all its objects; without any object, every mask counts as wrong."""
     numbers = np.unique(truth.instance[truth.instance > 0])
     return ChallengeQuery(text, tuple(int(number) for number in numbers))

@@ -1,6 +1,6 @@
-"""ARKitScenes as the OpenSUN3D challenge uses it: a phone's recording, its mesh, and a text to be found in each scene.
+"""ARKitScenes as used by the OpenSUN3D challenge: phone recordings, their meshes, and one text query per scene.
 
-The raw and the 3DOD release are read; the query and the truth come from a clone of the challenge's repository.
+The raw and the 3DOD release are read; the query and the ground truth come from a clone of the challenge's repository.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from su3d_bench.datasets.recordings.recorded_frames import reading
 
 DEVELOPMENT = "ChallengeDevelopmentSet"
 # What download_data_opensun3d.py (OpenSun3D/cvpr24-challenge at 59db30f) and download_data.py (apple/ARKitScenes at
-# 7283761) name the folders of scenes.
+# 7283761) call the scene folders.
 SETS = (
     DEVELOPMENT,
     "ChallengeTestSet",
@@ -38,10 +38,10 @@ def mesh_name(scene: str) -> str:
 
 
 class ArkitScenesOptions(BaseModel):
-    """``images``: those of 256x192 at up to 60 a second, as the challenge's loader takes them, or the ``wide`` camera's
-    with the laser scanner's depth where it is there. ``width``: columns of the frames, at most. ``min_confidence``:
-    depth that the phone was less sure of (0 to 2) is left out. ``challenge``: a clone of the challenge's repository,
-    where it does not lie beside the scenes."""
+    """``images``: those of 256x192 at up to 60 per second, as in the challenge's loader, or the ``wide`` camera's
+    with the laser scanner's depth if available. ``width``: maximum columns of a frame. ``min_confidence``:
+    depth of lower confidence (0 to 2) is dropped. ``challenge``: a clone of the challenge's repository,
+    if it is not next to the scenes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -63,13 +63,13 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
     scene_names = challenge_files.SCENE_NAMES
     places_of_scenes = tuple(f"{base}/{name}" if base else name for base in challenge_files.BASES for name in SETS)
     how_to_get = (
-        f"/{DEVELOPMENT}, in raw/Training or where else https://github.com/apple/ARKitScenes and the OpenSUN3D "
+        f"/{DEVELOPMENT}, in raw/Training or wherever https://github.com/apple/ARKitScenes and the OpenSUN3D "
         f"challenge download them (a scene is a folder such as 42445173 with {frames.TRAJECTORY_NAME}); set SU3D_DATA "
-        "to where they are"
+        "to that folder"
     )
     label_space = challenge_files.LABEL_SPACE
     variants = (challenge_files.VARIANT,)
-    no_mesh = "the challenge annotates what answers its query and nothing else"
+    no_mesh = "the challenge annotates only the objects that answer its query"
     Options = ArkitScenesOptions
 
     def is_scene(self, folder: Path) -> bool:
@@ -80,15 +80,15 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     @cached_property
     def challenge(self) -> challenge_files.Challenge:
-        """The challenge's lists and truths, as far as they are here."""
+        """The challenge's lists and ground truth, as far as available."""
         return challenge_files.find_challenge(self.root, self.options.challenge)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
-        """The challenge's development scenes, and its test scenes where their list is here."""
+        """The challenge's development scenes, and its test scenes if their list is available."""
         return self.challenge.groups
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: images, and query and truth."""
+        """One-line summary of the scene from a quick look: images, query, ground truth."""
         try:
             words = f"{len(self.recording(scene).images)} images"
         except FramesMissing:
@@ -104,7 +104,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         return len(self.frames(scene, stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """Every ``stride``-th of the frames that have all of their files and a pose, in the order of their times."""
+        """Every ``stride``-th frame that has all its files and a pose, in temporal order."""
         return frames.PhoneFrames(self.recording(scene), stride, self.options.width, self.options.min_confidence)
 
     def recording_files(self, scene: str) -> Sequence[Path]:
@@ -125,27 +125,27 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         return self.challenge.ground_truth(scene, self.surface(scene).vertices)
 
     def asked_text(self, scene: str) -> str:
-        """What the scene is searched for; ``GroundTruthMissing`` where no list has its query."""
+        """The query of the scene; ``GroundTruthMissing`` if no list has it."""
         return self.challenge.query(scene)
 
     def queries(self, scene: str) -> Sequence[challenge_files.ChallengeQuery]:
-        """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` without either."""
+        """The scene's query with the numbers of the objects that answer it, or ``GroundTruthMissing``."""
         return (
             challenge_files.answered(self.ground_truth(scene, challenge_files.VARIANT), self.challenge.query(scene)),
         )
 
     def mesh_file(self, scene: str) -> Path:
-        """The mesh that the phone made, which may be missing."""
+        """The phone's mesh, which may be missing."""
         return self.folder(scene) / mesh_name(scene)
 
     @keeps_last
     def surface(self, scene: str) -> Surface:
-        """The mesh that the phone made, without labels."""
+        """The phone's mesh, without labels."""
         path = self.mesh_file(scene)
         return meshes.read_surface(path, f"{self.where(scene)}: {path.name}")
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What of the recording was left out, and what is wrong with query and truth; images are left to the frames."""
+        """What was excluded from the recording, and faults of query and ground truth; images are checked as frames."""
         yield from self.recording(scene).missing
         yield from faults_of(
             [

@@ -1,4 +1,4 @@
-"""The phone's recording: colour, depth, confidence and a camera file an image, put together by their times."""
+"""The phone's recording: colour, depth, confidence and one camera file per image, matched by time stamp."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from su3d_bench.datasets.recordings import recorded_frames
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
 
-N_COLUMNS = 7  # time, the axis of the rotation times its angle, translation: DATA.md of apple/ARKitScenes at 7283761
-MAX_ROTATION = 1e3  # rad; half a turn is all that a writer needs
-# FrameReaderDataLoaderLowRes of opensun3d_challenge_utils.py, OpenSun3D/cvpr24-challenge at 59db30f: an image whose
-# nearest pose is so far away or farther is left out, and times of poses count in milliseconds.
+N_COLUMNS = 7  # time, rotation axis times angle, translation: DATA.md of apple/ARKitScenes at 7283761
+MAX_ROTATION = 1e3  # rad; writers need at most half a turn
+# FrameReaderDataLoaderLowRes of opensun3d_challenge_utils.py, OpenSun3D/cvpr24-challenge at 59db30f: an image with no
+# pose nearer than this is dropped, and pose times are rounded to milliseconds.
 MAX_DIFFERENCE_S = 0.3
 MILLISECONDS = 3
 
@@ -33,7 +33,7 @@ class Trajectory:
     poses: Float64Array
 
     def nearest(self, times_s: Float64Array, most_s: float = MAX_DIFFERENCE_S) -> Int64Array:
-        """The row of the pose nearest to each time, the later of equals; -1 where none is nearer than ``most_s``."""
+        """The row of the pose nearest to each time, the later of two equally near; -1 if none is within ``most_s``."""
         after = np.clip(np.searchsorted(self.times_s, times_s), 0, len(self.times_s) - 1)
         before = np.maximum(after - 1, 0)
         is_before = np.abs(times_s - self.times_s[before]) < np.abs(times_s - self.times_s[after])
@@ -42,7 +42,7 @@ class Trajectory:
 
 
 def read_trajectory(path: Path, where: str) -> Trajectory:
-    """The poses of a file ``lowres_wide.traj``, whose lines are world-to-camera; of equal times the last counts."""
+    """The poses of a file ``lowres_wide.traj``, whose lines are world-to-camera; for equal times the last counts."""
     rows: dict[float, list[float]] = {}
     for number, line in enumerate(read_text(path, where).split("\n"), start=1):
         words = line.split()
@@ -53,7 +53,7 @@ def read_trajectory(path: Path, where: str) -> Trajectory:
             raise DataError(f"{at}: has {len(words)} values; expected time, axis-angle and translation, {N_COLUMNS}")
         time_s, *rest = recorded_frames.numbers(words, at)
         is_usual = 0 <= time_s < 1e12 and max(map(abs, rest[:3])) < MAX_ROTATION and max(map(abs, rest[3:])) < 1e6
-        if not is_usual:  # of values that are not finite, too
+        if not is_usual:  # also false for non-finite values
             shown = " ".join(f"{value:g}" for value in (time_s, *rest))
             raise DataError(f"{at}: is {shown}; expected seconds, radians and metres; copy the file again")
         rows[round(time_s, MILLISECONDS)] = rest
@@ -81,9 +81,9 @@ COLOUR_FOLDER: Mapping[Images, str] = {"lowres": LOWRES, "wide": WIDE}
 UNITS_PER_METRE = 1000.0  # DATA.md of apple/ARKitScenes at 7283761: millimetres
 DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
 MAX_CONFIDENCE = 2
-# The readers of Apple and of the challenge look for a camera file of the time itself, then 1 ms before and after.
+# Apple's and the challenge's readers look for a camera file at the exact time, then 1 ms before and after.
 NEIGHBOURS_MS = (0, -1, 1)
-MAX_DEPTH_AWAY_MS = 5  # of a wide image's depth, which has the time of its own frame: half of a sixtieth of a second
+MAX_DEPTH_AWAY_MS = 5  # depth of a wide image has its own time stamp: half of a sixtieth of a second
 LARGEST_SIDE = 16384
 ADVICE = "download the scene again"
 
@@ -94,7 +94,7 @@ def camera_folder(colour: str) -> str:
 
 @dataclass(frozen=True)
 class Image:
-    """The names below the folder of one frame's files; ``confidence`` is None where it is not asked for."""
+    """File names of one frame, relative to the folder; ``confidence`` is None if not requested."""
 
     time_ms: int
     colour: str
@@ -109,9 +109,9 @@ class Image:
 
 @dataclass(frozen=True)
 class PhoneRecording:
-    """The usable images of a scene in the order of their times, with the row of the pose of each.
+    """The usable images of a scene in temporal order, with the row of the pose of each.
 
-    ``missing`` says, a line for each reason, what was left out because something of it is not there.
+    ``missing``: one line per reason why images were excluded.
     """
 
     where: str
@@ -127,7 +127,7 @@ class PhoneRecording:
 
 
 def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
-    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; empty without a folder."""
+    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; may be empty."""
     form = re.compile(rf"{scene}_(\d{{1,9}}(?:\.\d{{1,9}})?){re.escape(suffix)}")
     try:
         names = sorted(os.listdir(folder))
@@ -138,7 +138,7 @@ def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
 
 
 def open_recording(folder: Path, scene: str, images: Images, min_confidence: int, where: str) -> PhoneRecording:
-    """The recording of a scene; ``FramesMissing`` where it has no images, ``DataError`` where none can be used."""
+    """The recording of a scene; ``FramesMissing`` if it has no images, ``DataError`` if none can be used."""
     colour_folder = COLOUR_FOLDER[images]
     with recorded_frames.reading(where):
         colours = times_in(folder / colour_folder, scene, ".png")
@@ -147,14 +147,14 @@ def open_recording(folder: Path, scene: str, images: Images, min_confidence: int
         cameras = times_in(folder / camera_folder(colour_folder), scene, ".pincam")
         sure = times_in(folder / CONFIDENCE, scene, ".png") if min_confidence else {}
     if not colours and not depths:
-        raise FramesMissing(f"{where}: has no images in {folder / colour_folder} and none in {DEPTH}; {ADVICE}")
+        raise FramesMissing(f"{where}: no images in {folder / colour_folder} and none in {DEPTH}; {ADVICE}")
     if min_confidence and not sure:
         raise DataError(
-            f"{where}: {CONFIDENCE}/ is missing, which option min_confidence needs; the challenge does not download "
-            "it, leave the option at 0 or download it"
+            f"{where}: option min_confidence needs {CONFIDENCE}/, which is missing; the challenge does not download "
+            "it; leave the option at 0 or download it"
         )
     trajectory = read_trajectory(folder / TRAJECTORY_NAME, f"{where}: {TRAJECTORY_NAME}")
-    # The challenge walks the depth images of low resolution; images of the wide camera are fewer than those.
+    # The challenge iterates over the low-resolution depth images; wide-camera images are fewer.
     times = sorted(depths if images == "lowres" else colours)
     lacking, unposed, found, rows = list[str](), list[str](), list[Image](), list[int]()
     for time_ms, row in zip(times, trajectory.nearest(np.array(times, float) / 1000).tolist(), strict=True):
@@ -171,17 +171,17 @@ def open_recording(folder: Path, scene: str, images: Images, min_confidence: int
             colour = f"{colour_folder}/{colours[time_ms]}"
             found.append(Image(time_ms, colour, depth, f"{camera_folder(colour_folder)}/{camera}", confidence))
             rows.append(row)
-    what = "images lack another image or a camera file of their time"
+    what = "images have no matching image or camera file"
     remarks = recorded_frames.left_out(where, lacking, what, len(found))
     no_pose = f"images have no pose nearer than 0.3 s in {TRAJECTORY_NAME}"
     remarks += recorded_frames.left_out(where, unposed, no_pose, len(found))
     if not found:
-        raise DataError(remarks[0] if remarks else f"{where}: has no images in {colour_folder}; {ADVICE}")
+        raise DataError(remarks[0] if remarks else f"{where}: no images in {colour_folder}; {ADVICE}")
     return PhoneRecording(where, folder, tuple(found), tuple(rows), trajectory, tuple(remarks))
 
 
 def _depth_of(time_ms: int, images: Images, depths: Mapping[int, str], fine: Mapping[int, str]) -> str | None:
-    """The depth image of a time: for the wide camera that of the laser scanner, else the phone's nearest."""
+    """The depth image of a time: the laser scanner's for the wide camera, otherwise the phone's nearest."""
     if time_ms in fine:
         return f"{FINE_DEPTH}/{fine[time_ms]}"
     reach = 0 if images == "lowres" else MAX_DEPTH_AWAY_MS
@@ -193,7 +193,7 @@ def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
     """Width and height, and the intrinsics (3, 3), of a file ``.pincam``: one line, width height fx fy cx cy."""
     words = read_text(path, where, ADVICE).split()
     if len(words) != 6:
-        raise DataError(f"{where}: has {len(words)} values; expected one line width height fx fy cx cy")
+        raise DataError(f"{where}: has {len(words)} values; expected one line 'width height fx fy cx cy'")
     width, height, fx, fy, cx, cy = recorded_frames.numbers(words, where)
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise DataError(f"{where}: the image has {width:g}x{height:g} pixels; {ADVICE}")
@@ -201,7 +201,7 @@ def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
 
 
 class PhoneFrames(Sequence[Frame]):
-    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``.
+    """Every ``stride``-th usable frame, read on access; a file that cannot be used is a ``DataError``.
 
     Frames have at most ``width`` columns: colour is averaged, depth and confidence are taken from the nearest pixel.
     """
@@ -219,10 +219,10 @@ class PhoneFrames(Sequence[Frame]):
         image = self._recording.images[index]
         full, intrinsics = read_camera(self._recording.folder / image.camera, self._at(image.camera))
         size = self._size(full)
-        rgb = sized(decode_colour, self._content(image.colour), full, self._at(image.colour), "as its camera file says")
+        rgb = sized(decode_colour, self._content(image.colour), full, self._at(image.colour), "as in its camera file")
         scale = np.array(size) / np.array(full)
         intrinsics[:2, :2] *= scale[:, None]
-        intrinsics[:2, 2] = (intrinsics[:2, 2] + 0.5) * scale - 0.5  # the middle of the first pixel is at 0
+        intrinsics[:2, 2] = (intrinsics[:2, 2] + 0.5) * scale - 0.5  # the centre of the first pixel is at 0
         return Frame(
             index=index,
             timestamp_s=image.time_ms / 1000,
@@ -244,7 +244,7 @@ class PhoneFrames(Sequence[Frame]):
             confidence = decode_colour(self._content(image.confidence), self._at(image.confidence))[..., 0]
             self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
             if confidence.max(initial=0) > MAX_CONFIDENCE:
-                raise DataError(f"{self._at(image.confidence)}: has values to {confidence.max()}; expected 0, 1 and 2")
+                raise DataError(f"{self._at(image.confidence)}: has values up to {confidence.max()}; expected 0 to 2")
             confidence = recorded_frames.nearest_at(confidence, (values.shape[1], values.shape[0]))
             depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))
         return recorded_frames.nearest_at(depth_m, size)

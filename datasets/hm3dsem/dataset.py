@@ -1,9 +1,9 @@
-"""Walks through HM3DSem as HOV-SG generates and evaluates them: floors, rooms and objects of whole buildings.
+"""HM3DSem walks as HOV-SG generates and evaluates them: floors, rooms and objects of whole buildings.
 
-A walk has ``rgb/``, ``depth/`` and ``pose/`` with a file for each frame. Depth is 16 bits in mm. A pose is one line of
+A walk has ``rgb/``, ``depth/`` and ``pose/`` with one file per frame. Depth is 16 bits in mm. A pose is one line of
 16 numbers, the camera in Habitat's axes (x right, y up, z back); frames have the camera in OpenCV's axes, as HOV-SG's
-loader has them. There is no camera file: images are 90 degrees wide, and the principal point is half the size
-(hovsg/dataloader/hm3dsem.py). The world stays that of Habitat, whose y points up: predictions of HOV-SG lie in it.
+loader has them. There is no camera file: the field of view is 90 degrees and the principal point is the centre
+(hovsg/dataloader/hm3dsem.py). The world is Habitat's, with y up, as in HOV-SG's predictions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SCENE_NAMES = r"\d{5}-[A-Za-z0-9]{11}"
 COLOUR, DEPTH, POSE = "rgb", "depth", "pose"
 LABELS_OF = "hm3d"  # as OpenLex3D calls the dataset
 WALKS_URL = "https://github.com/hovsg/HOV-SG#habitat-matterport-3d-semantics"
-# The scenes that HOV-SG evaluates by its README, and those that its generator has poses for.
+# The scenes that HOV-SG's README evaluates, and those for which its generator has poses.
 EVALUATED = (
     "00824-Dd4bFSTQ8gi", "00829-QaLdnwvtxbs", "00843-DYehNKdT76V", "00861-GLAQ4DNUx5U",
     "00862-LT9Jq6dN3Ea", "00873-bxsVRursffK", "00877-4ok3usBNeis", "00890-6s7QHgap2fW",
@@ -42,14 +42,14 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "walks": tuple(sorted((*EVALUATED, "00847-bCPU9suPUw9", "00849-a8BtkwhxdRV"))),
 }
 UNITS_PER_METRE = 1000.0  # habitat_utils.py: save_obs
-FRAMES_PER_SECOND = 30.0  # ours: walks have no times
-TO_HABITAT = np.diag([1.0, -1.0, -1.0, 1.0])  # from a camera in OpenCV's axes to one in Habitat's, and back
+FRAMES_PER_SECOND = 30.0  # ours: walks have no time stamps
+TO_HABITAT = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera axes to Habitat's, and back
 DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
 ENDINGS = {COLOUR: "png", DEPTH: "png", POSE: "txt"}
 
 
 class Hm3dSem(RecordedDataset[NoOptions]):
-    """HOV-SG's walks through HM3DSem, with the truth that its tools create; read below the data root."""
+    """HOV-SG's walks through HM3DSem, with the ground truth created by its tools; read below the data root."""
 
     name = "hm3dsem"
     reader_version = 2
@@ -63,7 +63,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
     variants = (truth.VARIANT,)
     extra_ground_truths = openlex3d.EXTRA_GROUND_TRUTHS
     labels_of = LABELS_OF
-    no_mesh = "that of HM3D keeps its objects in a texture, which is not read"
+    no_mesh = "HM3D stores objects in a texture, which is not read"
     Options = NoOptions
 
     def is_scene(self, folder: Path) -> bool:
@@ -71,11 +71,11 @@ class Hm3dSem(RecordedDataset[NoOptions]):
         return is_walk and re.fullmatch(SCENE_NAMES, folder.name) is not None
 
     def groups(self) -> Mapping[str, Sequence[str]]:
-        """The scenes that HOV-SG evaluates, and those that it has poses for; whether they are here or not."""
+        """The scenes that HOV-SG evaluates and those for which it has poses, available or not."""
         return GROUPS
 
     def status(self, scene: str) -> str:
-        """A word on the walk from a quick look: frames, and ground truth."""
+        """One-line summary of the walk from a quick look: frames, ground truth."""
         folder = self.folder(scene)
         with recorded_frames.reading(self.where(scene)):
             n = sum(1 for _ in (folder / POSE).glob("*.txt")) if (folder / POSE).is_dir() else 0
@@ -92,12 +92,12 @@ class Hm3dSem(RecordedDataset[NoOptions]):
         return (folder / truth.INFO_NAME, *clouds, *(() if annotation is None else (annotation,)), *labels)
 
     def up(self, scene: str) -> WorldUp:
-        """Y, as Habitat has it."""
+        """Y, as in Habitat."""
         self.folder(scene)
-        return WorldUp("y", False, "Habitat's worlds are so", "predictions of HOV-SG lie in this world, so it stays")
+        return WorldUp("y", False, "Habitat's worlds have y up", "it is kept for HOV-SG's predictions")
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What is wrong with poses, truth and annotation, a line each; images are left to the frames."""
+        """Faults of poses, ground truth and annotation, one line each; images are checked as frames."""
         yield from faults_of([lambda: self.recording(scene), lambda: self._check_annotation(scene)])
 
     def _check_annotation(self, scene: str) -> None:
@@ -126,21 +126,21 @@ class Hm3dSem(RecordedDataset[NoOptions]):
 
 
 def annotation_file(root: Path, walk: Path) -> Path | None:
-    """The ``.semantic.txt`` of a walk's scene, beside the walk or in the release; None where it is not there."""
+    """The ``.semantic.txt`` of a walk's scene, next to the walk or in the release; None if missing."""
     name = f"{walk.name.partition('-')[2]}.semantic.txt"
     folders = [walk, *(root / place / walk.name for place in RELEASE_PLACES)]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
 def open_walk(path: Path, where: str) -> Recording:
-    """The frames of the walk in ``path``; a fault in what is read of it is a ``DataError``."""
+    """The frames of the walk in ``path``; a fault in its files is a ``DataError``."""
     files = {
         kind: by_number(list_folder(path, kind, where), rf"[\w-]{{1,80}}[_-](\d{{6,9}})\.{ending}", f"{where}: {kind}/")
         for kind, ending in ENDINGS.items()
     }
     numbers = sorted(set().union(*files.values()))
     if not numbers:
-        raise DataError(f"{where}: {POSE}/, {COLOUR}/ and {DEPTH}/ hold no frame; generate the walk again")
+        raise DataError(f"{where}: {POSE}/, {COLOUR}/ and {DEPTH}/ have no frames; generate the walk again")
     check_complete(
         {f"{kind}/..._{{:06d}}.{ending}": files[kind] for kind, ending in ENDINGS.items()},
         range(numbers[0], numbers[-1] + 1),
@@ -164,10 +164,10 @@ def open_walk(path: Path, where: str) -> Recording:
 
 
 def read_poses(path: Path, names: Sequence[str], where: str) -> Float64Array:
-    """Camera-to-world poses (n, 4, 4) of cameras in OpenCV's axes, in the world of the files."""
+    """Camera-to-world poses (n, 4, 4), OpenCV camera axes, in the world of the files."""
     poses = np.array([read_matrix(path, name, where) for name in names]).reshape(-1, 4, 4)
     is_sound = np.isfinite(poses).all(axis=(1, 2))
     is_sound[is_sound] = are_rigid(poses[is_sound])
     if not is_sound.all():
-        raise DataError(f"{where}: {names[int(np.argmin(is_sound))]}: is no rigid pose; generate the walk again")
+        raise DataError(f"{where}: {names[int(np.argmin(is_sound))]}: not a rigid transform; generate the walk again")
     return poses @ TO_HABITAT

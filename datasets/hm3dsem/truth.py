@@ -1,8 +1,8 @@
-"""The truth of a walk: ``scene_info.json`` with floors, rooms and objects, and the cloud of each object.
+"""The ground truth of a walk: ``scene_info.json`` with floors, rooms and objects, and the cloud of each object.
 
-Files and keys are those that create_hm3dsem_walks_gt.py of hovsg/HOV-SG (commit 71a8069) writes and its
-hm3dsem_evaluator.py reads. The semantic mesh of HM3D, whose objects are colours of a texture, is not read: the clouds
-were made of what the walk saw of it.
+Files and keys are those written by create_hm3dsem_walks_gt.py of hovsg/HOV-SG (commit 71a8069) and read by its
+hm3dsem_evaluator.py reads. The semantic mesh of HM3D, whose objects are texture colours, is not read: the clouds
+were created from what the walk saw of it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ AGAIN = "create the ground truth again with HOV-SG's tool"
 
 @cache
 def label_set() -> LabelSet:
-    """The categories of HM3DSem's objects, numbered by HOV-SG's list from 1."""
+    """The categories of HM3DSem's objects, numbered from 1 in the order of HOV-SG's list."""
     rows = parse_toml(file_text(CLASS_TABLES / "hm3dsem.toml"))["classes"]
     return LabelSet(LABEL_SPACE, tuple(int(row[0]) for row in rows), tuple(str(row[1]) for row in rows))
 
@@ -45,7 +45,7 @@ class Level(FileModel):
 
 
 class Region(FileModel):
-    """A room; people name it with ``category``, HOV-SG's tools by a vote of its objects."""
+    """A room; ``category`` is its human annotation, HOV-SG's tools vote over its objects."""
 
     floor_id: WholeNumber
     bev_region_points: Annotated[list[Point], Field(min_length=1)]
@@ -66,7 +66,7 @@ class WalkObject(FileModel):
 
 
 class WalkInfo(FileModel):
-    """What ``scene_info.json`` holds, in its order."""
+    """The content of ``scene_info.json``, in file order."""
 
     levels: list[Level]
     regions: list[Region]
@@ -75,16 +75,16 @@ class WalkInfo(FileModel):
     @model_validator(mode="after")
     def _check_ids(self) -> WalkInfo:
         if len({one.id for one in self.objects}) != len(self.objects):
-            raise ValueError("an object stands there twice")
+            raise ValueError("an object is listed twice")
         if not {room.floor_id for room in self.regions} <= {level.id for level in self.levels}:
-            raise ValueError("a 'floor_id' names no level")
+            raise ValueError("a 'floor_id' does not match a level")
         return self
 
 
 def read_truth(folder: Path, where: str) -> GroundTruth:
     """The clouds of all objects one after another, with the floors and rooms of the walk in ``folder``.
 
-    Instance ids count the objects in the order of the file from 1; a category that is not in HOV-SG's list is class 0.
+    Instance ids number the objects in file order from 1; a category not in HOV-SG's list is class 0.
     """
     info = read_info(folder / INFO_NAME, where)
     clouds = [read_cloud(folder / OBJECTS / f"{one.id}.ply", where) for one in info.objects]
@@ -105,7 +105,7 @@ def read_truth(folder: Path, where: str) -> GroundTruth:
 
 
 def read_info(path: Path, where: str) -> WalkInfo:
-    """What ``scene_info.json`` says; ``where`` begins each message."""
+    """The content of ``scene_info.json``; ``where`` begins each message."""
     return read_json(path, f"{where}: {path.name}", WalkInfo, AGAIN)
 
 
@@ -122,24 +122,24 @@ def places_of(info: WalkInfo) -> Places:
 
 
 def read_cloud(path: Path, where: str) -> Float32Array:
-    """The points (N, 3) of an object, one at least."""
+    """The points (N, 3) of an object, at least one."""
     where = f"{where}: {path.parent.name}/{path.name}"
     vertices = read_ply(path, where).element("vertex")
     columns = {} if vertices is None else vertices.columns
     axes = [axis for axis in (columns.get(name) for name in "xyz") if isinstance(axis, np.ndarray)]
     if len(axes) != 3:
-        raise DataError(f"{where}: its vertices have no x, y and z; {AGAIN}")
+        raise DataError(f"{where}: its vertices lack x, y or z; {AGAIN}")
     with converted(PredictionError, DataError):
         points = checked_points(np.stack([axis.astype(np.float64) for axis in axes], axis=1), where)
     if not len(points):
-        raise DataError(f"{where}: has no point; {AGAIN}")
+        raise DataError(f"{where}: has no points; {AGAIN}")
     return points
 
 
 def read_annotation(path: Path, where: str) -> dict[int, tuple[str, str, int]]:
     """Object id -> colour, category and region of a ``.semantic.txt``: a heading, then ``id,colour,"category",region``.
 
-    The category is taken between its quotation marks, commas and all.
+    The category is the text between the quotation marks, including commas.
     """
     where = f"{where}: {path.name}"
     lines = read_text(path, where).splitlines()
@@ -153,16 +153,16 @@ def read_annotation(path: Path, where: str) -> dict[int, tuple[str, str, int]]:
         except (ValueError, StopIteration, csv.Error):
             raise DataError(f'{where}:{number}: is {line[:60]!a}; expected id,colour,"category",region') from None
         if rows.setdefault(row[0], row[1]) != row[1] or len(rows) > MAX_OBJECTS:
-            raise DataError(f"{where}:{number}: object {row[0]} stands there twice; copy the file again")
+            raise DataError(f"{where}:{number}: object {row[0]} is listed twice; copy the file again")
     return rows
 
 
 def check_annotation(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> None:
-    """A ``DataError`` where an object of the walk is not that of the scene's annotation."""
+    """Raise ``DataError`` if an object of the walk differs from the scene's annotation."""
     for one in info.objects:
         own = one.hex, one.category, one.region_id
         if annotation.get(one.id) != own:
             found = printable(f"colour, category and region are {own} and {annotation.get(one.id)}", 120)
             raise DataError(
-                f"{where}: {INFO_NAME}: object {one.id} is not that of the scene's .semantic.txt ({found}); {AGAIN}"
+                f"{where}: {INFO_NAME}: object {one.id} differs from the scene's .semantic.txt ({found}); {AGAIN}"
             )

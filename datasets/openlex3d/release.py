@@ -1,8 +1,8 @@
-"""OpenLex3D's ground truth: the labels and queries of its release with the points of the base data.
+"""OpenLex3D's ground truth: labels and queries of its release, with the points of the base data.
 
 The release (``gt_openlex3d.zip``) has ``<dataset>/prompt_list.txt`` and in ``<dataset>/<scene>/`` two files of
-categories, ``gt_categories.json`` by object and ``gt_categories_query_to_object_mapping_<level>.json`` by text, and
-where only a part of the scene was seen ``gt_visible_cloud.pcd``; which point belongs to which object comes from the
+categories, ``gt_categories.json`` per object and ``gt_categories_query_to_object_mapping_<level>.json`` per text, and
+``gt_visible_cloud.pcd`` where only a part of the scene was seen; which point belongs to which object comes from the
 base data. Source: openlex3d at commit 3dbad2b.
 """
 
@@ -43,12 +43,12 @@ MAX_ID = 2**31 - 1
 Content = TypeVar("Content")
 
 Level = Literal["l0", "l1", "all"]
-LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, what depicts them, both
-QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
+LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, depictions, both
+QUERY_LEVEL: Level = "l0"  # the release's default
 
 
 def _whole_characters(text: str) -> str:
-    """JSON can write halves of characters, which no encoder takes."""
+    """JSON strings may contain lone surrogates, which cannot be encoded."""
     text.encode("utf-8")
     return text
 
@@ -68,28 +68,28 @@ class OpenLexFiles:
     def __post_init__(self) -> None:
         for name in (self.dataset, self.scene):
             if name in ("", ".", "..") or any(character in name for character in "/\\\0"):
-                raise DataError(f"openlex3d: '{printable(name, 60)}' is no name of a dataset or scene")
+                raise DataError(f"openlex3d: '{printable(name, 60)}' is not a dataset or scene name")
 
     @property
     def where(self) -> str:
         return f"{self.dataset}/{self.scene}"
 
     def prompts(self) -> tuple[str, ...]:
-        """The labels among which a method may choose, in the order of the list."""
+        """The labels that a method may choose from, in list order."""
         where = f"{self.where}: {PROMPTS_NAME}"
         return read_prompts(self.root / self.dataset / PROMPTS_NAME, where)
 
     def objects(self) -> dict[int, ObjectLabels]:
-        """The labels of each object by its id."""
+        """Object id -> labels."""
         return read_categories(self._of_scene(CATEGORIES_NAME), f"{self.where}: {CATEGORIES_NAME}")
 
     def queries(self, level: Level) -> tuple[TextQuery, ...]:
-        """The texts of ``level`` and the objects that each speaks of."""
+        """The texts of ``level`` and the objects to which each refers."""
         return read_queries(self._of_scene(queries_name(level)), f"{self.where}: {queries_name(level)}")
 
     @property
     def has_visible_points(self) -> bool:
-        """Whether the release says which part of the scene its images show."""
+        """Whether the release has the part of the scene that its images show."""
         return os.path.exists(self._of_scene(VISIBLE_NAME))
 
     def visible_points(self) -> Float32Array:
@@ -109,12 +109,12 @@ class OpenLexFiles:
 
 
 def read_prompts(path: Path, where: str) -> tuple[str, ...]:
-    """One prompt a line, without the white space around it."""
+    """One prompt per line, stripped."""
     text = _read_text(path, where)
     lines = text.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n").split("\n")
     prompts = tuple(line.strip() for line in lines)
     if not any(prompts):
-        raise DataError(f"{where}: has no prompt; expected one a line")
+        raise DataError(f"{where}: has no prompts; expected one per line")
     return prompts
 
 
@@ -156,12 +156,12 @@ def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
         tiers = tuple(found.synonyms), tuple(found.depictions), tuple(found.vis_sim)
         labels = ObjectLabels(*tiers, tuple(found.clutter or ()))
         if labels_of.setdefault(sample.object_id, labels) != labels:
-            raise DataError(f"{where}: object {sample.object_id} stands there twice with other labels; keep one")
+            raise DataError(f"{where}: object {sample.object_id} is listed twice with other labels; keep one")
     return labels_of
 
 
 def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
-    """The queries of all levels of the file, in its order: level -> text -> object ids."""
+    """The queries of all levels in file order: level -> text -> object ids."""
     levels = _read_json(path, where, dict[str, dict[Text, ObjectIds]])
     try:
         return tuple(TextQuery(text, tuple(ids)) for level in levels.values() for text, ids in level.items())
@@ -174,19 +174,19 @@ def _read_json(path: Path, where: str, kind: type[Content]) -> Content:
 
 
 def _read_text(path: Path, where: str) -> str:
-    if not os.path.exists(path):  # False, too, where the system refuses to look
+    if not os.path.exists(path):  # also False without permission
         raise _missing(path, where)
     return read_text(path, where)
 
 
 def _missing(path: Path, where: str) -> GroundTruthMissing:
-    return GroundTruthMissing(f"{where}: is not there; expected {printable(str(path), 200)}")
+    return GroundTruthMissing(f"{where}: is missing; expected {printable(str(path), 200)}")
 
 
 SAMPLED_DATASET = "scannetpp"
-SAMPLED_FOLDER = "prepared_semantics"  # beside data/ of ScanNet++
+SAMPLED_FOLDER = "prepared_semantics"  # next to ScanNet++'s data/
 SAMPLED_POINTS, SAMPLED_OBJECTS = "sampled_coords", "sampled_instance_anno_id"
-HOW_TO_SAMPLE = "semantic.prep.prepare_training_data of github.com/scannetpp/scannetpp writes it"
+HOW_TO_SAMPLE = "create it with semantic.prep.prepare_training_data of github.com/scannetpp/scannetpp"
 HM3D_BASES = (
     "hm3d", "hm3d/val", "hm3dsem_walks", "hm3dsem_walks/val", "HM3D", ".", "hm3dsem/val", "HM3DSem/val", "val"
 )  # fmt: skip
@@ -197,9 +197,9 @@ MAX_OBJECTS = 2**16  # the original keeps ids in 16 bits
 
 @dataclass(frozen=True)
 class LabelledPoints:
-    """``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64 as the base data numbers its objects, -1 for none.
+    """``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64 object numbers of the base data, -1 for none.
 
-    ``source`` says which data they are.
+    ``source`` names the data.
     """
 
     points: Float32Array
@@ -208,7 +208,7 @@ class LabelledPoints:
 
 
 def points_of(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
-    """The points of a scene of ``replica``, ``scannetpp`` or ``hm3d``; ``GroundTruthMissing`` where they are not."""
+    """The points of a scene of ``replica``, ``scannetpp`` or ``hm3d``; ``GroundTruthMissing`` if unavailable."""
     return {"replica": _of_replica, "scannetpp": _of_scannetpp, "hm3d": _of_hm3d}[dataset](data_root, scene)
 
 
@@ -224,9 +224,9 @@ def _of_replica(data_root: Path, scene: str) -> LabelledPoints:
 
 
 def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
-    """The corners of all faces, a vertex of four faces four times: every object counts, with a class or without.
+    """The corners of all faces (a vertex of four faces four times); every object counts, with or without a class.
 
-    The original takes a face whose object the scene's list does not have for one of object 0; here it keeps its number.
+    The original assigns a face whose object is not in the scene's list to object 0; here it keeps its number.
     """
     return LabelledPoints(
         mesh.vertices[mesh.corners.values],
@@ -236,7 +236,7 @@ def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
 
 
 def sampled_points_file(data_root: Path, scene: str) -> Path | None:
-    """Where the sampled points of a scene are; None where they are not."""
+    """Path of the sampled points of a scene; None if missing."""
     name = f"{SAMPLED_FOLDER}/{scene}.pth"
     return next((file for base in SCANNETPP_BASES if (file := data_root / base / name).is_file()), None)
 
@@ -252,7 +252,7 @@ def _of_scannetpp(data_root: Path, scene: str) -> LabelledPoints:
 
 
 def read_sampled_points(path: Path, where: str) -> LabelledPoints:
-    """The points that ScanNet++'s toolbox sampled on the mesh, with the object of the nearest vertex; -100 for none."""
+    """The points that ScanNet++'s toolbox sampled on the mesh, with the nearest vertex's object; -100 for none."""
     with converted(PredictionError, DataError):
         content = read_torch(path)
         if not isinstance(content, dict) or not {SAMPLED_POINTS, SAMPLED_OBJECTS} <= set(content):
@@ -293,21 +293,21 @@ class SceneInfo(FileModel):
 
 
 def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
-    """The cloud of every object that ``scene_info.json`` names, one object after another."""
+    """The clouds of all objects in ``scene_info.json``, concatenated."""
     advice = "unpack the release again"
     ids = [one.id for one in read_json(folder / SCENE_INFO, f"{where}: {SCENE_INFO}", SceneInfo, advice).objects]
     if len(set(ids)) != len(ids):
-        raise DataError(f"{where}: {SCENE_INFO}: an object stands there twice; {advice}")
+        raise DataError(f"{where}: {SCENE_INFO}: an object is listed twice; {advice}")
     clouds: list[Float32Array] = []
     n_points = 0
     for one in ids:
         path, beside = folder / OBJECTS_FOLDER / f"{one}.ply", f"{where}: {OBJECTS_FOLDER}/{one}.ply"
         if not path.is_file():
-            raise DataError(f"{beside}: is not there, and {SCENE_INFO} names object {one}; {advice}")
+            raise DataError(f"{beside}: is missing, but {SCENE_INFO} lists object {one}; {advice}")
         clouds.append(vertex_positions(read_ply(path, beside), beside))
         n_points += len(clouds[-1])
         if n_points > MAX_POINTS:
-            raise DataError(f"{beside}: the scene has more than {MAX_POINTS} points; is it damaged?")
+            raise DataError(f"{beside}: the scene has more than {MAX_POINTS} points; check for damage")
     return LabelledPoints(
         np.concatenate(clouds),
         np.repeat(np.array(ids, np.int64), [len(cloud) for cloud in clouds]),
@@ -315,9 +315,9 @@ def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
     )
 
 
-DATASETS = ("replica", "scannetpp", "hm3d")  # as the release calls them, and below the data root their own data
-ALL_SEEN = ("scannetpp", "hm3d")  # whose scenes may have no cloud of visible points: all that the base data has counts
-VISIBLE_RADIUS_M = 0.05  # how far the labelled point may be that says to which object a visible point belongs
+DATASETS = ("replica", "scannetpp", "hm3d")  # names in the release, and of the base data's folders below the data root
+ALL_SEEN = ("scannetpp", "hm3d")  # scenes may lack a cloud of visible points: all base points count
+VISIBLE_RADIUS_M = 0.05  # maximum distance from a visible point to the labelled point that gives its object
 VISIBLE, FACE_CORNERS = "openlex3d-visible", "openlex3d-face-corners"
 EXTRA_GROUND_TRUTHS: Mapping[str, str] = {LABELS: VISIBLE, QUERIES: FACE_CORNERS}  # label space -> ground truth
 RELEASE_FOLDER = "gt_openlex3d"
@@ -326,9 +326,9 @@ PAGE = "https://github.com/openlex3d/openlex3d"
 
 
 def categories_truth(files: OpenLexFiles, labelled: LabelledPoints) -> OpenLexTruth:
-    """The truth of ``openlex3d-topn`` and ``openlex3d-ranking``: visible points with the objects of the nearest point.
+    """Ground truth of ``openlex3d-topn`` and ``openlex3d-ranking``: visible points with the nearest point's object.
 
-    One without a labelled point nearer than 5 cm has no object. Without a cloud of visible points a scene of
+    Points without a labelled point within 5 cm have no object. Without a cloud of visible points, a scene of
     ``ALL_SEEN`` is scored on all labelled points, as the original does.
     """
     if files.dataset in ALL_SEEN and not files.has_visible_points:
@@ -349,7 +349,7 @@ def categories_truth(files: OpenLexFiles, labelled: LabelledPoints) -> OpenLexTr
 
 
 def queries_truth(files: OpenLexFiles, labelled: LabelledPoints, level: Level) -> QueryTruth:
-    """The truth of ``openlex3d-queries``: all points with their objects, seen or not."""
+    """Ground truth of ``openlex3d-queries``: all points with their objects, visible or not."""
     return QueryTruth(
         labelled.points,
         labelled.object_of_point,
@@ -369,7 +369,7 @@ class OpenLexRelease:
 
     @staticmethod
     def datasets_at(folder: Path) -> tuple[str, ...]:
-        """The datasets whose labels a folder of ground truth has; none where it is not the release."""
+        """The datasets with labels in a ground-truth folder; none if it is not the release."""
         return tuple(name for name in DATASETS if (folder / name / PROMPTS_NAME).is_file())
 
     def scenes(self) -> tuple[str, ...]:
@@ -382,7 +382,7 @@ class OpenLexRelease:
         return digest_json({file.name: digest_file(file) for file in files if file.is_file()})
 
     def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
-        """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""
+        """The ground truth of a scene; ``GroundTruthMissing`` if one of its files is missing."""
         files = OpenLexFiles(self.folder, self.dataset, scene)
         labelled = _kept_points(self.dataset, self.data_root, scene)
         if variant == VISIBLE:
@@ -391,7 +391,7 @@ class OpenLexRelease:
 
 
 def label_files(root: Path, dataset: str, scene: str) -> tuple[Path, ...]:
-    """The files of a scene's labels below the data root, sampled points too; none where the release is not there."""
+    """The files of a scene's labels below the data root, including sampled points; none without the release."""
     found = _find(root, dataset, scene)
     if found is None:
         return ()
@@ -403,9 +403,9 @@ def label_files(root: Path, dataset: str, scene: str) -> tuple[Path, ...]:
 
 
 def truth_below(root: Path, dataset: str, scene: str, variant: str) -> Any:
-    """The truth of a dataset's scene, from the release and the base data below the data root.
+    """The ground truth of a dataset's scene, from the release and the base data below the data root.
 
-    An ``OpenLexTruth`` or a ``QueryTruth``, as ``variant`` says; neither is a ``GroundTruth``.
+    An ``OpenLexTruth`` or a ``QueryTruth``, depending on ``variant``; neither is a ``GroundTruth``.
     """
     found = _find(root, dataset, scene)
     if found is None:
@@ -418,7 +418,7 @@ def truth_below(root: Path, dataset: str, scene: str, variant: str) -> Any:
 
 
 def _find(root: Path, dataset: str, scene: str) -> tuple[OpenLexRelease, str] | None:
-    """The release below ``root`` with the labels of a scene, and what that calls it."""
+    """The release below ``root`` that has labels of a scene, and the scene's name in it."""
     for place in PLACES:
         for name in _names(scene):
             if (root / place / dataset / name / CATEGORIES_NAME).is_file():
@@ -427,11 +427,11 @@ def _find(root: Path, dataset: str, scene: str) -> tuple[OpenLexRelease, str] | 
 
 
 def _names(scene: str) -> tuple[str, ...]:
-    """What the release may call a scene: of HM3D's walks the number before the hyphen."""
+    """Possible names of a scene in the release: for HM3D walks, the number before the hyphen."""
     return tuple(dict.fromkeys((scene, scene.partition("-")[0])))
 
 
 @lru_cache(maxsize=1)
 def _kept_points(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
-    """The points of a scene; the last ones are kept, because every protocol asks for them anew."""
+    """The points of a scene; the last ones are cached, because every protocol asks for them again."""
     return points_of(dataset, data_root, scene)

@@ -1,4 +1,4 @@
-"""What datasets of files do alike: scenes below the data root, what is read of them, their digest, what is missing."""
+"""Shared base of file-based datasets: scenes below the data root, the files that are read, digests, missing data."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recording, reading
 
 logger = logging.getLogger(__name__)
-MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
-MAX_LINES = 20  # on faults of one kind
+MARKER = "rooms.json"  # lists the scenes of a folder that `datasets make` rendered
+MAX_LINES = 20  # per kind of fault
 DatasetT = TypeVar("DatasetT")
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 Answer = TypeVar("Answer")
 
 
 class NoOptions(BaseModel):
-    """A dataset without settings: its files say everything."""
+    """A dataset without options: its files define everything."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -45,15 +45,15 @@ def read_marker(folder: Path) -> dict[str, str]:
         return {str(scene): str(key) for scene, key in scenes.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(
-            f"{path}: not the marker that `su3d-bench datasets make` writes ({error}); delete it if the scenes were "
-            "not made by it, otherwise make them again"
+            f"{path}: not a marker of `su3d-bench datasets make` ({error}); delete it if the scenes were "
+            "created otherwise, or create them again"
         ) from error
 
 
 def folders_in(root: Path, names: Iterable[str]) -> Iterator[tuple[Path, list[Path]]]:
-    """Each folder of these names below ``root`` that can be read, and its sub-folders in the order of their names.
+    """Each readable folder of these names below ``root``, and its sub-folders in alphabetical order.
 
-    One that two names lead to comes once: by a link, or on a file system that takes scannet and ScanNet for one.
+    A folder reached by two names counts once (links, or a case-insensitive file system with scannet and ScanNet).
     """
     seen = set[tuple[int, int]]()
     for place in (root / name for name in names):
@@ -69,7 +69,7 @@ def folders_in(root: Path, names: Iterable[str]) -> Iterator[tuple[Path, list[Pa
 
 @dataclass(frozen=True)
 class SceneTree:
-    """``places``: the folders with scenes; ``folders`` of each, the first place first; ``made``: those that
+    """``places``: the folders with scenes; ``folders`` of each scene, first place first; ``made``: those that
     ``datasets make`` rendered."""
 
     root: Path
@@ -81,7 +81,7 @@ class SceneTree:
 def find_scenes(
     root: Path, names: Iterable[str], is_scene: Callable[[Path], bool], first: Sequence[str] = ()
 ) -> SceneTree:
-    """The scenes in folders of these names below ``root``, those of ``first`` before all others; none is no error."""
+    """The scenes in folders of these names below ``root``, those of ``first`` before all others; may be empty."""
     folders: dict[str, tuple[Path, ...]] = {}
     places, made = [], set[str]()
     for place, children in folders_in(root, names):
@@ -97,7 +97,7 @@ def find_scenes(
 
 
 def keeps_last(method: Callable[[DatasetT, str], Answer]) -> Callable[[DatasetT, str], Answer]:
-    """A method of a scene that keeps its last answer, because each step asks for it again."""
+    """A per-scene method that caches its last answer, because each step asks for it again."""
     name = f"_last{method.__name__}"
 
     @wraps(method)
@@ -111,7 +111,7 @@ def keeps_last(method: Callable[[DatasetT, str], Answer]) -> Callable[[DatasetT,
 
 
 def faults_of(questions: Iterable[Callable[[], object]]) -> Iterator[str]:
-    """The line of each question that fails, each line once; ground truth that is missing is no fault."""
+    """The messages of the checks that fail, without repeats; missing ground truth is not a fault."""
     seen = set[str]()
     for ask in questions:
         try:
@@ -125,7 +125,7 @@ def faults_of(questions: Iterable[Callable[[], object]]) -> Iterator[str]:
 
 
 def shortened(lines: Iterable[str], where: str) -> Iterator[str]:
-    """The first lines on faults of one kind, and how many more there are."""
+    """The first lines on faults of one kind, and the number of further ones."""
     found = list(lines)
     yield from found[:MAX_LINES]
     if len(found) > MAX_LINES:
@@ -135,10 +135,10 @@ def shortened(lines: Iterable[str], where: str) -> Iterator[str]:
 class FileDataset(ABC, Generic[OptionsT]):
     """A dataset that is read from files below a data root.
 
-    ``reader_version`` is raised whenever the same files come out as other frames or another ground truth.
-    ``places_of_scenes`` are folders below the data root in which scenes may lie, the usual first. ``how_to_get`` says,
-    after "no scene in ROOT", where they are expected and come from. ``labels_of`` is what OpenLex3D calls the dataset,
-    if it labels it. ``no_mesh`` says why there is no annotated mesh.
+    ``reader_version`` is raised whenever the same files yield different frames or ground truth.
+    ``places_of_scenes``: folders below the data root that may contain scenes, the usual first. ``how_to_get`` states,
+    after "no scene in ROOT", where scenes are expected and come from. ``labels_of``: OpenLex3D's name of the dataset,
+    if labelled. ``no_mesh``: why there is no annotated mesh.
     """
 
     name: str
@@ -156,22 +156,22 @@ class FileDataset(ABC, Generic[OptionsT]):
         self._warned_of: set[str] = set()
 
     def warn_once(self, scene: str, line: str | None) -> None:
-        """Log a line on the scene, if there is one, and only the first time."""
+        """Log a line on the scene, if any, only once."""
         if line and scene not in self._warned_of:
             self._warned_of.add(scene)
             logger.warning("%s", line)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether a folder in one of the places is a scene; of use to ``find_tree`` alone."""
+        """Whether a folder in one of the places is a scene; used by ``find_tree`` only."""
         raise AssertionError(f"{type(self).__name__} defines neither is_scene nor find_tree")
 
     def find_tree(self) -> SceneTree:
-        """Where the scenes are; none is no error here."""
+        """Locate the scenes; there may be none."""
         return find_scenes(self.root, self.places_of_scenes, self.is_scene)
 
     @cached_property
     def tree(self) -> SceneTree:
-        """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
+        """The location of the scenes; a ``ScenesMissing`` that states how to get data if there are none."""
         tree = self.find_tree()
         if not tree.folders:
             raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
@@ -181,7 +181,7 @@ class FileDataset(ABC, Generic[OptionsT]):
         return tuple(self.tree.folders)
 
     def places(self) -> Sequence[Path]:
-        """Where scenes are, or else would be looked for first."""
+        """Where scenes are, or where they are looked for first."""
         return self.find_tree().places or [self.root / name for name in self.places_of_scenes[:2]]
 
     def info(self, scene: str, stride: int) -> SceneInfo:
@@ -189,7 +189,7 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     @abstractmethod
     def n_frames(self, scene: str, stride: int) -> int:
-        """How many frames ``frames`` would give, from a cheap look."""
+        """The number of frames that ``frames`` would return, from a cheap look."""
 
     def image_domain(self, scene: str) -> ImageDomain:
         return "rendered-rooms" if scene in self.tree.made else "camera"
@@ -200,18 +200,18 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     @abstractmethod
     def recording_key(self, scene: str) -> str:
-        """A key of the recording: its poses and cameras, the sizes of all files, the first and last images."""
+        """A key of the recording: poses, cameras, sizes of all files, the first and last images."""
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
-        """What is read of the scene beside its recording, as far as it is there."""
+        """The files read besides the recording, if available."""
         return ()
 
     def files(self, scene: str) -> Sequence[Path]:
         return (*self.recording_files(scene), *self.small_files(scene))
 
     def digest(self, scene: str) -> str:
-        """A key of ``recording_key`` and of the content of what else is read: what is changed in the middle of a
-        recording and keeps its size goes unseen."""
+        """A key of ``recording_key`` and of the content of the other files; a changed image in the middle of the
+        recording is not detected if its size is unchanged."""
         words = self.name, self.reader_version, scene, self.image_domain(scene), self.options.model_dump_json()
         total = hashlib.sha256(" ".join(str(word) for word in words).encode())
         total.update(self.recording_key(scene).encode())
@@ -239,11 +239,11 @@ class FileDataset(ABC, Generic[OptionsT]):
         raise GroundTruthMissing(f"{self.where(scene)}: no annotated mesh; {self.no_mesh}")
 
     def where(self, scene: str) -> str:
-        """How messages begin."""
+        """Prefix of messages."""
         return f"{self.name}/{scene}"
 
     def folder(self, scene: str) -> Path:
-        """The folder of a scene; a ``DataError`` where there is none."""
+        """The folder of a scene; a ``DataError`` if there is none."""
         if scene not in self.tree.folders:
             hint = suggest(scene, list(self.tree.folders), f"{self.tree.places[0]} has")
             raise DataError(f"{self.name}: no scene '{scene}'{hint}")
@@ -251,7 +251,7 @@ class FileDataset(ABC, Generic[OptionsT]):
 
 
 class RecordedDataset(FileDataset[OptionsT]):
-    """A dataset whose frames have one size and are read from one colour and one depth file each."""
+    """A dataset whose frames have one size and are each read from one colour and one depth file."""
 
     @abstractmethod
     def recording(self, scene: str) -> Recording: ...
@@ -269,12 +269,12 @@ class RecordedDataset(FileDataset[OptionsT]):
         return self.recording(scene).digest()
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What is missing of the recording, a line for each kind; the frames go on without it."""
+        """What the recording lacks, one line per kind; frames are usable without it."""
         yield from self.recording(scene).missing
 
 
 def sizes_and_ends(files: Sequence[Path], n_ends: int, digest: Callable[[Path], Any] = digest_file) -> str:
-    """The names and sizes of files, and the content of the first and last ``n_ends``."""
+    """A key of the names and sizes of files, and the content of the first and last ``n_ends``."""
     lines = [f"{path.parent.name}/{path.name} {path.stat().st_size}" for path in files]
     ends = dict.fromkeys((*files[:n_ends], *files[-n_ends:]))
     return "\n".join([*lines, *(f"{path.name} {digest(path)}" for path in ends)])

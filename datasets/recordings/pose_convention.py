@@ -1,11 +1,11 @@
-"""Whether poses and depth images are meant as they are read: depth of one frame, seen from another, must agree.
+"""Check of pose and depth conventions: depth of one frame, seen from another, must agree.
 
-And which axis of the world points up, from the cameras and level surfaces.
+It also finds which axis of the world points up, from the cameras and level surfaces.
 
-Wrong poses that are rigid motions look right to every other check, and a map made with them is only bad. The points of
-one frame are projected into another under the reading at hand and under the usual mistakes: the inverse motion, the
-other camera axes, both, and another unit of depth. Where a mistake agrees clearly better, the reading is wrong; where
-the reading at hand is not clearly better than the inverse, nobody can tell from the frames.
+Wrong poses that are rigid motions pass every other check and only make the map bad. The points of
+one frame are projected into another under the current reading and under common mistakes: the inverse motion, the
+other camera axes, both, and another unit of depth. If a mistake agrees clearly better, the reading is wrong; if
+the current reading is not clearly better than the inverse, the frames cannot decide.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from su3d_bench.core.interfaces import Dataset, HasReadingCorrections
 from su3d_bench.core.types import Float64Array, Frame, UpAxis, WorldUp
 
 N_ANCHORS = 4
-GAPS = (1, 3, 9, 27)  # frames between the two of a pair: fast and slow cameras, and strides, both find one that tells
-N_COLUMNS = 80  # of the grid of pixels looked at: 4,800 of a 640x480 image
+GAPS = (1, 3, 9, 27)  # frame distances of pairs: suits fast and slow cameras, and strides
+N_COLUMNS = 80  # of the pixel grid: 4,800 pixels of a 640x480 image
 TOLERANCE = 0.02  # of the depth; a Kinect's noise is 1.4 % of it at 5 m (Khoshelham and Elberink 2012)
-MIN_LANDED = 0.3  # a reading is trusted where this share of the points comes to lie on a pixel with depth
+MIN_LANDED = 0.3  # a reading is trusted if this share of the points lands on pixels with depth
 MIN_SHARE = 0.6  # ... and agrees with this share of those
-MIN_GAIN = 0.2  # ... which is so much more than the reading at hand has
-MIN_WON = 0.75  # of the pairs that tell two readings apart
+MIN_GAIN = 0.2  # ... by this much more than the current reading
+MIN_WON = 0.75  # of the pairs that distinguish two readings
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes to OpenGL's, and back
-# Between the units m, mm, 0.1 mm and TUM's 0.2 mm; 8: values whose bits were rotated by three, as SUN RGB-D does it.
+# Between the units m, mm, 0.1 mm and TUM's 0.2 mm; 8: values with bits rotated by three, as in SUN RGB-D.
 ROTATED = 0.125
 DEPTH_FACTORS = (0.001, 0.1, ROTATED, 0.2, 5.0, 8.0, 10.0, 1000.0)
 Motion = Literal["as read", "inverse", "other axes", "inverse and other axes"]
@@ -44,7 +44,7 @@ READINGS: tuple[tuple[Motion, float], ...] = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Another reading that agrees better: how it differs, and the mean shares of both on the pairs that tell."""
+    """Another reading that agrees better: how it differs, and mean shares of both on the deciding pairs."""
 
     motion: Motion
     depth_factor: float
@@ -61,8 +61,8 @@ class Finding:
     def changes(self, camera_axes: str = "opencv") -> tuple[str, ...]:
         """Which of ``pose_direction`` and ``camera_axes`` to change in a description with these ``camera_axes``.
 
-        A reading is told by the motion between two frames. The inverse of a pose that had its axes changed moves as
-        the pose with its direction and axes changed.
+        A reading is identified by the motion between two frames. The inverse of a pose with changed axes moves like
+        the pose with changed direction and axes.
         """
         direction, axes = "pose_direction", "camera_axes"
         of_motion: Mapping[Motion, tuple[str, ...]] = {
@@ -76,17 +76,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be said of how poses and depth are read: ``is_wrong`` where another reading agrees clearly better,
-    else the reading is only not confirmed."""
+    """A finding on the reading of poses and depth: ``is_wrong`` if another reading agrees clearly better,
+    otherwise the reading is only unconfirmed."""
 
     is_wrong: bool
     line: str
 
 
 def judge_scene(dataset: Dataset, scene: str, frames: Sequence[Frame] | None = None) -> Verdict | None:
-    """The verdict on a scene in the words of its dataset; None where the reading is right, or none is asked for.
+    """The verdict on a scene, worded for its dataset; None if the reading is right or not to be checked.
 
-    ``frames`` are those at full rate where they are at hand; some twenty of them are read.
+    ``frames`` are at full rate if available; about twenty of them are read.
     """
     if isinstance(dataset, HasReadingCorrections) and not dataset.is_reading_checked(scene):
         return None
@@ -113,33 +113,33 @@ def _in_words(finding: Finding) -> str:
 
 
 def _uncertainty(shares: Float64Array) -> str | None:
-    """Why the frames do not confirm that the poses are no inverses, which is the usual mistake; None where they do."""
+    """Why the frames cannot rule out inverted poses (the usual mistake); None if they can."""
     as_read, inverse = shares[:, 0], shares[:, READINGS.index(("inverse", 1.0))]
     if not len(shares) or max(as_read.max(), inverse.max()) < MIN_SHARE:
-        best = f", at most {as_read.max():.0%} of what one sees" if len(shares) else ""
-        return f"poses and depth could not be checked: no two of the frames looked at see the same{best}"
+        best = f", at most {as_read.max():.0%} of what one frame shows" if len(shares) else ""
+        return f"poses and depth could not be checked: no two of the examined frames overlap{best}"
     tells = np.abs(as_read - inverse) >= MIN_GAIN
     n_confirm = int((tells & (as_read > inverse) & (as_read >= MIN_SHARE)).sum())
     if n_confirm and n_confirm >= MIN_WON * tells.sum():
         return None
     if not tells.any():
-        return "the frames do not tell the poses from their inverses: the camera hardly moves between those looked at"
+        return "the frames cannot distinguish the poses from their inverses: the camera hardly moves between them"
     return (
         f"poses and depth may contradict each other: only {n_confirm} of {int(tells.sum())} pairs of frames agree "
-        f"better as the poses are read than with their inverses; look at su3d-bench datasets show"
+        f"better with the poses than with their inverses; check with: su3d-bench datasets show"
     )
 
 
 def judge_convention(frames: Sequence[Frame]) -> Finding | None:
-    """The best of the other readings, if it wins nearly every pair that tells it from the reading at hand.
+    """The best other reading, if it wins nearly every pair that distinguishes it from the current one.
 
-    Frames without motion between them tell nothing, nor does one frame.
+    Frames without motion between them, or a single frame, decide nothing.
     """
     return _best_other(_shares(frames))
 
 
 def _shares(frames: Sequence[Frame]) -> Float64Array:
-    """For each pair of frames (rows) and reading (columns) the share of the points that agree."""
+    """The share of points that agree, for each pair of frames (rows) and reading (columns)."""
     cache: dict[int, Frame] = {}
     table = []
     for first, second in _pairs(len(frames)):
@@ -166,7 +166,7 @@ def _best_other(shares: Float64Array) -> Finding | None:
 
 
 def _pairs(n: int) -> list[tuple[int, int]]:
-    """Pairs of positions in ``n`` frames, spread over the recording, both directions of time."""
+    """Pairs of positions in ``n`` frames, spread over the recording, in both directions of time."""
     anchors = sorted({round(part * (n - 1) / (N_ANCHORS - 1)) for part in range(N_ANCHORS)}) if n else []
     pairs = {
         (anchor, other)
@@ -178,7 +178,7 @@ def _pairs(n: int) -> list[tuple[int, int]]:
 
 
 class _Points:
-    """Points of one frame on a grid of pixels, in its camera."""
+    """Points of one frame on a pixel grid, in camera coordinates."""
 
     def __init__(self, frame: Frame) -> None:
         step = max(1, frame.depth_m.shape[1] // N_COLUMNS)
@@ -193,7 +193,7 @@ class _Points:
         self._pose = frame.camera_to_world
 
     def share_in(self, other: Frame, motion: Motion, depth_factor: float) -> float:
-        """The share of the points that land on a pixel with depth in ``other`` and agree; few landings count as 0."""
+        """The share of points that land on a pixel with depth in ``other`` and agree; 0 if few land."""
         to_other = _motion(self._pose, other.camera_to_world, motion)
         x, y, z = to_other[:3, :3] @ (self._points * depth_factor) + to_other[:3, 3:]
         fx, fy, cx, cy = other.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
@@ -212,7 +212,7 @@ class _Points:
 
 
 def _motion(first: Float64Array, second: Float64Array, motion: Motion) -> Float64Array:
-    """The map (4, 4) from the camera of the first pose into that of the second, under a reading of both."""
+    """The transform (4, 4) from the first pose's camera to the second's, under a reading of both."""
     if motion.startswith("inverse"):
         first, second = (np.asarray(np.linalg.inv(pose), np.float64) for pose in (first, second))
     if motion.endswith("other axes"):
@@ -222,39 +222,39 @@ def _motion(first: Float64Array, second: Float64Array, motion: Motion) -> Float6
 
 AXES: tuple[UpAxis, ...] = ("x", "y", "z", "-x", "-y", "-z")
 DIRECTIONS = np.concatenate([np.eye(3), -np.eye(3)])
-MAYBE, UPRIGHT = 0.5, 0.8  # of a metre up the images how much of it is along an axis: 60 and 37 degrees off it
-LEVEL = np.cos(np.radians(15))  # of a surface's normal along up: the noise of a depth camera over half a hand's width
-MIN_LEVEL, MORE_LEVEL = 0.05, 2.0  # share of the surfaces that must lie level, and so many times those of the next
+MAYBE, UPRIGHT = 0.5, 0.8  # mean component of the image's up direction along an axis: 60 and 37 degrees off
+LEVEL = np.cos(np.radians(15))  # cosine of surface normal and up: allows for depth noise over a few centimetres
+MIN_LEVEL, MORE_LEVEL = 0.05, 2.0  # minimum share of level surfaces, and minimum ratio to the next axis
 N_FRAMES = 6
-N_DRAWN_COLUMNS, REACH = 80, 2  # of the grid of pixels looked at; a normal is that of neighbours so many columns away
-SMOOTH = 0.1  # of the depth; neighbours farther apart are of two things
+N_DRAWN_COLUMNS, REACH = 80, 2  # of the pixel grid; normals use neighbours this many columns away
+SMOOTH = 0.1  # of the depth; neighbours farther apart belong to different surfaces
 
 
 def guess_up(poses: Float64Array, frames: Sequence[Frame]) -> WorldUp:
-    """The axis that ``poses`` (n, 4, 4), and where they leave a choice some of ``frames``, show to point up."""
+    """The axis that points up according to ``poses`` (n, 4, 4) and, if these are ambiguous, to some ``frames``."""
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     if not len(poses):
         return WorldUp(None, False, "no frame has a pose")
     along = DIRECTIONS @ -poses[:, :3, 1].mean(axis=0)
     candidates = np.flatnonzero(along >= MAYBE)
     if not len(candidates):
-        return WorldUp(None, False, "the cameras were held in no one way")
+        return WorldUp(None, False, "the camera orientation varies too much")
     if len(candidates) > 1 or along[candidates[0]] < UPRIGHT:
         level = _shares_level(frames)[candidates]
         best, *others = np.sort(level)[::-1]
         if best < MIN_LEVEL or any(best < MORE_LEVEL * other for other in others):
-            return WorldUp(None, False, "the cameras were held aslant and no axis has clearly more level surfaces")
-        return WorldUp(AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of what the frames see lies level so")
-    return WorldUp(AXES[candidates[0]], False, "the cameras were held so")
+            return WorldUp(None, False, "the cameras were tilted and no axis has clearly more level surfaces")
+        return WorldUp(AXES[candidates[int(level.argmax())]], False, f"{best:.0%} of the surfaces are normal to it")
+    return WorldUp(AXES[candidates[0]], False, "by camera orientation")
 
 
 def _shares_level(frames: Sequence[Frame]) -> Float64Array:
-    """For each of ``AXES`` the share of the surfaces seen whose outer normal is along it."""
+    """For each of ``AXES`` the share of visible surfaces whose outward normal is along it."""
     counts, n = np.zeros(len(AXES)), 0
     for position in sorted({int(place) for place in np.linspace(0, len(frames) - 1, min(len(frames), N_FRAMES))}):
         try:
             normals = _normals(frames[position])
-        except DataError:  # whoever needs the frame says what is wrong with it
+        except DataError:  # reported by the code that needs the frame
             continue
         counts += (normals @ DIRECTIONS.T >= LEVEL).sum(axis=0)
         n += len(normals)
@@ -262,7 +262,7 @@ def _shares_level(frames: Sequence[Frame]) -> Float64Array:
 
 
 def _normals(frame: Frame) -> Float64Array:
-    """Unit normals (n, 3) in the world, towards the camera, of smooth places on a grid of pixels."""
+    """Unit normals (n, 3) in the world, towards the camera, at smooth places of a pixel grid."""
     step = max(1, frame.depth_m.shape[1] // N_DRAWN_COLUMNS)
     z = frame.depth_m[::step, ::step].astype(np.float64)
     fx, fy, cx, cy = frame.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]

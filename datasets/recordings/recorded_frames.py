@@ -1,5 +1,5 @@
-"""What readers of loose recordings share: text files of bounded size, paths that stay in their folder, rigid poses, and
-frames that are read from one colour and one depth file each.
+"""Shared by readers of loose recordings: size-limited text files, confined paths, rigid poses, and frames
+that are each read from one colour and one depth file.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes
 
-MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
+MAX_NAME_LENGTH = 255  # of a path component, in all current file systems
 N_DEPTH_VALUES = 1 << 16
 LARGEST_DEPTH_VALUE = N_DEPTH_VALUES - 1
-# How much of the range below the largest value must be empty: in millimetres 6.6 m, in Replica's unit 1 m.
+# Required empty range below the largest value: 6.6 m in millimetres, 1 m in Replica's unit.
 STANDS_APART = 0.1
 logger = logging.getLogger(__name__)
 
 
 @contextmanager
 def reading(where: str) -> Iterator[None]:
-    """A file that cannot be read in the block is a ``DataError``."""
+    """Turn failures to read a file in the block into ``DataError``."""
     try:
         yield
     except OSError as error:
@@ -39,16 +39,16 @@ def reading(where: str) -> Iterator[None]:
 
 
 def depth_m_of_values(units_per_metre: float) -> Float32Array:
-    """Metres (65536,) of every value that a depth image can hold."""
+    """Metres (65536,) of every possible value of a depth image."""
     return (np.arange(N_DEPTH_VALUES) / units_per_metre).astype(np.float32)
 
 
 class StoredDepth:
-    """Metres of depth images as files hold them; 65535 is no depth where it stands apart from all others of the image.
+    """Depth images in metres; 65535 counts as no depth if it is far from all other values of the image.
 
-    So 7-Scenes and many other recorders write "nothing"; in an image whose depths come near it, it is one of them.
-    ``metres`` (65536,) float32 are those of every value, 0 where it means none. Unless ``is_quiet``, what is taken out
-    is said once, in words that are the same whichever image is read first.
+    7-Scenes and many other recorders write "no depth" this way; if depths come near it, it is a real depth.
+    ``metres`` (65536,) float32 map every value, 0 if it means no depth. Unless ``is_quiet``, dropped depth is
+    logged once, with the same text whichever image is read first.
     """
 
     def __init__(self, where: str, metres: Float32Array, *, is_quiet: bool = False) -> None:
@@ -58,8 +58,8 @@ class StoredDepth:
         self._saying = Lock()  # frames are read by several threads
 
     def depth_m(self, values: UInt16Array) -> Float32Array:
-        """Depth (H, W) m of an image with these ``values``, 0 where it has none."""
-        depth_m = self._metres.take(values)  # half the time of an index
+        """Depth (H, W) m of an image with these ``values``, 0 for no depth."""
+        depth_m = self._metres.take(values)  # twice as fast as indexing
         far_m = float(self._metres[LARGEST_DEPTH_VALUE])
         if far_m > 0 and values.max() == LARGEST_DEPTH_VALUE:
             is_largest = values == LARGEST_DEPTH_VALUE
@@ -74,22 +74,22 @@ class StoredDepth:
             was_said, self._is_said = self._is_said, True
         if not was_said:
             apart = f"depth {LARGEST_DEPTH_VALUE} ({far_m:.4g} m) counts as no depth"
-            logger.warning("%s: %s where it stands apart from all other depths of its image", self._where, apart)
+            logger.warning("%s: %s if it is far from all other depths of its image", self._where, apart)
 
 
 def numbers(words: Sequence[str], where: str) -> list[float]:
-    """The words as numbers, finite or not."""
+    """The words as numbers, which may be non-finite."""
     values = []
     for word in words:
         try:
             values.append(float(word))
         except ValueError:
-            raise DataError(f"{where}: {word[:20]!r} is no number") from None
+            raise DataError(f"{where}: {word[:20]!r} is not a number") from None
     return values
 
 
 def square(words: Sequence[str], where: str, sides: Sequence[int] = (4,)) -> Float64Array:
-    """The words as the numbers of a square matrix, row by row."""
+    """The words as a square matrix, row by row."""
     for side in sides:
         if len(words) == side * side:
             return np.array(numbers(words, where)).reshape(side, side)
@@ -98,7 +98,7 @@ def square(words: Sequence[str], where: str, sides: Sequence[int] = (4,)) -> Flo
 
 
 class Folder:
-    """A folder whose files are named by other files: a name that leads out of it is a ``DataError``."""
+    """A folder whose files are named by other files; a name that points outside is a ``DataError``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -106,10 +106,10 @@ class Folder:
         self._is_inside: dict[Path, bool] = {}
 
     def file(self, name: str, where: str) -> Path:
-        """The path of ``name``, which may be missing; parts that are symbolic links must end inside, too."""
+        """The path of ``name``, which may be missing; symbolic links in it must end inside the folder too."""
         parts = PurePosixPath(name).parts
         if not name.isprintable() or not parts or max(map(len, parts)) > MAX_NAME_LENGTH:
-            raise DataError(f"{where}: {name[:40]!r} is no file name")
+            raise DataError(f"{where}: {name[:40]!r} is not a file name")
         path = self.path / name
         if ".." in parts or name.startswith("/") or not self._leads_inside(path):
             raise DataError(f"{where}: {name[:80]!r} leads out of the folder; name files inside it")
@@ -121,13 +121,13 @@ class Folder:
             if parent not in self._is_inside:
                 self._is_inside[parent] = parent.resolve().is_relative_to(self._resolved)
             return self._is_inside[parent] and (not path.is_symlink() or path.resolve().is_relative_to(self._resolved))
-        except (OSError, RuntimeError):  # a name too long for the file system, or links in a circle
+        except (OSError, RuntimeError):  # name too long, or circular links
             return False
 
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """Where a frame comes from: names of its colour and depth file below the folder, camera-to-world pose (4, 4)."""
+    """Source of a frame: names of its colour and depth file in the folder, camera-to-world pose (4, 4)."""
 
     index: int
     timestamp_s: float
@@ -138,10 +138,10 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """The usable frames of a scene; ``metres`` (65536,) are those of every value of a depth image, 0 for no depth.
+    """The usable frames of a scene; ``metres`` (65536,) map every depth value, 0 for no depth.
 
-    ``files`` are all that it is read from besides the images; ``image_size`` is what its camera file says, if it does;
-    ``missing`` says, a line for each reason, what was left out because something of it is not there.
+    ``files``: all files read besides the images; ``image_size``: from the camera file, if stated there;
+    ``missing``: one line per reason why frames were excluded.
     """
 
     where: str
@@ -157,8 +157,8 @@ class Recording:
         return [self.folder.path / name for frame in self.frames for name in (frame.colour, frame.depth)]
 
     def digest(self) -> str:
-        """A key of the content of ``files``, all images' names and sizes, and the content of the first and
-        the last frame: an image in the middle that was changed and kept its size goes unseen."""
+        """A key of the content of ``files``, the names and sizes of all images, and the content of the first and
+        last frame; a changed image in the middle is not detected if its size is unchanged."""
         total = hashlib.sha256()
         images = self.images()
         with reading(self.where):
@@ -170,9 +170,9 @@ class Recording:
 
 
 class RecordedFrames(Sequence[Frame]):
-    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``.
+    """Every ``stride``-th usable frame, read on access; a file that cannot be used is a ``DataError``.
 
-    ``is_quiet``: nothing is said of depth that counts as none, for the frames are read for themselves too.
+    ``is_quiet``: do not log depth that counts as none, because the frames are read elsewhere too.
     """
 
     advice = "copy the recording again"
@@ -194,11 +194,11 @@ class RecordedFrames(Sequence[Frame]):
         return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
 
     def check_size(self, width: int, height: int, where: str) -> None:
-        """A ``DataError`` where a colour image of this size is not of the recording's camera."""
+        """Raise ``DataError`` if a colour image of this size does not fit the recording's camera."""
         expected, (cx, cy) = self._recording.image_size, self._recording.intrinsics[:2, 2]
         if expected is not None and expected != (width, height):
             raise DataError(
-                f"{where} is {width}x{height}, the camera file says {expected[0]}x{expected[1]}; intrinsics belong to "
+                f"{where} is {width}x{height}, the camera file has {expected[0]}x{expected[1]}; intrinsics belong to "
                 "one image size"
             )
         if not (0 <= cx <= width and 0 <= cy <= height):
@@ -208,7 +208,7 @@ class RecordedFrames(Sequence[Frame]):
             )
 
     def check_depth(self, values: UInt16Array, where: str) -> None:
-        """A ``DataError`` where a depth image cannot be right."""
+        """Raise ``DataError`` if a depth image cannot be right."""
 
     def _depth_values(self, frame: RecordedFrame, rgb: UInt8Array) -> UInt16Array:
         where, content = self._read(frame.depth)
@@ -227,7 +227,7 @@ class RecordedFrames(Sequence[Frame]):
 
 
 def colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
-    """The image averaged to the width and height ``size``."""
+    """The image resized to ``size`` (width, height) by averaging."""
     import cv2
 
     is_same = colour.shape[1::-1] == size
@@ -235,7 +235,7 @@ def colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
 
 
 def nearest_at(image: NDArray[Any], size: Size) -> NDArray[Any]:
-    """The image at the width and height ``size``, each pixel the nearest one of the original."""
+    """The image resized to ``size`` (width, height) by nearest neighbour."""
     import cv2
 
     is_same = image.shape[1::-1] == size
@@ -243,17 +243,17 @@ def nearest_at(image: NDArray[Any], size: Size) -> NDArray[Any]:
 
 
 def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> list[str]:
-    """The line, if any, that says how many were left out and the first; logged where frames are used without them."""
+    """The line (if any) with the number excluded and the first; logged when frames are used without them."""
     if not names:
         return []
-    line = f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+    line = f"{where}: {len(names)} {what} (the first: {names[0][:80]}); excluded, {n_used} frames are used"
     if n_used:
         logger.warning("%s", line)
     return [line]
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float, where: str) -> Float64Array:
-    """Intrinsics (3, 3); numbers that no camera has are a ``DataError``."""
+    """Intrinsics (3, 3); impossible values are a ``DataError``."""
     values = (fx, fy, cx, cy)
     # 1e6 pixels: beyond any lens on an image of MAX_PIXELS
     if not all(np.isfinite(value) and abs(value) < 1e6 for value in values) or min(fx, fy) <= 0:

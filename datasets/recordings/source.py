@@ -1,7 +1,7 @@
-"""A recording of a colour and a depth camera as the device left it: two image sizes, raw depth, poses that may be lost.
+"""A recording of a colour and a depth camera as the device stored it: two image sizes, raw depth, poses possibly lost.
 
-Every way in which ScanNet's recordings are stored is read through ``RgbdSource``; what becomes of it (which frames are
-used, in which of the two cameras) is the matter of the dataset.
+All storage forms of ScanNet's recordings are read as ``RgbdSource``; the dataset decides which frames are
+used and in which of the two cameras.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from su3d_bench.formats.arrays import read_text
 class SensorPair:
     """The two cameras of a recording.
 
-    Intrinsics (3, 3) in pixels of their own image; extrinsics (4, 4): the depth one maps points of the depth camera
-    into the colour camera, the colour one is the identity in practice. Metres are depth values / ``depth_shift``.
-    ``where`` begins the message of what does not fit.
+    Intrinsics (3, 3) in pixels of their own image; extrinsics (4, 4): that of depth maps points of the depth camera
+    into the colour camera, that of colour is the identity in practice. Metres are depth values / ``depth_shift``.
+    ``where`` begins the message on inconsistent values.
     """
 
     colour_size: images.Size
@@ -57,61 +57,61 @@ class SensorPair:
         for name, matrix in (("colour", self.colour_extrinsic), ("depth", self.depth_extrinsic)):
             assert matrix.shape == (4, 4), matrix.shape
             if not np.isfinite(matrix).all():
-                raise DataError(f"{where}: the {name} extrinsic holds a number that is not finite; expected a 4x4 pose")
+                raise DataError(f"{where}: the {name} extrinsic has a non-finite value; expected a 4x4 pose")
         if not (np.isfinite(self.depth_shift) and self.depth_shift > 0):
             raise DataError(f"{where}: the depth shift is {self.depth_shift:g}; expected units per metre, above 0")
 
 
 class RgbdSource(Protocol):
-    """The frame records of one recording in order, those without a usable pose among them; images are read when asked.
+    """The frame records of a recording in order, including those without a usable pose; images are read on access.
 
     ``where`` (``<dataset>/<scene>``) begins each message; a fault in any file is a ``DataError``.
     """
 
     where: str
     camera: SensorPair
-    numbers: Int64Array  # of the records at full rate; exports that left frames out keep their numbers
+    numbers: Int64Array  # of the records at full rate; kept by exports that skip frames
 
     def __len__(self) -> int: ...
 
     def poses(self) -> Float64Array:
-        """Camera-to-world matrices (n, 4, 4) as stored, of the depth camera; not finite where tracking was lost."""
+        """Camera-to-world matrices (n, 4, 4) as stored, of the depth camera; non-finite if tracking was lost."""
         ...
 
     def timestamp_s(self, i: int) -> float:
-        """When record ``i`` was taken; at 30 frames a second where the recording has no times that increase."""
+        """Time of record ``i``; assumes 30 frames per second if the recording has no increasing times."""
         ...
 
     def colour(self, i: int) -> UInt8Array:
-        """Image (H, W, 3) RGB in the colour size of ``camera``."""
+        """Image (H, W, 3) RGB at the colour size of ``camera``."""
         ...
 
     def depth(self, i: int) -> images.UInt16Array:
-        """Values (H, W) as stored, 0 where invalid, in the depth size of ``camera``."""
+        """Values (H, W) as stored, 0 if invalid, at the depth size of ``camera``."""
         ...
 
     def files(self) -> Sequence[Path]:
-        """The files that the recording consists of."""
+        """The files of the recording."""
         ...
 
 
 Grid = Literal["depth", "colour"]
-SAME_RAY_PX = 0.01  # two images whose pixels differ by less in their rays are taken as one; text files keep six digits
+SAME_RAY_PX = 0.01  # images whose rays differ by less count as aligned; text files keep six digits
 IDENTITY_TOLERANCE = 1e-6
-MAX_INTRINSIC = 1e6  # pixels; no lens comes near it, and nothing computed from it overflows
+MAX_INTRINSIC = 1e6  # pixels; beyond any lens, and safe from overflow
 
 
 @dataclass(frozen=True)
 class Registration:
-    """From a pair of cameras to images of one size, those of the ``grid`` camera.
+    """Registers a pair of cameras: both images in the size of the ``grid`` camera.
 
-    ``depth``, the default: depth stays as it is to the bit, each of its pixels gets the colour, bilinearly, at which
-    its point is seen by the colour camera. A pixel without depth borrows that of the nearest one that has some. A point
-    beside the colour image or behind its camera gets the nearest colour on the border. What the colour camera cannot
-    see because something stands before it gets the colour of what stands there.
+    ``depth``, the default: depth is unchanged; each of its pixels gets the colour (bilinear) at which
+    its point is seen by the colour camera. A pixel without depth uses the nearest depth. A point
+    outside the colour image or behind its camera gets the nearest border colour. A point that is occluded for the
+    colour camera gets the colour of the occluder.
 
-    ``colour``: colour stays as it is to the bit; depth is that of the points seen by the colour camera, each at the
-    pixel nearest to it, the nearest point where several fall on one. Other pixels have no depth: where the colour image
+    ``colour``: colour is unchanged; depth is that of the points seen by the colour camera, each at its nearest
+    pixel, the nearest point if several fall on one. Other pixels have no depth: if the colour image
     is larger, most of them.
     """
 
@@ -120,8 +120,8 @@ class Registration:
 
     @cached_property
     def depth_to_colour(self) -> Float64Array:
-        """Points of the depth camera in the colour camera (4, 4)."""
-        # The colour extrinsic is the identity in all of ScanNet; else both lead into one common frame.
+        """Transform (4, 4) from the depth camera to the colour camera."""
+        # The colour extrinsic is the identity in all of ScanNet; otherwise both map to a common frame.
         matrix: Float64Array = np.linalg.solve(self.camera.colour_extrinsic, self.camera.depth_extrinsic).astype(
             np.float64
         )
@@ -129,12 +129,12 @@ class Registration:
 
     @property
     def intrinsics(self) -> Float64Array:
-        """Of the registered images (3, 3)."""
+        """Intrinsics (3, 3) of the registered images."""
         return self.camera.depth_intrinsics if self.grid == "depth" else self.camera.colour_intrinsics
 
     @cached_property
     def is_identity(self) -> bool:
-        """Whether both images have one size and each pixel of one the same ray as in the other."""
+        """Whether both images have the same size and each pixel the same ray."""
         if self.camera.colour_size != self.camera.depth_size:
             return False
         if np.abs(self.depth_to_colour - np.eye(4)).max() > IDENTITY_TOLERANCE:
@@ -146,7 +146,7 @@ class Registration:
 
     @cached_property
     def _from_pose(self) -> Float64Array | None:
-        """What a pose of the depth camera is multiplied with; None where poses stay as they are."""
+        """What a pose of the depth camera is multiplied by; None if poses are unchanged."""
         if self.grid == "depth" or self.is_identity:
             return None
         return np.linalg.inv(self.depth_to_colour).astype(np.float64)
@@ -165,7 +165,7 @@ class Registration:
 
     @cached_property
     def _rays(self) -> Float32Array:
-        """Per pixel of the depth image its ray in homogeneous coordinates of the colour image (3, H, W), at depth 1."""
+        """The ray of each depth pixel in homogeneous coordinates of the colour image (3, H, W), at depth 1."""
         width, height = self.camera.depth_size
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = np.stack([u, v, np.ones_like(u)])
@@ -176,7 +176,7 @@ class Registration:
 
     @cached_property
     def _shift(self) -> Float32Array:
-        """What the distance of the two cameras adds to ``_rays`` times depth (3,)."""
+        """Offset (3,) from the distance of the two cameras, added to ``_rays`` times depth."""
         return (self.camera.colour_intrinsics @ self.depth_to_colour[:3, 3]).astype(np.float32)
 
     def _seen_at(self, depth_m: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -189,7 +189,7 @@ class Registration:
 
     @cached_property
     def _fixed_places(self) -> tuple[Float32Array, Float32Array]:
-        """Columns and rows for cameras that look from one point: they do not depend on depth."""
+        """Columns and rows for cameras with the same centre: independent of depth."""
         return self._seen_at(np.ones(self._rays.shape[1:], np.float32))[:2]
 
     def _colour_at_depth(self, colour: UInt8Array, depth_m: Float32Array) -> UInt8Array:
@@ -212,7 +212,7 @@ class Registration:
 
 
 def filled(depth_m: Float32Array) -> Float32Array:
-    """Depth with that of the nearest pixel that has some where there is none; 1 m where none has any."""
+    """Depth with gaps filled by the nearest pixel that has some; 1 m if none has any."""
     is_empty = depth_m <= 0
     if not is_empty.any():
         return depth_m
@@ -228,7 +228,7 @@ def filled(depth_m: Float32Array) -> Float32Array:
 
 
 def make_registration(camera: SensorPair, grid: Grid, where: str) -> Registration:
-    """The registration of a pair of cameras; a ``DataError`` where they are no pinhole cameras a rigid motion apart."""
+    """The registration of a pair of cameras; a ``DataError`` unless they are pinhole cameras a rigid motion apart."""
     for name, matrix in (("colour", camera.colour_extrinsic), ("depth", camera.depth_extrinsic)):
         if not are_rigid(matrix[None])[0]:
             raise DataError(f"{where}: the {name} extrinsic is not a rigid motion; expected a 4x4 pose, metres")
@@ -246,7 +246,7 @@ NumberedNames = Mapping[int, str]  # the number of a frame to the name of its fi
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame, below the folder of the export, and its number at full rate."""
+    """Files of one frame, relative to the export folder, and its number at full rate."""
 
     number: int
     colour: str
@@ -256,10 +256,10 @@ class FrameFiles:
 
 @dataclass(eq=False)
 class ExportedFrames:
-    """An export as an ``RgbdSource``; each file is read when it is asked for.
+    """An export as an ``RgbdSource``; files are read on access.
 
-    ``camera_files`` are the names of the files that describe the cameras; ``size_reason`` says in the message about an
-    image of another size why it should have that of ``camera``.
+    ``camera_files`` describe the cameras; ``size_reason`` explains, in the message on an
+    image of another size, why it should have the size of ``camera``.
     """
 
     folder: Path
@@ -302,13 +302,13 @@ class ExportedFrames:
 
 
 def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)) -> Float64Array:
-    """The square matrix, of as many rows as one of ``sides``, in a text file; its numbers may be not finite."""
+    """The square matrix in a text file, with a number of rows in ``sides``; values may be non-finite."""
     where = f"{where}: {name}"
     return square(read_text(folder / name, where, EXPORT_AGAIN).split(), where, sides)
 
 
 def read_size(folder: Path, name: str, where: str) -> images.Size:
-    """Width and height of an image file by its header."""
+    """Width and height of an image file, from its header."""
     size = images.image_size(images.read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
     if size is None:
         raise DataError(f"{where}: {name}: not a readable image; {EXPORT_AGAIN}")
@@ -316,7 +316,7 @@ def read_size(folder: Path, name: str, where: str) -> images.Size:
 
 
 def list_folder(folder: Path, name: str, where: str) -> list[str]:
-    """The names in a folder, sorted; without hidden ones, which systems leave behind."""
+    """The sorted names in a folder, except hidden ones."""
     try:
         return sorted(entry.name for entry in os.scandir(folder / name) if not entry.name.startswith("."))
     except OSError as error:
@@ -324,7 +324,7 @@ def list_folder(folder: Path, name: str, where: str) -> list[str]:
 
 
 def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:
-    """The names that match ``pattern`` by its first group, the number of the frame; another name is an error."""
+    """The names that match ``pattern``, by frame number (its first group); any other name is an error."""
     name_of: dict[int, str] = {}
     extra = []
     for name in names:
@@ -339,14 +339,14 @@ def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:
 
 
 def every_kth(known: set[int]) -> range:
-    """The numbers of an export from 0 that left out all but every k-th frame, as far as ``known`` tells."""
+    """The frame numbers of an export that kept every k-th frame, starting at 0, inferred from ``known``."""
     return range(0, max(known) + 1, math.gcd(*known) or 1)
 
 
 def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str, advice: str = EXPORT_AGAIN) -> None:
-    """Raise ``DataError`` unless each kind of file is there for exactly the ``expected`` frames.
+    """Raise ``DataError`` unless each kind of file exists for exactly the ``expected`` frames.
 
-    The keys are what the name of a missing file would be, with {} in place of its number.
+    The keys are file names with {} in place of the number, for messages.
     """
     there = {name: {number for number in files if number in expected} for name, files in kinds.items()}
     n_missing = sum(len(expected) - len(known) for known in there.values())

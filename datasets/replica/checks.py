@@ -1,6 +1,6 @@
-"""What is wrong with the files of a Replica scene, one line each, where a reader stops at the first fault; their key.
+"""Faults in the files of a Replica scene, one line each (readers stop at the first fault), and its key.
 
-Images are not looked at here: decoding them is the reader's part.
+Images are not checked here, but when frames are decoded.
 """
 
 from __future__ import annotations
@@ -34,11 +34,9 @@ from su3d_bench.formats.poses import poses_of_lines
 
 SLACK_M = 0.05
 SPACING_M = 0.05  # of the points on the sides of boxes
-MIN_EDGE_POINTS = (
-    6  # points along one edge: the sides of the smallest thing then have 216, enough to count as an object
-)
+MIN_EDGE_POINTS = 6  # points along an edge: the smallest box then has 216 on its sides, enough to count as an object
 MAX_POINTS = 2_000_000
-MAX_OBJECTS = 10_000  # the release has at most some hundreds in a scene
+MAX_OBJECTS = 10_000  # the release has at most a few hundred per scene
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision
 
 
@@ -60,7 +58,7 @@ class ObjectBox(FileModel):
 
 
 def boxes_of(info: Info, where: str) -> dict[int, OrientedBox]:
-    """Object id -> its box in the world; objects without ``oriented_bbox`` are left out."""
+    """Object id -> its box in the world; objects without ``oriented_bbox`` are excluded."""
     return {
         row.id: _box(row.oriented_bbox, f"{where}: {INFO_NAME}: object {row.id}")
         for row in info.objects
@@ -80,12 +78,12 @@ def _box(content: Any, where: str) -> OrientedBox:
 
 
 def object_boxes_of(path: Path, where: str) -> ObjectBoxes:
-    """The boxes of the objects that have a class, at least one, by instance id: that of the object, plus 1."""
+    """The boxes of the objects that have a class (at least one) by instance id, which is the object id plus 1."""
     info, labels = read_info(path, where), replica_label_set()
     classes, found = info.class_of_object, boxes_of(info, where)
     boxes = {number + 1: found[number] for number in sorted(found) if classes[number] in labels.ids}
     if not boxes:
-        raise GroundTruthMissing(f"{where}: no ground truth 'boxes'; no object of a class has a box in {INFO_NAME}")
+        raise GroundTruthMissing(f"{where}: no ground truth 'boxes'; no object with a class has a box in {INFO_NAME}")
     if len(boxes) > MAX_OBJECTS:
         raise DataError(f"{where}: {INFO_NAME}: {len(boxes)} objects have a box; expected at most {MAX_OBJECTS}")
     return ObjectBoxes(boxes, {instance: classes[instance - 1] for instance in boxes}, labels)
@@ -127,7 +125,7 @@ def _on_sides(box: OrientedBox, most_along: int) -> Float64Array:
 def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox]) -> dict[int, float]:
     """Object id -> how far, in metres, its farthest face centre lies beyond its box and the slack of 5 cm.
 
-    The centre of a face is the mean of its corners. Objects without box or without face are left out.
+    The centre of a face is the mean of its corners. Objects without a box or a face are excluded.
     """
     lengths = mesh.corners.lengths
     owner = np.repeat(np.arange(len(lengths)), lengths)
@@ -144,12 +142,12 @@ def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox])
     return outside
 
 
-PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
-PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
+PNG_HEAD_BYTES = 64  # signature and size chunk
+PNG_TAIL_BYTES = 1024  # end of the pixels, and small trailing chunks
 
 
 def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
-    """Faults of camera and trajectory of the scene in a render ``tree``, and images that are missing."""
+    """Faults of camera and trajectory of the scene in a render ``tree``, and missing images."""
     lines: list[str] = []
     yield from faults_of([lambda: read_camera(tree / "cam_params.json", where),
                           lambda: lines.extend(trajectory_lines(tree / scene / "traj.txt", where))])  # fmt: skip
@@ -159,7 +157,7 @@ def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
 
 
 def original_problems(original: Path | None, where: str) -> Iterator[str]:
-    """Faults of the scene in the original release; one without any of it, or with its boxes alone, has none."""
+    """Faults of the scene in the original release; none if it is absent or has only its boxes."""
     if original is None:
         return
     if not (original / INFO_NAME).exists():
@@ -175,7 +173,7 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         return
     lines = (
         f"{where}: {INFO_NAME}: object {object_id} has faces {beyond_m:.2f} m beyond its box and the slack of "
-        f"{SLACK_M} m; the boxes are of another mesh"
+        f"{SLACK_M} m; the boxes belong to another mesh"
         for object_id, beyond_m in outside.items()
     )
     yield from shortened(lines, f"{where}: {INFO_NAME}")
@@ -193,11 +191,11 @@ def digest_of(files: Sequence[Path], images: Sequence[Path], where: str) -> str:
 
 
 def image_key(path: Path) -> str:
-    """A key of an image: of every byte, except of a PNG, whose own checksum of all pixels stands near its end.
+    """A key of an image: of every byte or, for a PNG, of its size and its checksum near the end.
 
-    The pixels of a PNG are a zlib stream, which ends with the Adler-32 of the uncompressed rows. What this cannot see:
-    other pixels of the same checksum (one in 2**32) and size, and damage amid a PNG, which the reader of frames
-    refuses because the checksum of the chunk fails.
+    The pixels of a PNG are a zlib stream, which ends with the Adler-32 of the uncompressed rows. Not detected:
+    other pixels with the same checksum (1 in 2**32) and size, and damage within a PNG, which the frame reader
+    rejects because the chunk checksum fails.
     """
     with opened(path) as file:
         head = file.read(PNG_HEAD_BYTES)

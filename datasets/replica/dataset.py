@@ -1,4 +1,4 @@
-"""Replica: NICE-SLAM's RGB-D render for input, the original release for ground truth."""
+"""Replica: frames from NICE-SLAM's RGB-D render, ground truth from the original release."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Replica(FileDataset[NoOptions]):
     name = "replica"
     reader_version = 4
     reads_made_rooms = True
-    scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
+    scene_names = r"(room_?[0-2]|office_?[0-4])"  # including those of generated rooms
     label_space = "replica"
     variants = (
         "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", scene_graphs.VARIANT
@@ -33,13 +33,13 @@ class Replica(FileDataset[NoOptions]):
 
     @cached_property
     def rendered(self) -> folders.RenderTree:
-        """The render tree, without scenes where there is none."""
+        """The render tree, with no scenes if there is none."""
         return folders.find_render_tree(self.root) or folders.RenderTree(self.root / folders.RENDER_FOLDERS[0], ())
 
     def scenes(self) -> Sequence[str]:
-        """The official scenes that are here, in their order, then every other scene of the render tree.
+        """The official scenes that are available, in their order, then all other scenes of the render tree.
 
-        Without a render tree those of the original release, which can be looked at; beside one they are named singly.
+        Without a render tree, those of the original release, which can be viewed; otherwise these only work by name.
         """
         scenes = self.rendered.scenes or folders.unrendered_scenes(self.root)
         if not scenes:
@@ -47,12 +47,12 @@ class Replica(FileDataset[NoOptions]):
         return scenes
 
     def places(self) -> Sequence[Path]:
-        """Where the render tree is, or else would be looked for, in that order."""
+        """Where the render tree is, or would be looked for, in that order."""
         tree = folders.find_render_tree(self.root)
         return [tree.folder] if tree is not None else [self.root / name for name in folders.RENDER_FOLDERS]
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: poses and ground truth; ``info`` checks every file's presence."""
+        """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks that files exist."""
         n_frames = "no frames"
         if self._is_rendered(scene):
             try:
@@ -75,7 +75,7 @@ class Replica(FileDataset[NoOptions]):
         return f"{n_frames}, {words}" + (f"; also {', '.join(released)}" if released else "")
 
     def n_frames(self, scene: str, stride: int) -> int:
-        """Cheap, with a check that the scene's frames are complete."""
+        """A cheap count that also checks that the scene's frames are complete."""
         folder = self.folder(scene)
         if not self._is_rendered(scene):
             return 0
@@ -91,7 +91,7 @@ class Replica(FileDataset[NoOptions]):
         if not self._is_rendered(scene):
             raise FramesMissing(
                 f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
-                f"{folders.FETCH_FRAMES}; what is here can be looked at: su3d-bench datasets show {where}"
+                f"{folders.FETCH_FRAMES}; to view the available files: su3d-bench datasets show {where}"
             )
         camera = frames.read_camera(self.rendered.folder / "cam_params.json", where)
         poses = frames.read_trajectory(folder / "traj.txt", where)
@@ -107,13 +107,13 @@ class Replica(FileDataset[NoOptions]):
         return (self.rendered.folder / "cam_params.json", folder / "traj.txt", *images)
 
     def recording_key(self, scene: str) -> str:
-        """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
+        """A key of the content of every file; see ``image_key`` for what it does not detect in an image."""
         folder = self.folder(scene)
         files = (self.rendered.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
         return checks.digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
+        """Faults in the scene's files, one line each; objects without entry are void, not faults."""
         self.folder(scene)
         if self._is_rendered(scene):
             yield from checks.render_problems(self.rendered.folder, scene, self.where(scene))
@@ -153,7 +153,7 @@ class Replica(FileDataset[NoOptions]):
         return truth.triangle_mesh(self._annotated_mesh(scene))
 
     def surface(self, scene: str) -> Surface:
-        """The mesh beside the render, whose vertices label files for OpenMask3D and OVO describe."""
+        """The mesh next to the render, whose vertices the label files for OpenMask3D and OVO describe."""
         self.folder(scene)
         mesh = self._render_mesh(scene)
         if not mesh.exists():
@@ -164,7 +164,7 @@ class Replica(FileDataset[NoOptions]):
         return self.rendered.folder / f"{scene}_mesh.ply"
 
     def folder(self, scene: str) -> Path:
-        """Where the scene's render is or would be; a ``DataError`` where nothing of the scene is here."""
+        """Path of the scene's render, existing or not; a ``DataError`` if nothing of the scene exists."""
         if not self._is_rendered(scene) and not self._is_annotated(scene):
             known = self.scenes()
             hint = suggest(scene, known, f"{self.rendered.folder} has")
@@ -179,7 +179,7 @@ class Replica(FileDataset[NoOptions]):
         return scene in self.rendered.scenes
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
-        """The render's mesh and every file of ground truth that is here, of whatever variant."""
+        """The render's mesh and every available ground-truth file, of any variant."""
         original = folders.find_original_scene(self.root, scene)
         names = (truth.MESH_NAME, truth.INFO_NAME)
         paths = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
@@ -190,7 +190,7 @@ class Replica(FileDataset[NoOptions]):
         return tuple(path for path in dict.fromkeys(paths) if path.exists())
 
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
-        """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
+        """Variant -> its files, for ground truth released by others than Replica's authors; empty if none."""
         sequence = folders.find_semantic_sequence(self.root, scene)
         reference = self.folder(scene) / folders.REFERENCE_CLOUD
         clouds = () if sequence is None else (*truth.cloud_files(sequence), reference)
@@ -208,7 +208,7 @@ class Replica(FileDataset[NoOptions]):
         return folders.find_label_file(self.root, scene, folders.SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
 
     def _labelled_meshes(self, scene: str) -> dict[str, Path]:
-        """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
+        """The meshes whose vertices a label file may describe; first that of the render, which the authors used."""
         original, render = folders.find_original_scene(self.root, scene), self._render_mesh(scene)
         meshes = {render.name: render} | ({} if original is None else {truth.MESH_NAME: original / truth.MESH_NAME})
         return {name: path for name, path in meshes.items() if path.exists()}
@@ -218,7 +218,7 @@ class Replica(FileDataset[NoOptions]):
         if path is None:
             folder = folders.INSTANCE_FOLDERS[0] if variant == "openmask3d" else folders.SEMANTIC_LABEL_FOLDERS[0]
             raise GroundTruthMissing(
-                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
+                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label per vertex, in "
                 f"{self.rendered.folder}; {folders.HOW_TO_GET_LABELS[variant]}"
             )
         make = truth.instance_file_truth if variant == "openmask3d" else truth.class_file_truth
@@ -231,7 +231,7 @@ class Replica(FileDataset[NoOptions]):
             expected = f"{folders.original_name(scene)}/Sequence_1/{folders.FUSED_CLOUD}"
             raise GroundTruthMissing(
                 f"{where}: no ground truth 'conceptgraphs'; expected {expected} of its authors ({folders.CLOUDS_URL}) "
-                f"in {self.root / folders.SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
+                f"in {self.root / folders.SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 works without it"
             )
         if not reference.exists():
             raise GroundTruthMissing(
@@ -246,7 +246,7 @@ class Replica(FileDataset[NoOptions]):
         return truth.read_annotated_mesh(self._original(scene), self.where(scene))
 
     def _instead(self, scene: str) -> str:
-        """A clause on what scores the scene without its mesh; empty where nothing does."""
+        """A clause on what can score the scene without its mesh; empty if nothing can."""
         try:
             checks.object_boxes_of(self._info(scene), self.where(scene))
         except DataError:
@@ -254,7 +254,7 @@ class Replica(FileDataset[NoOptions]):
         return "; the protocol replica-boxes scores it by the boxes of its objects"
 
     def _original(self, scene: str) -> Path:
-        """The scene's folder in the original release, with both files of the truth."""
+        """The scene's folder in the original release, with both files of the ground truth."""
         original, where = folders.find_original_scene(self.root, scene), self.where(scene)
         if original is None:
             raise GroundTruthMissing(

@@ -1,4 +1,4 @@
-"""Where the two trees of Replica are below the data root, and what scenes and classes are called.
+"""Where the two trees of Replica are below the data root, and the names of scenes and classes.
 
 The *render tree* is the RGB-D render of NICE-SLAM (``Replica/room0/...``), the *original tree* the release with the
 annotated meshes (``replica_v1/room_0/habitat/...``).
@@ -22,7 +22,7 @@ RENDER_FOLDERS, RENDER_PARTS = ("Replica", "replica", "."), ("traj.txt", "result
 DATASET_FOLDERS = ("Replica-Dataset", "Replica_Dataset", "replica_dataset", "Replica", "replica", ".")
 ORIGINAL_FOLDERS = ("replica_v1", "Replica_v1", "Replica-Dataset/replica_v1", *DATASET_FOLDERS)
 ORIGINAL_FILES = ("info_semantic.json", "mesh_semantic.ply")  # in the folder habitat of a scene
-# Names that users give the folder of ConceptGraphs' ground truth, whose scenes are room_0/Sequence_1/...
+# Common names of the folder with ConceptGraphs' ground truth, whose scenes are room_0/Sequence_1/...
 SEMANTIC_FOLDERS = (
     *(f"{name}{mark}semantic" for mark in "-_" for name in ("Replica", "replica")),
     "Replica_Semantic",
@@ -30,16 +30,16 @@ SEMANTIC_FOLDERS = (
 )
 FUSED_CLOUD = "saved-maps-gt/pointclouds"  # in Sequence_1
 REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the render tree
-# Text files of one label a vertex stand in such folders, below the data root or a render tree.
+# Folders of text files with one label per vertex, below the data root or a render tree.
 LABEL_PLACES = (*RENDER_FOLDERS, "opennerf/datasets", "datasets")
 INSTANCE_FOLDERS = ("ground_truth", "instance_gt", "instance_gt/validation", "replica_gt_instances")
 SEMANTIC_LABEL_FOLDERS = ("semantic_gt", "replica_gt_semantics")
 FETCH_FRAMES, FETCH_MESHES = "su3d-bench datasets fetch replica frames", "su3d-bench datasets fetch replica meshes"
 CLOUDS_URL = "https://github.com/concept-graphs/concept-graphs"  # its README has the link
 HOW_TO_GET_LABELS = {
-    "openmask3d": "ask its authors (https://github.com/OpenMask3D/openmask3d/issues/1) or take the archive that "
+    "openmask3d": "ask its authors (https://github.com/OpenMask3D/openmask3d/issues/1) or use the archive that "
     "scripts/get_replica_dataset.sh of Open-YOLO 3D downloads; replica-openmask3d scores without them",
-    "ovo-51": "they are in https://github.com/opennerf/opennerf, datasets/replica_gt_semantics",
+    "ovo-51": "get them from https://github.com/opennerf/opennerf, datasets/replica_gt_semantics",
 }
 
 
@@ -52,10 +52,10 @@ class RenderTree:
 
 
 def find_render_tree(root: Path) -> RenderTree | None:
-    """The first of ``RENDER_FOLDERS`` below ``root`` that holds a scene; None where none does."""
+    """The first of ``RENDER_FOLDERS`` below ``root`` that holds a scene; None if none does."""
     for name in RENDER_FOLDERS:
         folder = root / name
-        # The data root itself holds other datasets too, whose folders are not scenes of this one.
+        # The data root also contains other datasets, whose folders are not scenes of this one.
         is_scene = all if name == "." else any
         scenes = [one.name for one in _folders(folder) if is_scene((one / part).exists() for part in RENDER_PARTS)]
         if scenes:
@@ -83,7 +83,7 @@ def original_name(scene: str) -> str:
 
 
 def find_original_scene(root: Path, scene: str) -> Path | None:
-    """The folder of the original release with ``habitat/`` in it; None where no tree below ``root`` has it."""
+    """The folder of the original release with ``habitat/`` in it; None if no tree below ``root`` has it."""
     return _scene_with("habitat", root, ORIGINAL_FOLDERS, scene)
 
 
@@ -101,13 +101,13 @@ def unrendered_scenes(root: Path) -> tuple[str, ...]:
 
 
 def find_semantic_sequence(root: Path, scene: str) -> Path | None:
-    """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None where there is none."""
+    """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None if there is none."""
     folder = _scene_with(f"Sequence_1/{FUSED_CLOUD}", root, SEMANTIC_FOLDERS, scene)
     return None if folder is None else folder / "Sequence_1"
 
 
 def _scene_with(part: str, root: Path, folders: tuple[str, ...], scene: str) -> Path | None:
-    """The first folder of the scene, in one of ``folders``, in which there is a folder ``part``."""
+    """The first folder of the scene, in one of ``folders``, that contains a folder ``part``."""
     for name in folders:
         for scene_name in dict.fromkeys((original_name(scene), scene)):
             if (root / name / scene_name / part).is_dir():
@@ -116,7 +116,7 @@ def _scene_with(part: str, root: Path, folders: tuple[str, ...], scene: str) -> 
 
 
 def find_label_file(root: Path, scene: str, folders: tuple[str, ...], prefix: str) -> Path | None:
-    """The text of one label a vertex: ``office0.txt``, ``office_0.txt`` or ``<prefix>office0.txt`` in a usual place."""
+    """The labels of one scene, one per vertex: ``office0.txt``, ``office_0.txt`` or ``<prefix>office0.txt``."""
     for place in LABEL_PLACES:
         for folder in folders:
             for name in dict.fromkeys((scene, original_name(scene), f"{prefix}{scene}")):
@@ -127,16 +127,16 @@ def find_label_file(root: Path, scene: str, folders: tuple[str, ...], prefix: st
 
 
 def no_render_tree(root: Path) -> ScenesMissing:
-    """What to say where no scene was found: where it was looked for and how to get data."""
+    """Message if no scene was found: where they are expected and how to get data."""
     return ScenesMissing(
         f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
-        f"results/); {FETCH_FRAMES} brings them; set SU3D_DATA to where they are, "
-        f"or make rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
+        f"results/); download them with {FETCH_FRAMES}, set SU3D_DATA to their folder, "
+        f"or create rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
     )
 
 
 @cache
 def replica_label_set() -> LabelSet:
-    """The 101 classes, ids 1 to 101; 0 is void and no class."""
+    """The 101 classes, ids 1 to 101; 0 is void, not a class."""
     rows = json.loads(file_text(Path(__file__).with_name("labels.json")))
     return LabelSet(LABEL_SPACE, tuple(int(row["id"]) for row in rows), tuple(str(row["name"]) for row in rows))

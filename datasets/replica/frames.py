@@ -1,8 +1,8 @@
-"""Posed RGB-D frames of the render that NICE-SLAM distributes: cam_params.json, traj.txt, results/.
+"""Posed RGB-D frames of NICE-SLAM's render: cam_params.json, traj.txt, results/.
 
 Depth is uint16, metres are value / scale, 0 is invalid; a pose is a row-major 4x4 camera-to-world matrix with OpenCV
-axes in the z-up world of the original mesh, taken as it is. A fault in any file fails the scene: the release is
-complete, so a gap or a NaN means a damaged copy, and a number computed around it would not be the scene's.
+axes in the z-up world of the original mesh, used unchanged. Any faulty file fails the scene: the release is
+complete, so a gap or a NaN means a damaged copy, and a metric would not be that of the scene.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Pixels = Annotated[float, Field(gt=0, lt=1e9)]
 
 
 class Camera(FileModel):
-    """Image size and intrinsics in pixels, and how many depth units make a metre."""
+    """Image size and intrinsics in pixels, and depth units per metre."""
 
     w: WholeNumber
     h: WholeNumber
@@ -61,7 +61,7 @@ def read_camera(path: Path, where: str) -> Camera:
 
 
 def read_trajectory(path: Path, where: str) -> Float64Array:
-    """Camera-to-world poses (n, 4, 4), one a line; ``where`` begins each message."""
+    """Camera-to-world poses (n, 4, 4), one per line; ``where`` begins each message."""
     return poses_of_lines(trajectory_lines(path, where), f"{where}: traj.txt")
 
 
@@ -69,12 +69,12 @@ def trajectory_lines(path: Path, where: str) -> list[str]:
     """The lines of ``traj.txt``, at least one."""
     lines = read_text(path, f"{where}: traj.txt").rstrip().splitlines()
     if not lines:
-        raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
+        raise DataError(f"{where}: traj.txt is empty; expected one pose per line")
     return lines
 
 
 def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:
-    """Raise ``DataError`` unless results/ holds exactly colour and depth of frames 0 to ``n_poses`` - 1."""
+    """Raise ``DataError`` unless results/ has exactly the colour and depth of frames 0 to ``n_poses`` - 1."""
     names = list_folder(scene_folder, "results", where)
     matches = {
         "results/frame{:06d}.jpg": [re.fullmatch(r"frame(\d{6,9})\.jpg", name) for name in names],
@@ -83,7 +83,7 @@ def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:
     kinds = {kind: {int(match[1]): match[0] for match in found if match} for kind, found in matches.items()}
     n_frames = max(set().union(*kinds.values()), default=-1) + 1
     if n_frames == 0:
-        raise DataError(f"{where}: results/ holds no frames; expected frame000000.jpg and depth000000.png and so on")
+        raise DataError(f"{where}: results/ has no frames; expected frame000000.jpg and depth000000.png and so on")
     check_complete(kinds, range(n_frames), where, "copy results/ again")
     if n_frames != n_poses:
         raise DataError(
@@ -100,7 +100,7 @@ def depth_name(index: int) -> str:
 
 
 class ReplicaFrames(recorded_frames.RecordedFrames):
-    """The frames at ``indices``, each read when it is asked for; a file that cannot be used is a ``DataError``."""
+    """The frames at ``indices``, each read on access; a file that cannot be used is a ``DataError``."""
 
     advice = "copy results/ again"
 
@@ -118,4 +118,4 @@ class ReplicaFrames(recorded_frames.RecordedFrames):
 
     def check_depth(self, values: UInt16Array, where: str) -> None:
         if not values.any():
-            raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
+            raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or exclude the scene")

@@ -1,8 +1,8 @@
 """ReplicaSSG's scene graphs of Replica: ``objects.json``, ``relationships.json`` and ``replica_to_visual_genome.json``.
 
-Source: files/ of Howardkhh/ReplicaSSG at 9419097 and Merging/evaluate.py of Howardkhh/FROSS at 645153b. The files stand
-in ``ReplicaSSG/`` below the data root or beside the scenes. Objects whose label means none of the listed classes of
-Visual Genome (``unknown``) are none of the graph.
+Source: files/ of Howardkhh/ReplicaSSG at 9419097 and Merging/evaluate.py of Howardkhh/FROSS at 645153b. The files are
+in ``ReplicaSSG/`` below the data root or next to the scenes. Objects whose label is not one of the listed classes of
+Visual Genome (``unknown``) are excluded from the graph.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from su3d_bench.formats.json_models import FileModel, WholeNumber, checked_json
 VARIANT = "replicassg"
 OBJECTS, RELATIONS, CLASSES = "objects.json", "relationships.json", "replica_to_visual_genome.json"
 FILES = (OBJECTS, RELATIONS, CLASSES)
-UNKNOWN = "unknown"  # a label that means none of the listed classes
+UNKNOWN = "unknown"  # a label outside the listed classes
 FOLDER_NAMES = ("ReplicaSSG", "ReplicaSSG/files", "replicassg")
 URL = "https://github.com/Howardkhh/ReplicaSSG"
-MAX_BYTES = 64 << 20  # the released ones have 0.3 MB
+MAX_BYTES = 64 << 20  # released files have 0.3 MB
 Content = TypeVar("Content")
 
 
@@ -39,9 +39,9 @@ def find_graph_folder(root: Path) -> Path | None:
 
 
 def graph_truth(root: Path, scene: str, mesh: AnnotatedMesh, where: str) -> GroundTruth:
-    """The centre of each face with the class and instance of its object, and the annotated graph.
+    """The centre of each face with its object's class and instance, and the annotated graph.
 
-    Instance ids are ``object_id`` + 1; class ids the place in the list of Visual Genome's classes, from 1.
+    Instance ids are ``object_id`` + 1; class ids are positions in the list of Visual Genome's classes, from 1.
     """
     folder = find_graph_folder(root)
     if folder is None:
@@ -55,7 +55,7 @@ def graph_truth(root: Path, scene: str, mesh: AnnotatedMesh, where: str) -> Grou
     try:
         graph = TrueGraph(class_of_object, triples)
     except DataError as error:
-        raise DataError(f"{where}: {RELATIONS}: {error}; its objects need a label of {CLASSES}") from error
+        raise DataError(f"{where}: {RELATIONS}: {error}; its objects need a label in {CLASSES}") from error
     instance = np.where(mesh.object_of_face < MAX_OBJECT_ID, mesh.object_of_face + 1, 0).astype(np.int32)
     ids, row = np.unique(instance, return_inverse=True)
     semantic = np.array([class_of_object.get(key, 0) for key in ids.tolist()], np.int32)[row]
@@ -87,7 +87,7 @@ class Scans(FileModel):
 
 
 def _classes(path: Path, where: str) -> tuple[tuple[str, ...], Mapping[str, int]]:
-    """The listed classes, and the id of that which each label of Replica means; labels of none of them are left out."""
+    """The listed classes, and the class id of each Replica label; labels outside the list are omitted."""
     content = _read(path, where, ClassLists)
     place = {name: number for number, name in enumerate(content.listed, 1)}
     if len(place) != len(content.listed):
@@ -103,22 +103,22 @@ def _objects(path: Path, scan: str, class_of_label: Mapping[str, int], where: st
     for row in _rows(path, scan, "objects", list[GraphObject], where):
         class_id = class_of_label.get(row.label)
         if class_id is not None and answer.setdefault(row.id + 1, class_id) != class_id:
-            raise DataError(f"{where}: {scan}: object {row.id} stands there twice, with two classes")
+            raise DataError(f"{where}: {scan}: object {row.id} is listed twice, with two classes")
     return answer
 
 
 def _relations(path: Path, scan: str, where: str) -> tuple[tuple[int, str, int], ...]:
-    """Subject, predicate and object of each relation of a scan; the file has both objects before the predicate."""
+    """Subject, predicate and object of each relation of a scan; in the file the predicate comes last."""
     kind = list[Annotated[tuple[WholeNumber, WholeNumber, Any, str], Strict(False)]]
     rows = _rows(path, scan, "relationships", kind, where)
     return tuple((subject + 1, predicate, other + 1) for subject, other, _, predicate in rows)
 
 
 def _rows(path: Path, scan: str, key: str, kind: type[Content], where: str) -> Content:
-    """The list under ``key`` of the one entry of a scan; those of other scans are not looked at."""
+    """The list under ``key`` of a scan's one entry; entries of other scans are ignored."""
     mine = [one for one in _read(path, where, Scans).scans if one.get("scan") == scan]
     if len(mine) != 1:
-        raise DataError(f"{where}: has {len(mine)} entries of {scan}; expected one")
+        raise DataError(f"{where}: has {len(mine)} entries for {scan}; expected one")
     return checked_json(mine[0].get(key), f"{where}: {scan}: {key}", kind)
 
 

@@ -1,10 +1,10 @@
 """Ground truth of the original Replica release: habitat/mesh_semantic.ply and habitat/info_semantic.json.
 
-``object_id`` is an instance of a *face*; vertices carry no label. Our rules, where the release has none:
+``object_id`` is the instance of a *face*; vertices have no label. Our rules, not defined by the release:
 
-- a vertex belongs to the object of most of the faces around it, the lowest id where several have as many;
-- an instance id is ``object_id`` + 1, because 0 is an object in the release and none in ground truth;
-- an object without entry in ``objects``, or whose class is none of the 101, is void: class 0, instance 0.
+- a vertex belongs to the object of most faces around it, the lowest id in a tie;
+- an instance id is ``object_id`` + 1, because 0 is an object in the release and means none in ground truth;
+- an object without entry in ``objects``, or whose class is not one of the 101, is void: class 0, instance 0.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from su3d_bench.formats.poses import moved, read_first_pose
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"
-UNDEFINED_CLASSES = (-2, -1, 0, 256)  # what the release writes where an object has no class
+UNDEFINED_CLASSES = (-2, -1, 0, 256)  # written by the release if an object has no class
 MAX_OBJECT_ID = 2**31 - 2
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class AnnotatedMesh:
     """``vertices`` (V, 3); ``corners`` of F polygons; ``object_of_face`` (F,) as in the file; per face its class and
-    instance id (F,), 0 where void; ``class_of_instance`` of every object that has a class."""
+    instance id (F,), 0 if void; ``class_of_instance`` of every object that has a class."""
 
     vertices: Float32Array
     corners: ListColumn
@@ -76,7 +76,7 @@ class InfoObject(FileModel):
 
 
 class Info(FileModel):
-    """``info_semantic.json``; ``class_of_object`` has undefined classes too."""
+    """``info_semantic.json``; ``class_of_object`` includes undefined classes."""
 
     classes: list[InfoClass]
     objects: list[InfoObject]
@@ -87,20 +87,20 @@ class Info(FileModel):
 
 
 def read_info(path: Path, where: str) -> Info:
-    """The table of the scene's objects. Its own classes must be Replica's: with others every label would be wrong."""
+    """The table of the scene's objects. Its classes must be Replica's, otherwise every label would be wrong."""
     where, labels = f"{where}: {INFO_NAME}", replica_label_set()
     info = read_json(path, where, Info)
     for row in info.classes:
         if row.id in labels.ids and row.name.replace("_", "-").lower() != labels.name_of(row.id):
             raise DataError(
                 f"{where}: class {row.id} is {row.name[:40]!a}, in Replica it is '{labels.name_of(row.id)}'; this file "
-                "has other classes"
+                "uses different classes"
             )
     class_of_object = info.class_of_object
     for one in info.objects:
         if (class_id := class_of_object[one.id]) != one.class_id:
             raise DataError(
-                f"{where}: object {one.id} stands there twice, as class {one.class_id} and as class {class_id}"
+                f"{where}: object {one.id} is listed twice, as class {one.class_id} and as class {class_id}"
             )
     return info
 
@@ -124,7 +124,7 @@ def _warn_void_objects(ids: Int64Array, n_faces: Int64Array, class_of_object: Ma
 
 
 def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64Array]:
-    """Vertices, corners and object ids of a mesh, checked to fit each other."""
+    """Vertices, corners and object ids of a mesh, checked for consistency."""
     file = read_ply(path, where)
     face = file.element("face")
     if face is None or face.n_rows == 0:
@@ -133,18 +133,18 @@ def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64A
     corners = face_corners(face, len(vertices), where)
     if "object_id" not in face.columns:
         raise DataError(
-            f"{where}: faces have no 'object_id'; a program that drops it has saved this file, take the original"
+            f"{where}: faces have no 'object_id'; the file was saved by a program that drops it, use the original"
         )
     objects = scalar_column(face, "object_id", where)
     if objects.dtype.kind == "f":
-        raise DataError(f"{where}: 'object_id' is of type {objects.dtype}; expected a type of whole numbers")
+        raise DataError(f"{where}: 'object_id' is of type {objects.dtype}; expected an integer type")
     return vertices, corners, objects.astype(np.int64)
 
 
 def object_of_vertex(n_vertices: int, corners: ListColumn, object_of_face: Int64Array) -> Int64Array:
-    """Row in ``object_of_face`` of a face whose object has most of the faces around each vertex; -1 without faces.
+    """Row in ``object_of_face`` of a face whose object has most faces around each vertex; -1 without faces.
 
-    The lowest object id wins where several have as many. A face that names a vertex twice counts once.
+    Ties go to the lowest object id. A face that lists a vertex twice counts once.
     """
     n_faces = len(object_of_face)
     face_of_corner = np.repeat(np.arange(n_faces), corners.lengths)
@@ -168,12 +168,12 @@ def vertex_truth(mesh: AnnotatedMesh) -> GroundTruth:
         np.where(face < 0, np.int32(0), mesh.instance_of_face[face]),
         replica_label_set(),
         "mesh-vertices",
-        f"vertices of {MESH_NAME}, each with the object of most of its faces (the lowest id among equals)",
+        f"vertices of {MESH_NAME}, each with the object of most of its faces (lowest id in a tie)",
     )
 
 
 def corner_truth(mesh: AnnotatedMesh) -> GroundTruth:
-    """The corners of every face, in the order of the faces: a vertex of four faces four times."""
+    """The corners of every face in file order: a vertex of four faces appears four times."""
     n_corners = mesh.corners.lengths
     return GroundTruth(
         mesh.vertices[mesh.corners.values],
@@ -200,9 +200,9 @@ def triangle_mesh(mesh: AnnotatedMesh) -> InstanceMesh:
 INSTANCES_PER_CLASS = 1000  # ScanNet's format
 BLOCK_BYTES = 1 << 20
 WHOLE_NUMBER = re.compile(rb"-?\d{1,9}")
-UNDEFINED_CLASS = 256  # what the release writes where an object has no class; as label of an instance it is void
+UNDEFINED_CLASS = 256  # written by the release if an object has no class; void as an instance label
 CLASSLESS = (-2, -1, UNDEFINED_CLASS)
-# The 51 classes of OpenNeRF's evaluation, which are those that occur in the eight scenes; see the head of this file.
+# The 51 classes of OpenNeRF's evaluation, those that occur in the eight scenes; see the module docstring.
 OVO_CLASSES = (
     3, 7, 8, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 22, 23, 26, 29, 31, 34, 35, 37, 40, 44, 47, 52, 54, 56, 59, 60,
     61, 62, 63, 64, 65, 70, 71, 76, 78, 79, 80, 82, 83, 87, 88, 91, 92, 93, 95, 97, 98,
@@ -210,30 +210,30 @@ OVO_CLASSES = (
 
 
 def instance_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
-    """Instances of a ``class id * 1000 + instance`` file on the vertices of the first of ``meshes`` that has as many.
+    """Instances from a ``class id * 1000 + instance`` file, for the first of ``meshes`` with as many vertices.
 
-    Values below 1000 and those of the undefined class 256 are void. Each other value is an instance, one ending in
-    000 too, as ScanNet's evaluation has it; instances are numbered from 1 in the order of their values, because two
+    Values below 1000 and the undefined class 256 are void. Each other value is an instance, including those ending in
+    000, as in ScanNet's evaluation; instances are numbered from 1 in ascending order of value, because two
     classes may use the same number.
     """
     values, name = _labels_of_mesh(path, meshes, where)
     distinct, inverse = np.unique(values, return_inverse=True)
     label = distinct // INSTANCES_PER_CLASS
     if label[0] < 0:
-        raise DataError(f"{where}: {path.name}: holds {distinct[0]}; expected class id * 1000 + instance, 0 or more")
+        raise DataError(f"{where}: {path.name}: contains {distinct[0]}; expected class id * 1000 + instance, 0 or more")
     is_void = (label == 0) | (label == UNDEFINED_CLASS)
     is_foreign = ~is_void & ~np.isin(label, replica_label_set().ids)
     if is_foreign.any():
         first = int(np.argmax(is_foreign))
         raise DataError(
             f"{where}: {path.name}: {distinct[first]} is of class {label[first]}, Replica has 1 to "
-            f"{replica_label_set().ids[-1]}; an instance number above {INSTANCES_PER_CLASS - 1} has spilled over, or "
-            "the labels are of another dataset"
+            f"{replica_label_set().ids[-1]}; an instance number above {INSTANCES_PER_CLASS - 1} overflowed, or "
+            "the labels belong to another dataset"
         )
     number = np.where(is_void, 0, np.cumsum(~is_void))
     if number.max() >= INSTANCES_PER_CLASS:
         raise DataError(
-            f"{where}: {path.name}: holds {number.max()} instances; a scene of this format has at most "
+            f"{where}: {path.name}: has {number.max()} instances; a scene of this format has at most "
             f"{INSTANCES_PER_CLASS - 1}"
         )
     return GroundTruth(
@@ -247,17 +247,17 @@ def instance_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> G
 
 
 def class_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
-    """Classes of a file of Replica's ids on the vertices of the first of ``meshes`` that has as many; no instances.
+    """Classes from a file of Replica ids, for the first of ``meshes`` with as many vertices; no instances.
 
-    Any number that is none of the 51 and does not stand for 'no class' is refused: it would mean another numbering,
+    A number that is not one of the 51 ids or 'no class' is rejected: it would mean another numbering,
     such as 0 to 50 in the order of OpenNeRF's evaluation, and every label would be wrong.
     """
     values, name = _labels_of_mesh(path, meshes, where)
     foreign = np.setdiff1d(values, (*OVO_CLASSES, *CLASSLESS))
     if len(foreign):
         raise DataError(
-            f"{where}: {path.name}: holds the class {foreign[0]}, none of the {len(OVO_CLASSES)} Replica ids of this "
-            "evaluation; a file numbered 0 to 50 must be brought back to Replica's ids first"
+            f"{where}: {path.name}: has class {foreign[0]}, not one of the {len(OVO_CLASSES)} Replica ids of this "
+            "evaluation; a file numbered 0 to 50 must be mapped back to Replica's ids first"
         )
     return GroundTruth(
         _vertices(meshes[name], f"{where}: {name}"),
@@ -270,26 +270,26 @@ def class_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> Grou
 
 
 def _labels_of_mesh(path: Path, meshes: Mapping[str, Path], where: str) -> tuple[Int32Array, str]:
-    """The labels, and the name of the mesh that has as many vertices; a ``DataError`` with all counts where none has.
+    """The labels, and the name of the mesh with as many vertices; a ``DataError`` with all counts if there is none.
 
-    ``meshes``: those that the file may describe by what messages call them.
+    ``meshes``: candidate meshes by their names in messages.
     """
     n_vertices = {name: _n_vertices(mesh, f"{where}: {name}") for name, mesh in meshes.items()}
     if not n_vertices:
         raise DataError(
-            f"{where}: {path.name}: labels the vertices of a mesh, but neither the mesh of the render nor that of the "
-            "original release is here; copy one of them"
+            f"{where}: {path.name}: labels mesh vertices, but neither the mesh of the render nor that of the "
+            "original release is available; copy one of them"
         )
     values, n_lines = read_whole_numbers(path, max(n_vertices.values()), f"{where}: {path.name}")
     name = next((name for name, n in n_vertices.items() if 0 < n == n_lines), None)
     if name is None:
         counts = " and ".join(f"{name} {n}" for name, n in n_vertices.items())
-        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label per vertex")
     return values, name
 
 
 def _n_vertices(mesh: Path, where: str) -> int:
-    """As the header says it; ``_vertices`` reads and checks the chosen mesh."""
+    """As stated in the header; ``_vertices`` reads and checks the chosen mesh."""
     with reading(where, DataError), opened(mesh) as file:
         header = read_header(file.read(MAX_HEADER_BYTES), where)
     return next((element.n_rows for element in header.elements if element.name == "vertex"), 0)
@@ -300,9 +300,9 @@ def _vertices(mesh: Path, where: str) -> Float32Array:
 
 
 def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array, int]:
-    """The numbers of a text, one a line, and how many lines it has; beyond ``at_most`` lines they are only counted.
+    """The numbers of a text, one per line, and its line count; beyond ``at_most`` lines they are only counted.
 
-    A line may be of any length: one without end is cut at ``BLOCK_BYTES``.
+    Lines may have any length: longer ones are cut at ``BLOCK_BYTES``.
     """
     values, n_lines = array("i"), 0
     with reading(where, DataError), opened(path) as file:
@@ -311,7 +311,7 @@ def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array
             word = line.strip()
             if not WHOLE_NUMBER.fullmatch(word):
                 shown = ascii(word[:20].decode("ascii", "replace"))
-                raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number a line")
+                raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number per line")
             if n_lines <= at_most:
                 values.append(int(word))
     return np.array(values, np.int32), n_lines
@@ -328,9 +328,9 @@ def cloud_files(sequence: Path) -> tuple[Path, ...]:
 
 
 def conceptgraphs_truth(sequence: Path, reference: Path, where: str) -> GroundTruth:
-    """The labelled cloud in the world, and the reference cloud as the points to be scored; no instances.
+    """The labelled cloud in the world, and the reference cloud as the points to score; no instances.
 
-    The label of a point is the argmax of its 102 channels, the first maximum: a row of zeros is 'other', id 0.
+    The label of a point is the argmax of its 102 channels (first maximum): a row of zeros is 'other', id 0.
     """
     trajectory, points_file, labels_file = cloud_files(sequence)
     first_pose = read_first_pose(trajectory, f"{where}: {sequence.name}/{trajectory.name}")
@@ -339,7 +339,7 @@ def conceptgraphs_truth(sequence: Path, reference: Path, where: str) -> GroundTr
     labels = largest_column(labels_file, N_EMBEDDING, labels_where)
     if len(labels) != len(points):
         raise DataError(
-            f"{labels_where}: has {len(labels)} rows, {points_file.name} has {len(points)}; both must be of one cloud"
+            f"{labels_where}: has {len(labels)} rows, {points_file.name} has {len(points)}; they must match"
         )
     return GroundTruth(
         moved(points, first_pose),
@@ -358,5 +358,5 @@ def read_points(path: Path, where: str) -> Float32Array:
     points = read_rows(path, 3, where)
     check_finite(points, where, "point")
     if not len(points):
-        raise DataError(f"{where}: holds no point; make or copy it again")
+        raise DataError(f"{where}: has no points; create or copy it again")
     return points

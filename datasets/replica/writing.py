@@ -1,4 +1,4 @@
-"""Scenes in the exact layout of Replica: the render tree and the original release."""
+"""Write scenes in the exact layout of Replica: the render tree and the original release."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from su3d_bench.datasets.rooms.scan import RoomScan
     from su3d_bench.datasets.rooms.truth import RoomObject
 
-LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
-DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m
+LAYOUT_VERSION = 1  # increase it when the written bytes of a scene change
+DEPTH_SCALE = 6553.5  # NICE-SLAM's render: 65535 is 10 m
 RENDER_FOLDER, ORIGINAL_FOLDER = "Replica", "replica_v1"
 STAGED_ORIGINAL, STAGED_MESH = ".original", ".mesh.ply"
 
@@ -51,7 +51,7 @@ class ReplicaLayout(Layout):
         k = dataset.intrinsics
         sizes = {"w": width, "h": height, "fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
         text = json_text({"camera": sizes | {"scale": DEPTH_SCALE}})
-        complaint = f"is another camera than that of {dataset.name} ({width}x{height})"
+        complaint = f"differs from the camera of {dataset.name} ({width}x{height})"
         write_shared_text(out / RENDER_FOLDER / "cam_params.json", text, complaint)
 
     def frame_names(self, index: int) -> Sequence[str]:
@@ -82,9 +82,9 @@ def _vertex_element(scan: RoomScan) -> PlyElement:
 
 
 def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
-    """Quads with ``object_id`` of 16 bits, as in the release."""
+    """Quads with a 16-bit ``object_id``, as in the release."""
     if scan.object_id.max(initial=0) > np.iinfo(np.uint16).max or scan.object_id.min(initial=0) < 0:
-        raise DataError(f"object ids go to {scan.object_id.max()}; the layout has 16 bits, 0 to 65535")
+        raise DataError(f"object ids go up to {scan.object_id.max()}; the layout's 16 bits allow 0 to 65535")
     faces: dict[str, Column] = {
         "vertex_indices": images.list_column(scan.faces),
         "object_id": scan.object_id.astype(np.uint16),

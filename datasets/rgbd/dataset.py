@@ -1,7 +1,7 @@
 """Any folder of colour, depth and pose files, described by one ``rgbd.toml`` (see ``description.py``).
 
 A scene is ``rgbd/<scene>/rgbd.toml`` below the data root, or a TOML file or a folder with ``rgbd.toml`` that the option
-``files`` names. Frames that lack an image or a pose are said once and left out. There is no ground truth.
+``files`` names. Frames without an image or a pose are reported once and excluded. There is no ground truth.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ OTHER |= {"opencv": "opengl", "opengl": "opencv"}
 
 
 class RgbdOptions(BaseModel):
-    """``files``: descriptions outside the data root, each a TOML file or a folder that holds ``rgbd.toml``."""
+    """``files``: descriptions outside the data root, each a TOML file or a folder with ``rgbd.toml``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,8 +50,8 @@ class RgbdOptions(BaseModel):
 class Rgbd(RecordedDataset[RgbdOptions]):
     """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth.
 
-    ``folders`` are the description of each scene: those of the option ``files`` in its order, then those below the
-    data root. A file is called by its own name, or by its folder's where it is an ``rgbd.toml``.
+    ``folders`` are the description of each scene: those of the option ``files`` in order, then those below the
+    data root. A scene is named after its file or, for an ``rgbd.toml``, after its folder.
     """
 
     name = "rgbd"
@@ -77,11 +77,11 @@ class Rgbd(RecordedDataset[RgbdOptions]):
         return SceneTree(self.root, (*self.options.files, place), {name: (path,) for name, path in path_of.items()})
 
     def is_reading_checked(self, scene: str) -> bool:
-        """Whether the description lets depth be held against the poses."""
+        """Whether the description allows checking depth against the poses."""
         return self._open(scene)[0].check_convention
 
     def correction_of_reading(self, scene: str, finding: Finding) -> str:
-        """The keys of the description that make the files be read as ``finding`` says."""
+        """The keys of the description to change so that the files are read as ``finding`` suggests."""
         description = self._open(scene)[0]
         changes = [f'{key} = "{OTHER[getattr(description, key)]}"' for key in finding.changes(description.camera_axes)]
         if finding.depth_factor == ROTATED and description.depth_rotated_bits == 0:
@@ -90,15 +90,15 @@ class Rgbd(RecordedDataset[RgbdOptions]):
             changes.append(f"depth_unit_m = {description.depth_unit_m * finding.depth_factor:g}")
         return (
             f"with {' and '.join(changes)}; set that in {self.folder(scene).name}, or check_convention = false "
-            "to read the files as they are described"
+            "to read the files as described"
         )
 
     def surface(self, scene: str) -> Surface:
-        """The mesh that the description names."""
+        """The mesh in the description."""
         description, recording = self._open(scene)
         place = f"{recording.where}: {self.folder(scene).name}"
         if description.mesh is None:
-            raise DataError(f'{place} names no mesh; add one in the world of the poses: mesh = "mesh.ply"')
+            raise DataError(f'{place} has no mesh; add one in the world of the poses: mesh = "mesh.ply"')
         surface = read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
         if description.up is None:
             return surface
@@ -106,11 +106,11 @@ class Rgbd(RecordedDataset[RgbdOptions]):
         return replace(surface, vertices=turned)
 
     def up(self, scene: str) -> WorldUp:
-        """What the description says of its world, or else what the frames show."""
+        """The world's up axis from the description, otherwise as the frames show it."""
         description, recording = self._open(scene)
         name = self.folder(scene).name
         if description.up is not None:
-            return WorldUp(description.up, True, f"{name} says so")
+            return WorldUp(description.up, True, f"set in {name}")
         guess = guess_up(
             np.array([frame.pose for frame in recording.frames]),
             recorded_frames.RecordedFrames(recording, is_quiet=True),
@@ -128,7 +128,7 @@ class Rgbd(RecordedDataset[RgbdOptions]):
 
 
 def open_recording(path: Path, description: files.RgbdDescription, where: str) -> recorded_frames.Recording:
-    """The usable frames of what the TOML file ``path`` describes; what is missing is said once, as a warning."""
+    """The usable frames described by the TOML file ``path``; missing parts are reported once, as a warning."""
     place = f"{where}: {path.name}"
     folder = _folder(path, description, place)
     colours, depths = (files.files_of(folder, name, place) for name in (description.colour, description.depth))
@@ -136,7 +136,7 @@ def open_recording(path: Path, description: files.RgbdDescription, where: str) -
     if files.INDEX not in description.colour and not len(colours) == len(depths) == len(poses.of_number):
         raise DataError(
             f"{place}: {len(colours)} colour files, {len(depths)} depth files and {len(poses.of_number)} poses match; "
-            f"files pair up in order only where there are as many of each, otherwise by {files.INDEX}"
+            f"files pair up in order only if the counts are equal; otherwise use {files.INDEX}"
         )
     frames, missing = [], []
     for number in sorted(colours.keys() | depths.keys() | poses.of_number.keys()):
@@ -163,14 +163,14 @@ def _folder(path: Path, description: files.RgbdDescription, place: str) -> recor
     try:
         if (path.parent / description.folder).is_dir():
             return recorded_frames.Folder(path.parent / description.folder)
-    except OSError:  # a name too long for the file system
+    except OSError:  # the name is too long
         pass
-    raise DataError(f"{place}: folder = {description.folder[:80]!r}: there is no such folder beside {path.name}")
+    raise DataError(f"{place}: folder = {description.folder[:80]!r}: no such folder next to {path.name}")
 
 
 @dataclass(frozen=True)
 class _Poses:
-    """Poses and, where they have them, times in seconds by the number of the frame, and the files they came from."""
+    """Poses and, if available, times in seconds by frame number, and the files they come from."""
 
     of_number: dict[int, files.Pose]
     times_s: dict[int, float]
@@ -190,8 +190,8 @@ def _poses(
                 contradicting.append(f"{name} begins with {printable(header, 40)!r}")
         if contradicting:
             logger.warning(
-                "%s: the poses are read as %s, and %d of their files say otherwise (the first: %s); what they are is "
-                "told by the depth alone",
+                "%s: the poses are read as %s, but %d of their files have another header (the first: %s); only the "
+                "depth images can decide",
                 *(place, description.pose_direction, len(contradicting), contradicting[0]),
             )
         return _Poses(pose_of, {}, tuple(folder.path / name for name in names.values()))
@@ -201,9 +201,9 @@ def _poses(
     numbers = images if len(matrices) == len(images) else range(images[0], images[-1] + 1)
     if len(matrices) != len(numbers):
         raise DataError(
-            f"{where} has {len(matrices)} poses; expected {len(images)}, one an image"
+            f"{where} has {len(matrices)} poses; expected {len(images)}, one per image"
             + (
-                f", or {len(numbers)}, one a number from {images[0]} to {images[-1]}"
+                f", or {len(numbers)}, one per number from {images[0]} to {images[-1]}"
                 if len(numbers) > len(images)
                 else ""
             )
@@ -218,7 +218,7 @@ def _poses(
 def _intrinsics(
     folder: recorded_frames.Folder, description: files.RgbdDescription, where: str, place: str
 ) -> tuple[Float64Array, tuple[int, int] | None, tuple[Path, ...]]:
-    """Intrinsics, the image size where a file says it, and that file."""
+    """Intrinsics, the image size if a file states it, and that file."""
     if description.intrinsics is not None:
         return recorded_frames.pinhole(*description.intrinsics, where=place), None, ()
     assert description.intrinsics_file is not None
@@ -228,7 +228,7 @@ def _intrinsics(
 
 @lru_cache(maxsize=8)
 def depth_table(description: files.RgbdDescription) -> Float32Array:
-    """Metres (65536,) of every value that a depth image can hold, 0 where it means that there is no depth."""
+    """Metres (65536,) of every possible value of a depth image, 0 if it means no depth."""
     stored = np.arange(recorded_frames.N_DEPTH_VALUES, dtype=np.uint32)
     bits = description.depth_rotated_bits
     values = ((stored >> bits) | (stored << (16 - bits))) & 0xFFFF

@@ -1,4 +1,4 @@
-"""``rgbd.toml`` and the files that it names: which belong together, and the poses and intrinsics in them."""
+"""``rgbd.toml`` and the files it names: how files pair up, and their poses and intrinsics."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from su3d_bench.formats.arrays import parsed_json, read_text
 
 FILE_NAME = "rgbd.toml"
 INDEX = "{index}"
-MAX_DESCRIPTION_BYTES = 1 << 14  # some twenty lines are in use; deeply nested keys take quadratic time
+MAX_DESCRIPTION_BYTES = 1 << 14  # about twenty lines suffice; deeply nested keys take quadratic time
 Number = Annotated[float, Field(allow_inf_nan=False)]
 DepthValue = Annotated[int, Field(ge=0, le=65535)]
 
 
 class RgbdDescription(BaseModel):
-    """The keys of ``rgbd.toml``; every file but ``folder`` is named relative to ``folder`` and lies inside it.
+    """The keys of ``rgbd.toml``; all files except ``folder`` are relative to ``folder`` and inside it.
 
-    - ``folder``: where the data is, relative to the TOML file
-    - ``colour``, ``depth``, ``pose``: patterns. With ``{index}`` in all of them, files of one number belong together;
-      with ``*`` or ``?`` in all of them, the k-th file of each in numeric order. JPEG, PNG, PPM; PNG, PGM of 16 bits
-    - ``pose``: text files of a 4x4 matrix; or ``trajectory``: one file with a pose for every image or, where images are
+    - ``folder``: location of the data, relative to the TOML file
+    - ``colour``, ``depth``, ``pose``: patterns. With ``{index}`` in all of them, files with the same number pair up;
+      with ``*`` or ``?`` in all of them, files pair up in numeric order. JPEG, PNG, PPM; PNG, PGM of 16 bits
+    - ``pose``: text files of a 4x4 matrix; or ``trajectory``: one file with a pose per image or, if images are
       missing, for every number from the first to the last. ``trajectory_format``: ``open3d`` (blocks of five lines,
-      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers a line) or
-      ``matrix`` (16 numbers a line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
+      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers per line) or
+      ``matrix`` (16 numbers per line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
     - ``pose_direction`` and ``camera_axes``: what the matrices map, and whether y points down and z into the scene
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
-      left; with 3, a value p means ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: how many units, besides 0,
-      mean no depth; 65535 need not be named, it means none wherever it stands apart from all other depths of its image
+      left; with 3, a value p is ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: values that, besides 0,
+      mean no depth; 65535 is not needed, it means none if it is far from all other depths of its image
     - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
-    - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are turned until it is z.
-      Without it the world stays as it is; where the frames show another axis to point up, that is said
-    - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that work on one
-    - ``frames_per_second``: gives frames their times where the trajectory has none
-    - ``check_convention``: off to read poses that the depth images contradict
+    - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are rotated so that it is z.
+      Without it the world is unchanged, with a warning if the frames show another axis to point up
+    - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that need one
+    - ``frames_per_second``: gives the frame times if the trajectory has none
+    - ``check_convention``: false to read poses that contradict the depth images
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -82,10 +82,10 @@ class RgbdDescription(BaseModel):
     def _check_pairs(self) -> RgbdDescription:
         for key, other in (("pose", "trajectory"), ("intrinsics", "intrinsics_file")):
             if (getattr(self, key) is None) == (getattr(self, other) is None):
-                raise ValueError(f"give '{key}' or '{other}', one of the two")
+                raise ValueError(f"give either '{key}' or '{other}'")
         patterns = [pattern for pattern in (self.colour, self.depth, self.pose) if pattern is not None]
         if len({INDEX in pattern for pattern in patterns}) > 1:
-            raise ValueError("some patterns have {index} and some have not; give it to all of them or to none")
+            raise ValueError("some patterns have {index} and some do not; use it in all or none")
         return self
 
 
@@ -107,13 +107,13 @@ def read_description(path: Path, where: str) -> RgbdDescription:
     except tomllib.TOMLDecodeError as error:
         raise DataError(f"{where}: not valid TOML: {error}") from error
     except ConfigError as error:
-        # A rule on several keys has no line of its own.
+        # A rule on several keys has no line number.
         place, of_whole, rule = str(error).partition(" rgbd = '...':")
         raise DataError(f"{where}:{rule}" if of_whole else f"{where}{place}") from error
 
 
 def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> None:
-    """What is misspelt before what is missing: a misspelt key is both."""
+    """Misspelt keys first, then missing ones, because a misspelt key is also missing."""
     fields = RgbdDescription.model_fields
     for key in table:
         if key not in fields:
@@ -124,21 +124,21 @@ def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> Non
             raise DataError(f"{where}: the key '{key}' is missing; needed: colour, depth, depth_unit_m, and more")
 
 
-MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit
+MAX_NUMBER = 2**31 - 1  # maps store frame numbers in 32 bits; time stamps in names do not fit
 MAX_DISTANCE_M = 1e6  # of a camera from the origin
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MATRIX_ROWS = {"kitti": (3, "the upper rows of a 4x4 matrix"), "matrix": (4, "a 4x4 matrix row by row")}
-FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers a line
+FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers per line
 HEADER = re.compile(r"[#%/\s]*[A-Za-z_](?!(?i:nf|an)\b)")  # a word, which is neither inf nor nan
 DIRECTION = re.compile(r"(world|w|cam(?:era)?|c)[\W_]*(?:2|to)[\W_]*(?:world|w|cam(?:era)?|c)", re.IGNORECASE)
-Pose = Float64Array | None  # None: tracking was lost, the matrix holds numbers that are not finite
+Pose = Float64Array | None  # None: tracking was lost, the matrix has non-finite values
 
 
 def files_of(folder: Folder, pattern: str, where: str) -> dict[int, str]:
-    """Number -> name below the folder, ascending: that at ``{index}``, or the place in numeric order."""
+    """Number -> name below the folder, ascending: the value of ``{index}``, or the position in numeric order."""
     directory, _, name_pattern = pattern.rpartition("/")
     if any(character in directory for character in "*?{}"):
-        raise DataError(f"{where}: {pattern!r}: the folder of a pattern is fixed; *, ? and {INDEX} stand in file names")
+        raise DataError(f"{where}: {pattern!r}: use *, ? and {INDEX} only in the file name, not in its folder")
     parent = folder.file(directory, where) if directory else folder.path
     try:
         names = [child.name for child in parent.iterdir()]
@@ -168,12 +168,10 @@ def _numbered(names: Sequence[str], pattern: str, where: str) -> dict[int, str]:
         if match := form.fullmatch(name):
             number = int(match[1])
             if number > MAX_NUMBER:
-                raise DataError(
-                    f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; name the files with * instead"
-                )
+                raise DataError(f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; use * in the pattern instead")
             if number in name_of:
                 raise DataError(
-                    f"{where}: {name_of[number][:60]} and {name[:60]} have one number; expected one file each"
+                    f"{where}: {name_of[number][:60]} and {name[:60]} have the same number; expected one file each"
                 )
             name_of[number] = name
     return name_of
@@ -184,7 +182,7 @@ def _numeric_order(name: str) -> tuple[list[int], str]:
 
 
 def read_trajectory_file(path: Path, form: str, where: str) -> tuple[Float64Array, list[float] | None]:
-    """The matrix of each pose (n, 4, 4), and the times in seconds where the file has them."""
+    """The matrix of each pose (n, 4, 4), and the times in seconds if the file has them."""
     if form == "open3d":
         return np.array(_open3d_log(read_text(path, where).split("\n"), where)).reshape(-1, 4, 4), None
     if form in MATRIX_ROWS:
@@ -226,7 +224,7 @@ def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
 
 
 def read_pose(folder: Path, name: str, where: str) -> tuple[Float64Array, str]:
-    """The matrix (4, 4) in a text file, and the line of words before it that some programs write; empty without one."""
+    """The matrix (4, 4) in a text file, and the header line that some programs write before it (or empty)."""
     where = f"{where}: {name}"
     text = read_text(folder / name, where)
     first, _, rest = text.lstrip().partition("\n")
@@ -235,7 +233,7 @@ def read_pose(folder: Path, name: str, where: str) -> tuple[Float64Array, str]:
 
 
 def direction_in(header: str) -> str | None:
-    """What a header says that a matrix maps; None where it does not."""
+    """What a matrix maps according to a header; None if the header does not state it."""
     found = DIRECTION.search(header)
     if found is None:
         return None
@@ -243,7 +241,7 @@ def direction_in(header: str) -> str | None:
 
 
 def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str) -> Pose:
-    """The pose with OpenCV axes, in a world with z up, out of a matrix (4, 4) that is meant as the description says."""
+    """The pose with OpenCV axes in a z-up world, from a matrix (4, 4) in the convention of the description."""
     if not np.isfinite(matrix).all():
         return None
     if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
@@ -260,7 +258,7 @@ def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: s
 
 
 def read_intrinsics(path: Path, where: str) -> tuple[Float64Array, tuple[int, int] | None]:
-    """Intrinsics (3, 3), and the image size where the file says it: Open3D's JSON does, a matrix in a text does not."""
+    """Intrinsics (3, 3), and the image size if the file states it: Open3D's JSON does, a text matrix does not."""
     text = read_text(path, where)
     if path.suffix == ".json":
         return _open3d_camera(text, where)
@@ -287,7 +285,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _pinhole_matrix(matrix: Float64Array, where: str) -> Float64Array:
-    """The matrix, if it is one of a pinhole camera without skew."""
+    """The matrix, if it is a skew-free pinhole camera's."""
     (fx, skew, cx), (below, fy, cy) = matrix[:2]
     if max(abs(skew), abs(below)) > 1e-6 * max(abs(fx), 1) or not np.array_equal(matrix[2], (0, 0, 1)):
         raise DataError(f"{where}: not a pinhole camera; expected fx 0 cx, 0 fy cy, 0 0 1")

@@ -12,10 +12,10 @@ from su3d_bench.core.system.files import file_text, parse_toml
 
 @dataclass(frozen=True)
 class RoomClass:
-    """One class: ``id`` and ``name`` as in Replica's info_semantic.json; what it may be made of.
+    """A class: ``id`` and ``name`` as in Replica's info_semantic.json, possible materials and models.
 
-    ``models``: the usual volume in litres of each sort of it that can be built; ``called``: what people call a sort
-    that is not called as its class is.
+    ``models``: the typical volume in litres of each model that can be built; ``called``: the everyday name of a
+    model that differs from its class name.
     """
 
     id: int

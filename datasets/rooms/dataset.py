@@ -1,4 +1,4 @@
-"""Built-in procedural indoor scenes: made on demand from a name, rendered by ray casting, fully known."""
+"""Built-in procedural indoor scenes: generated on demand from a name, rendered by ray casting, fully annotated."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from su3d_bench.datasets.rooms.scan import RoomScan, kept_arrays, kept_scan, sca
 from su3d_bench.datasets.rooms.trajectory import walk
 from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth, attribute_of_object, truth_of
 
-SOURCES = ("datasets/rooms", "numerics")  # what moves a room: what is kept of one is keyed by it
-GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
+SOURCES = ("datasets/rooms", "numerics")  # what affects a room: part of the key of cached data
+GENERATOR_VERSION = 3  # increase it whenever a scene of the same name changes
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
-TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
+TRAINING_FROM = 10_000  # numbers from here on are reserved for training the embedded encoder; no benchmark uses them
 FRAMES_PER_SECOND = 30.0
 N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
 ROOMS_IN_MEMORY = 2
 
 
 class RoomOptions(BaseModel):
-    """Image size, length of the walk, sensor noise (0 none, 1 mild, 2 strong), density of the scan."""
+    """Image size, length of the trajectory, sensor noise (0 none, 1 mild, 2 strong), density of the scan."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -65,7 +65,7 @@ def label_set() -> LabelSet:
 
 
 def scene_name_parts(scene: str) -> tuple[str, int]:
-    """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
+    """Kind and number of a scene name; raises ``DataError`` if it is not a scene."""
     match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
     if match is None or match[1] not in KINDS:
         hint = nearest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KINDS)}"
@@ -74,14 +74,14 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
 
 
 def _generator(*words: object) -> np.random.Generator:
-    """A random stream that the words fix, on every machine."""
+    """A random stream determined by the words, identical on every machine."""
     digest = hashlib.sha256("/".join(str(word) for word in words).encode()).digest()
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))
 
 
 @dataclass
 class BuiltRoom:
-    """A furnished room; what is costly is made when first asked for, and kept in ``folder`` if there is one."""
+    """A furnished room; expensive parts are computed on first use and cached in ``folder`` if there is one."""
 
     scene: str
     options: RoomOptions
@@ -115,7 +115,7 @@ class BuiltRoom:
         return Renderer(self.mesh, self.options.width, self.options.height)
 
     def coarser(self, width: int) -> Renderer:
-        """A renderer of the same tree, kept until another width is asked for."""
+        """A renderer sharing the same tree, cached until another width is requested."""
         if self._coarser is None or self._coarser.width != width:
             height = max(1, round(self.options.height * width / self.options.width))
             self._coarser = Renderer(self.mesh, width, height, self.renderer)
@@ -128,7 +128,7 @@ class BuiltRoom:
 
     @property
     def scan(self) -> RoomScan:
-        """The surface that the walk sees, made anew."""
+        """The surface seen on the trajectory, recomputed."""
         return scan_room(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m)
 
     def _kept_in(self, what: str) -> Path | None:
@@ -142,7 +142,7 @@ class BuiltRoom:
 
 
 class Rooms:
-    """Furnished rooms, made from their names; ``root`` holds what is kept of them."""
+    """Furnished rooms, generated from their names; ``root`` contains their cached data."""
 
     name = "rooms"
     label_space = "replica"
@@ -185,7 +185,7 @@ class Rooms:
         return self._room(scene).truth.objects
 
     def whole_objects(self, scene: str) -> tuple[WholeObject, ...]:
-        """Every object whole, seen or not."""
+        """Every object, complete, visible or not."""
         return tuple(known.whole() for known in self.objects(scene))
 
     def trajectory(self, scene: str) -> Float64Array:
@@ -193,13 +193,13 @@ class Rooms:
         return self._room(scene).trajectory
 
     def render(self, scene: str, view: int | Float64Array) -> RenderedFrame:
-        """The noise-free images at a frame of the walk or at any camera-to-world pose."""
+        """The noise-free images at a frame of the trajectory or at any camera-to-world pose."""
         room = self._room(scene)
         pose = room.trajectory[view] if isinstance(view, int | np.integer) else np.asarray(view, np.float64)
         return room.renderer.render(pose)
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """Every ``stride``-th frame, rendered when asked for."""
+        """Every ``stride``-th frame, rendered on access."""
         scene_name_parts(scene)
         return RoomFrames(self, scene, range(0, self.options.n_frames, stride))
 
@@ -210,7 +210,7 @@ class Rooms:
         return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self.trajectory(scene)[index], self.intrinsics)
 
     def sketch(self, scene: str, index: int, width: int) -> Frame:
-        """Frame ``index`` with fewer pixels, free of noise: colours and depths where the thinned rays hit."""
+        """A noise-free frame ``index`` with fewer pixels: colours and depths where the subsampled rays hit."""
         if width >= self.options.width:
             return self.frame(scene, index)
         room = self._room(scene)
@@ -220,12 +220,12 @@ class Rooms:
         return Frame(index, index / FRAMES_PER_SECOND, image.rgb, image.depth_m, pose, intrinsics)
 
     def scan(self, scene: str) -> RoomScan:
-        """The ground-truth surface; made once, then read from the cache."""
+        """The ground-truth surface; computed once, then read from the cache."""
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
         return kept_scan(path, lambda: self._room(scene).scan)
 
     def _scan_key(self, scene: str) -> str:
-        """What a scan depends on: not the size of the images nor their noise."""
+        """What a scan depends on: not on image size or noise."""
         from su3d_bench.core.digests import package_digest
 
         scene_name_parts(scene)
@@ -234,53 +234,53 @@ class Rooms:
         return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
 
     def _baked_folder(self, scene: str) -> Path | None:
-        """Where mesh and walk are kept; None for the thousands of training, and where no data root was made yet."""
+        """Cache folder of mesh and trajectory; None for the thousands of training scenes and without a data root."""
         from su3d_bench.core.digests import NUMERIC_PACKAGES, digest_json, package_digest, package_versions
 
         _, number = scene_name_parts(scene)
         if number >= TRAINING_FROM or not self.root.is_dir():
             return None
-        packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
+        packages = package_versions(NUMERIC_PACKAGES)  # another Open3D version may differ in the last bit
         words = package_digest(*SOURCES), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
         return self.root / "rooms" / digest_json(words)[:16]
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``).
 
-        Under the name of one of OpenScan's aspects: the vertices, with attributes in the place of classes.
+        For the name of an OpenScan aspect: the vertices, with attributes as classes.
         """
         if variant in self.extra_ground_truths:
             return self._attribute_truth(scene, variant)
         if variant not in self.variants:
             raise GroundTruthMissing(
-                f"rooms/{scene}: no ground truth '{variant}'; there is {' and '.join(self.variants)}"
+                f"rooms/{scene}: no ground truth '{variant}'; available: {' and '.join(self.variants)}"
             )
         scan = self.scan(scene)
         if variant == "mesh-vertices":
             points, owner = scan.vertices, scan.object_of_vertex()
         else:
             points, owner = scan.vertices[scan.faces.reshape(-1)], np.repeat(scan.object_id, 4)
-        source = f"rooms generator {GENERATOR_VERSION}: surface seen on the walk, {variant}"
+        source = f"rooms generator {GENERATOR_VERSION}: surface seen on the trajectory, {variant}"
         return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
 
     def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
         scan = self.scan(scene)
         owner = scan.object_of_vertex()
         attributes = attribute_of_object(self.objects(scene), variant)[owner]
-        source = f"rooms generator {GENERATOR_VERSION}: attributes of the objects, as far as the walk sees them"
+        source = f"rooms generator {GENERATOR_VERSION}: attributes of the objects seen on the trajectory"
         return GroundTruth(scan.vertices, attributes, owner, openscan.label_set(variant), variant, source)
 
     def _class_of_object(self, scene: str) -> Int32Array:
         return np.array([0, *[room_object.class_id for room_object in self.objects(scene)]], np.int32)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        """The rendered mesh itself, whole: hidden sides included."""
+        """The complete rendered mesh, including hidden sides."""
         mesh = self._room(scene).mesh
         classes = {room_object.id: room_object.class_id for room_object in self.objects(scene)}
         return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, label_set())
 
     def surface(self, scene: str) -> Surface:
-        """The scan without labels, each quad (0, 1, 2, 3) as the triangles (0, 1, 2) and (0, 2, 3).
+        """The scan without labels; each quad (0, 1, 2, 3) becomes the triangles (0, 1, 2) and (0, 2, 3).
 
         Its vertices are those of ``mesh-vertices``, in their order. No edge leads from one object to another.
         """
@@ -297,7 +297,7 @@ class Rooms:
 
 
 class RoomFrames(Sequence[Frame]):
-    """Frames of one room, each rendered when it is asked for."""
+    """Frames of one room, each rendered on access."""
 
     def __init__(self, rooms: Rooms, scene: str, indices: range) -> None:
         self._rooms, self._scene, self._indices = rooms, scene, indices

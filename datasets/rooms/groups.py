@@ -1,4 +1,4 @@
-"""Groups of things that belong together, and where: the steps of ``recipes.toml``."""
+"""Groups of objects that belong together, and their arrangement: the steps of ``recipes.toml``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POOLS: Mapping[str, list[str]] = parse_toml(file_text(Path(__file__).with_name("
 
 
 def stock(plan: Plan, anchor: Placed | None, wanted: Sequence[str], role: str = "top", turn: float = 8.0) -> None:
-    """Puts things on an anchor, as many as fit."""
+    """Puts objects on an anchor, as many as fit."""
     for want in wanted:
         if anchor is not None:
             plan.on(plan.new(want), anchor, role, turn=turn)
@@ -28,7 +28,7 @@ def some(plan: Plan, n: int, *wanted: str) -> list[str]:
 
 def stocked(plan: Plan, item: str, wanted: Sequence[str] = (), gap: float = 0.05, corner: bool = False,
             role: str = "top", turn: float = 8.0) -> None:  # fmt: skip
-    """A thing against a wall with others on it."""
+    """An object against a wall with others on it."""
     stock(plan, plan.against_wall(plan.new(item), gap=gap, corner=corner), wanted, role, turn)
 
 
@@ -42,7 +42,7 @@ def stocked_shelf(plan: Plan, extra: Sequence[str] = (), n: int = 7) -> None:
 
 
 def stocked_cabinet(plan: Plan, n: int, of: Sequence[str] | None = None, extra: Sequence[str] = ()) -> None:
-    """A cabinet with the ``extra`` things and ``n`` of others, small decoration unless named, on it."""
+    """A cabinet with the ``extra`` objects and ``n`` others on it (small decoration by default)."""
     cabinet = plan.against_wall(plan.new("cabinet"))
     stock(plan, cabinet, [*extra, *some(plan, n, *(POOLS["small_decor"] if of is None else of))])
 
@@ -99,7 +99,7 @@ def filled_basket(plan: Plan, content: str) -> None:
 
 
 def stood_up(item: Item) -> Item:
-    """A roll set on its end."""
+    """A roll standing on its end."""
     parts = [Part(part.shape.turned("y", 90), part.material) for part in item.parts]
     low = min(float(part.shape.quads[..., 2].min()) for part in parts)
     lifted = tuple(Part(part.shape.moved(z=-low), part.material) for part in parts)
@@ -213,7 +213,7 @@ def desk_place(plan: Plan, laptop: bool = False) -> Placed | None:
 
 
 def before_screen(plan: Plan, desk: Placed, item: Item, local_x: float, from_front: float) -> None:
-    """On a desk, at a place along it, near its front edge; elsewhere on it where that place is taken or beyond it."""
+    """On a desk at a position along it, near its front edge; elsewhere on it if that position is taken or outside."""
     spot = desk.item.spots[0]
     half = item.size[0] / 2
     placed = None
@@ -360,7 +360,7 @@ def counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[P
 
 
 def at_cabinet(plan: Plan, top: Placed, cabinet: Placed, item: Item) -> Placed | None:
-    """On the slab, over the middle of one cabinet."""
+    """On the slab, centred over one cabinet."""
     wall, along = plan.wall_of(cabinet)
     z = float(plan.boxes[top.id].high[2]) + GAP_M
     return plan.try_on(item, top, (*plan.wall_point(wall, along, 0.33), z), top.yaw, 0.0)

@@ -1,4 +1,4 @@
-"""Where things stand: a room's plan that refuses collisions, and ways to place an item in it."""
+"""Layout of a room: a plan that prevents collisions, and ways to place an item in it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from su3d_bench.datasets.rooms.objects.materials import Material, Texture, mix, 
 from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
 from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
 
-GAP_M = 0.002  # between touching faces, so that neither flickers through the other
+GAP_M = 0.002  # between touching faces, against z-fighting
 WALL_YAW = (0.0, -90.0, 180.0, 90.0)  # of an item with its back to the wall at y = depth, x = width, y = 0, x = 0
 FLAT = frozenset(("rug", "mat"))
 Value = TypeVar("Value")
@@ -44,22 +44,22 @@ def box_of(placed: Placed) -> Box:
 
 
 class Plan:
-    """A room being furnished; every method that places answers ``None`` where there is no room."""
+    """A room being furnished; every placing method returns ``None`` if there is no space."""
 
     def __init__(self, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
         self.rng = rng
         self.width, self.depth, self.height = width, depth, height
         self.placed: list[Placed] = []
         self.boxes: dict[int, Box] = {}
-        self.parent: dict[int, tuple[int, str]] = {}  # what holds an item, and how: on, in
-        self.rests_also_on: list[tuple[int, int]] = []  # where one slab lies on several
+        self.parent: dict[int, tuple[int, str]] = {}  # the holder of an item, and how: on, in
+        self.rests_also_on: list[tuple[int, int]] = []  # for a slab on several holders
         self.mount: dict[int, str] = {}
         self.keep_free: list[Box] = []
         self.lights: list[Light] = []
         self._used: dict[str, set[str]] = {}
 
     def new(self, want: str, colour: str | None = None) -> Item:
-        """An item of a class, or of a class/model, in a colour that the class does not have in this room yet."""
+        """An item of a class (or class/model), in a colour that the class does not have yet in this room."""
         class_name, _, model = want.partition("/")
         used = self._used.setdefault(class_name, set())
         item = make(class_name, self.rng, model or None, colour, frozenset(used))
@@ -88,7 +88,7 @@ class Plan:
         self, item: Item, x: float, y: float, yaw: float, z: float | None = None, gap: float = 0.0,
         mount: str = "floor", ignore: Sequence[int] = (),
     ) -> Placed | None:  # fmt: skip
-        """Places the item where it fits; ``z`` None stands it on the floor or on the rug that lies there."""
+        """Places the item where it fits; ``z`` None puts it on the floor or on the rug there."""
         candidate = Placed(0, item, yaw, np.array([x, y, 0.0 if z is None else z]))
         room = box_of(candidate)
         if z is None:
@@ -114,12 +114,12 @@ class Plan:
         self, item: Item, wall: int, along: float, off: float, z: float | None = None, gap: float = 0.0,
         mount: str = "floor", ignore: Sequence[int] = (),
     ) -> Placed | None:  # fmt: skip
-        """Back to a wall: its middle ``along`` it and ``off`` it."""
+        """Back to a wall: its centre ``along`` the wall and ``off`` it."""
         x, y = self.wall_point(wall, along, off)
         return self.try_at(item, x, y, WALL_YAW[wall], z, gap, mount, ignore)
 
     def try_by(self, item: Item, anchor: Placed, x: float, y: float, yaw: float, gap: float = 0.01) -> Placed | None:
-        """On the floor, at a place (x, y) as the anchor sees it."""
+        """On the floor, at a position (x, y) relative to the anchor."""
         world_x, world_y, _ = anchor.to_world(np.array([x, y, 0.0]))
         return self.try_at(item, float(world_x), float(world_y), yaw, None, gap)
 
@@ -127,7 +127,7 @@ class Plan:
         self, item: Item, holder: Placed, place: Sequence[float] | Float64Array, yaw: float, gap: float,
         relation: str = "on",
     ) -> Placed | None:  # fmt: skip
-        """At a place (x, y, z) of the world on ``holder``, and held by it."""
+        """At a world position (x, y, z) on ``holder``, which holds it."""
         x, y, z = (float(value) for value in place)
         placed = self.try_at(item, x, y, yaw, z, gap, "object", ignore=self._chain(holder.id))
         if placed:
@@ -140,7 +140,7 @@ class Plan:
     def against_wall(
         self, item: Item, walls: Sequence[int] = (0, 1, 2, 3), gap: float = 0.05, corner: bool = False
     ) -> Placed | None:
-        """Back to a wall, at a random place along it (or in a corner)."""
+        """Back to a wall, at a random position along it (or in a corner)."""
         half = item.size[0] / 2
         for wall in self.shuffled(walls) * 14:
             length = self.wall_length(wall)
@@ -167,7 +167,7 @@ class Plan:
         return next(filter(None, (self.hang(item, wall, float(along), z) for wall, along in places)), None)
 
     def wall_of(self, placed: Placed) -> tuple[int, float]:
-        """The wall behind an item, and its place along that wall."""
+        """The wall behind an item, and its position along that wall."""
         wall = WALL_YAW.index(placed.yaw)
         return wall, float(placed.position[0] if wall % 2 == 0 else placed.position[1])
 
@@ -184,14 +184,14 @@ class Plan:
 
     def facing(self, item: Item, anchor: Placed, distance: float, shift: float = 0.0, turn: float = 180.0,
                jitter: float = 0.0) -> Placed | None:  # fmt: skip
-        """In front of an item; ``turn`` 180 looks at it."""
+        """In front of an item; with ``turn`` 180 facing it."""
         depth = item.size[1] if turn % 180 == 0 else item.size[0]
         y = -(anchor.item.size[1] / 2 + distance + depth / 2)
         yaw = anchor.yaw + turn + float(self.rng.uniform(-jitter, jitter))
         return self.try_by(item, anchor, shift, y, yaw)
 
     def somewhere(self, item: Item, gap: float = 0.1, margin: float = 0.1) -> Placed | None:
-        """Anywhere on the floor, rather near a wall."""
+        """Anywhere on the floor, preferably near a wall."""
         reach = max(item.size[0], item.size[1]) / 2 + margin
         for _ in range(60):
             wall = int(self.rng.integers(0, 4))
@@ -228,7 +228,7 @@ class Plan:
         return chain
 
     def _within(self, item: Item, spot: Spot, where: str, yaw: float) -> tuple[float, float] | None:
-        """A place at which what the item stands on lies in the spot."""
+        """A position at which the item's contact area lies in the spot."""
         (x0, y0), (x1, y1) = item.foot
         feet = np.array([[x0, y0, 0], [x0, y1, 0], [x1, y0, 0], [x1, y1, 0]]) @ rotation("z", yaw).T
         low = spot.x0 - feet[:, 0].min(), spot.y0 - feet[:, 1].min()
@@ -246,7 +246,7 @@ class Plan:
         return x, y
 
     def finish_lights(self) -> None:
-        """A light under each hanging lamp, or under the ceiling's middle where none hangs, and above floor lamps."""
+        """A light under each hanging lamp (or at the centre of the ceiling if there is none) and above floor lamps."""
         lamps = [p for p in self.placed if p.item.class_name == "lamp"]
         hanging = [p for p in lamps if self.mount[p.id] == "ceiling"]
         for lamp in hanging:
@@ -263,7 +263,7 @@ def _rectangle(
     side: tuple[float, float, float], normal: tuple[float, float, float], material: Material, name: str, colour: str,
     made_of: str,
 ) -> Item:  # fmt: skip
-    """A single rectangle along x and ``side``, which is 0 in one of y and z, with a corner at the origin."""
+    """A single rectangle along x and ``side`` (which is 0 in y or z), with a corner at the origin."""
     x, y, z = side
     quads = np.array([[[0, 0, 0], [x, 0, 0], [x, y, z], [0, y, z]]], np.float64)
     shape = Shape(quads, np.broadcast_to(np.array(normal), (1, 4, 3)).copy())
@@ -271,7 +271,7 @@ def _rectangle(
 
 
 def add_shell(plan: Plan, tiled: bool) -> None:
-    """Floor, ceiling and the four walls, each an object of its own."""
+    """Floor, ceiling and the four walls, each a separate object."""
     rng = plan.rng
     made_of = "stone" if tiled or rng.random() < 0.2 else "wooden"
     colours = ["beige", "grey", "white"] if made_of == "stone" else ["brown", "beige", "beige", "grey"]
@@ -302,7 +302,7 @@ def add_shell(plan: Plan, tiled: bool) -> None:
 
 
 def add_openings(plan: Plan, n_windows: int, cover: str) -> None:
-    """A door, windows with what covers them, and the floor in front kept free."""
+    """A door, windows with coverings, and the floor in front kept free."""
     rng = plan.rng
     door = plan.new("door")
     wall = int(rng.integers(0, 4))

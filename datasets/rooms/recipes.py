@@ -1,4 +1,4 @@
-"""Furnishing a room by the recipe of its kind, from ``recipes.toml``."""
+"""Furnish a room by the recipe of its kind, from ``recipes.toml``."""
 
 from __future__ import annotations
 

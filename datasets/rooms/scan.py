@@ -1,4 +1,4 @@
-"""The ground-truth surface of a room as a scanner on the walk would have seen it; and what of a room is kept."""
+"""The ground-truth surface of a room as scanned along the trajectory; and the cached data of a room."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
-VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
-COARSE_STRIDE = 40  # frames are visited at this stride first, so that most faces are settled by the first few
+VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm per pixel at 1 m
+COARSE_STRIDE = 40  # frames are visited at this stride first, so that the first few decide most faces
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
         pose = poses[index].astype(np.float32)
         aim_at_faces(active, n_active, centres, normals, pose, intrinsics[0, 0], intrinsics[0, 2], intrinsics[1, 2],
                      VIEW_WIDTH, VIEW_HEIGHT, pixel, is_hit)  # fmt: skip
-        pixels = np.flatnonzero(is_hit)  # a third of the image: rays that decide nothing are not cast
+        pixels = np.flatnonzero(is_hit)  # a third of the image: other rays are not cast
         depth[pixels], instance[pixels] = renderer.depth_and_instance(poses[index], pixels)
         n_active = drop_seen(active, n_active, pixel, centres, normals, owner, seen, pose, depth, instance)
     return seen
@@ -78,7 +78,7 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
 def _welded(
     points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: RoomMesh
 ) -> RoomScan:
-    """One vertex for all corners of an object at one place, and none for what no face uses."""
+    """Merges the corners of an object at the same position, and drops unused vertices."""
     used = np.zeros(len(points), bool)
     used[faces] = True
     object_of_point = np.zeros(len(points), np.int64)
@@ -104,7 +104,7 @@ def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
     nearest = caster(mesh.vertices, mesh.triangles).compute_closest_points(o3d.core.Tensor(points))  # type: ignore[attr-defined]
     n = len(points)
     dull = mesh.materials.copy()
-    dull[:, 8] = 0.0  # the column of gloss
+    dull[:, 8] = 0.0  # the gloss column
     rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
     shade(np.ones(n, np.float32), nearest["primitive_ids"].numpy(), nearest["primitive_uvs"].numpy(), points,
           np.zeros(3, np.float32), mesh.triangles, mesh.normals, mesh.texture, mesh.light,
@@ -121,9 +121,9 @@ def kept_arrays(
     make: Callable[[], Arrays],
     forgiven: tuple[type[OSError], ...] = (OSError,),
 ) -> Arrays:
-    """The arrays of these ``names`` in ``path``, whose checksums hold, else those that ``make`` gives, kept there.
+    """The arrays of these ``names`` in ``path`` if their checksums are right, otherwise from ``make``, then stored.
 
-    A folder that takes no file only means that the next process makes the arrays again, where that is forgiven.
+    If writing fails with one of ``forgiven``, the next process computes the arrays again.
     """
     if path is None:
         return make()
@@ -138,10 +138,10 @@ def kept_arrays(
 
 
 def kept_scan(path: Path, make: Callable[[], RoomScan]) -> RoomScan:
-    """The scan in ``path``; made where it is not there, and then kept there, which must be possible."""
+    """The scan in ``path``; computed if missing, and then stored there, which must be possible."""
     try:
         return RoomScan(**kept_arrays(path, RoomScan.__dataclass_fields__, lambda: vars(make()), forgiven=()))
     except OSError as error:
         raise DataError(
-            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
+            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a writable folder"
         ) from error

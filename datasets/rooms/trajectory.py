@@ -1,4 +1,4 @@
-"""A smooth hand-held walk through a room that looks at everything in it."""
+"""A smooth hand-held trajectory through a room that shows everything in it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 CELL_M = 0.1
-CLEAR_M = 0.32  # between the camera and anything at its height
+CLEAR_M = 0.32  # minimum distance of the camera to anything at its height
 FRAMES_PER_VIEW = 40  # one chosen view in every 40 frames, the stride of OpenSU3D on Replica
 YAWS, PITCHES = 24, (-38.0, -24.0, -10.0, 8.0)
 HALF_WIDTH, HALF_HEIGHT = 0.8 * 0.8, 0.6 * 0.8  # tangents of the inner part of a 640x480 image with f = 400
@@ -23,7 +23,7 @@ def walk(mesh: RoomMesh, boxes: Sequence[Box], room: tuple[float, float, float],
          rng: np.random.Generator) -> Float64Array:  # fmt: skip
     """Camera-to-world poses (n_frames, 4, 4) with OpenCV axes.
 
-    ``n_structure`` is the last object id of the bare room (walls, floor, ceiling), which the views need not seek.
+    ``n_structure`` is the last object id of the bare room (walls, floor, ceiling), which views need not show.
     """
     path = _loop(_free_cells(boxes, room), boxes, rng)
     n_views = min(n_frames, max(10, n_frames // FRAMES_PER_VIEW))
@@ -44,7 +44,7 @@ def walk(mesh: RoomMesh, boxes: Sequence[Box], room: tuple[float, float, float],
 
 
 def _free_cells(boxes: Sequence[Box], room: tuple[float, float, float]) -> BoolArray:
-    """Cells (X, Y) whose centre keeps its distance from walls and from things at the camera's height."""
+    """Cells (X, Y) whose centre keeps its distance from walls and from objects at camera height."""
     nx, ny = int(room[0] / CELL_M), int(room[1] / CELL_M)
     x, y = np.meshgrid((np.arange(nx) + 0.5) * CELL_M, (np.arange(ny) + 0.5) * CELL_M, indexing="ij")
     for margin in (0.55, 0.4):
@@ -62,13 +62,13 @@ def _largest_part(free: BoolArray) -> BoolArray:
     from scipy.ndimage import label
 
     parts, n = label(free)
-    assert n > 0, "a room without a place to stand"
+    assert n > 0, "a room without free floor"
     sizes = np.bincount(parts.ravel())[1:]
     return np.asarray(parts == 1 + int(sizes.argmax()))
 
 
 def _loop(free: BoolArray, boxes: Sequence[Box], rng: np.random.Generator) -> Float64Array:
-    """A closed smooth path (N, 2) m through far-apart free cells, rather over bare floor than over furniture."""
+    """A closed smooth path (N, 2) m through distant free cells, preferably over bare floor."""
     cells = np.argwhere(free)
     points = (cells.astype(np.float64) + 0.5) * CELL_M
     chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())]
@@ -101,7 +101,7 @@ def _cost(points: Float64Array, boxes: Sequence[Box]) -> Float64Array:
 
 
 def _shortest_paths(free: BoolArray, cells: NDArray[np.intp], cost: Float64Array, order: Sequence[int]) -> list[int]:
-    """Cell indices along the cheapest way through all ``order`` stops and back to the first."""
+    """Cell indices along the cheapest path through all ``order`` stops and back to the first."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
@@ -147,7 +147,7 @@ def _along(loop: Float64Array, share: Float64Array) -> Float64Array:
 
 
 def _smooth(at: Float64Array, values: Float64Array, time: Float64Array) -> Float64Array:
-    """A monotone cubic through (at, values); beyond the last one it stays."""
+    """A monotone cubic through (at, values); constant after the last one."""
     from scipy.interpolate import PchipInterpolator
 
     if len(at) < 2:
@@ -156,7 +156,7 @@ def _smooth(at: Float64Array, values: Float64Array, time: Float64Array) -> Float
 
 
 def _wobble(rng: np.random.Generator, n_frames: int) -> Float64Array:
-    """Six slow unrests of a hand, each about -1..1, at 30 frames a second."""
+    """Six slow hand-shake signals, each about -1..1, at 30 frames per second."""
     time = np.arange(n_frames)[:, None] / 30.0
     total = np.zeros((n_frames, 6))
     for hertz, weight in ((0.35, 0.6), (0.9, 0.3), (1.7, 0.1)):
@@ -177,7 +177,7 @@ def _poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array, roll:
 
 
 def _choose_views(mesh: RoomMesh, stations: Float64Array, n_structure: int) -> tuple[Float64Array, Float64Array]:
-    """Yaw and pitch (degrees, yaw unwrapped) at each station, so that every object is seen again and again, well."""
+    """Yaw and pitch (degrees, yaw unwrapped) at each station, chosen to show every object repeatedly and well."""
     directions, weight = _sphere()
     candidates = np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in PITCHES])
     inside = _inside_view(candidates, directions)

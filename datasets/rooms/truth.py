@@ -1,4 +1,4 @@
-"""What is true of a room: its objects, how they relate, and their attributes as OpenScan has them."""
+"""Ground truth of a room: its objects, their relations, and their attributes as in OpenScan."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from su3d_bench.numerics.relations import Relations
 
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
 OPENINGS = frozenset(("door", "window"))
-# Materials that one can tell from a picture: the textures that only they have.
+# Materials recognizable in a picture: the textures that only they have.
 TEXTURE_WORDS = {"wooden": Texture.WOOD, "wicker": Texture.WICKER}
-WOOD_COLOURS = frozenset(("brown", "beige", "orange"))  # in other colours wood looks painted
+WOOD_COLOURS = frozenset(("brown", "beige", "orange"))  # wood of other colours looks painted
 MIN_SHOWN = 0.6  # of the surface
 
 
@@ -30,9 +30,9 @@ MIN_SHOWN = 0.6  # of the surface
 class RoomObject:
     """One object; ``id`` is its number in instance images, scans and meshes. Boxes are axis-aligned, world metres.
 
-    ``size_word`` compares with the usual size of the class; ``support`` is floor, wall, ceiling, object, or room for
-    what the room itself is made of. ``called``: what people would say, "pile of books"; ``shows_material``: whether a
-    picture tells the material.
+    ``size_word`` compares with the typical size of the class; ``support`` is floor, wall, ceiling, object, or room for
+    parts of the room itself. ``called``: everyday name, "pile of books"; ``shows_material``: whether a
+    picture shows the material.
     """
 
     id: int
@@ -50,14 +50,14 @@ class RoomObject:
     shows_material: bool = False
 
     def whole(self) -> WholeObject:
-        """The object as questions are made of it."""
+        """The object in the form from which questions are created."""
         box = np.array([self.box_min, self.box_max])
         return WholeObject(self.id, self.called, box, (self.material,) if self.shows_material else (), self.colour)
 
 
 @dataclass(frozen=True)
 class Relation:
-    """``subject`` stands in ``relation`` to ``object``; both are object ids."""
+    """``subject`` has the ``relation`` to ``object``; both are object ids."""
 
     subject: int
     relation: str
@@ -98,7 +98,7 @@ def _object(plan: Plan, placed_id: int) -> RoomObject:
 
 
 def _shows_material(item: Item) -> bool:
-    """Whether most of the surface has the texture that only this material has, and wood the colour of wood."""
+    """Whether most of the surface has a texture unique to this material and, for wood, a wooden colour."""
     if item.material == "wooden" and item.colour not in WOOD_COLOURS:
         return False
     area = {True: 0.0, False: 0.0}
@@ -119,7 +119,7 @@ MATERIAL = "material"
 
 
 def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Array:
-    """The attribute (n + 1,) of every object in an aspect by the object's id, 0 for none; that of id 0 is 0."""
+    """The attribute (n + 1,) of every object in an aspect, by object id; 0 for none and for id 0."""
     aspect = variant.partition("-")[2]
     ids = {word: attribute_id(variant, words) for word, words in _words_of(aspect).items()}
     words = [known.material if aspect == MATERIAL else known.class_name for known in objects]
@@ -128,6 +128,6 @@ def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Arr
 
 @cache
 def _words_of(aspect: str) -> Mapping[str, str]:
-    """The words of each class, or material, in an aspect."""
+    """The words of each class, or material, for an aspect."""
     table = parse_toml(file_text(Path(__file__).with_name("attributes.toml")))[aspect]
     return {name: words for words, names in table.items() for name in names}

@@ -1,4 +1,4 @@
-"""ScanNet: recordings as ``.sens`` files or as either reader exports them, truth from the annotated meshes."""
+"""ScanNet: recordings as ``.sens`` files or as either reader exports them, ground truth from the annotated meshes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from su3d_bench.formats.ply import read_ply
 
 
 def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where: str) -> Iterator[str]:
-    """Faults of the recording's index, its cameras and its poses."""
+    """Faults of the recording's index, cameras and poses."""
     try:
         source = open_source()
         walk, is_faulty = recordings.classify_poses(source)
@@ -34,7 +34,7 @@ def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where:
 
 
 def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Iterator[str]:
-    """Faults of the files that there are (by their names), each alone and, where all of the truth is, together."""
+    """Faults of the existing files (by name), each alone and, if the ground truth is complete, together."""
     readers: dict[str, Callable[[Path], object]] = {
         truth.TABLE_NAME: lambda path: truth.read_label_table(path, where),
         truth.FIRST_TABLE_NAME: lambda path: truth.read_label_table(path, where),
@@ -52,8 +52,8 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
 
 
 class ScannetOptions(BaseModel):
-    """``source``: which form of a recording is read where there are several. ``grid``: the camera whose images frames
-    have (``Registration``). ``axis_align``: turn poses and mesh along the walls, as ``axisAlignment`` says."""
+    """``source``: which form of a recording is read if there are several. ``grid``: the camera whose images frames
+    use (``Registration``). ``axis_align``: align poses and mesh with the walls, by ``axisAlignment``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -72,8 +72,8 @@ class ScanNet(FileDataset[ScannetOptions]):
     places_of_scenes = (".", "scans", "scannet/scans")
     how_to_get = (
         " or in its folders scans, scannet, scannet/scans (a scan is a folder such as scene0000_00 with "
-        "scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet says how to get it from "
-        "http://www.scan-net.org; or set SU3D_DATA to where it is, or make rooms in this layout: su3d-bench datasets "
+        "scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet explains how to get it from "
+        "http://www.scan-net.org; or set SU3D_DATA to its folder, or create rooms in this layout: su3d-bench datasets "
         "make rooms --layout scannet --out DIR"
     )
     label_space = "scannet"
@@ -85,14 +85,14 @@ class ScanNet(FileDataset[ScannetOptions]):
         return folders.find_scans(self.root)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
-        """The official splits, and the five scenes of the paper and of OVO, by name; whether they are here or not."""
+        """The official splits, and the five scenes of the paper and of OVO, by name; available or not."""
         return {split: folders.split_scenes(split) for split in folders.SPLITS} | {
             "paper": folders.PAPER_SCENES,
             "ovo": folders.OVO_SCENES,
         }
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: frames, those without a pose among them, and ground truth."""
+        """One-line summary of the scene from a quick look: frames (including those without a pose), ground truth."""
         frames = recordings.describe_recording(self.folder(scene), scene, self.where(scene), self.options.source)
         try:
             self._truth_files(scene)
@@ -102,11 +102,11 @@ class ScanNet(FileDataset[ScannetOptions]):
         return f"{frames}, ground truth{table}"
 
     def n_frames(self, scene: str, stride: int) -> int:
-        """The recording's index is read; frames without a pose are not counted."""
+        """Reads the recording's index; frames without a pose are not counted."""
         return len(self._open(scene)[1].every(stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """The usable ones among the first of every ``stride`` frames; a line of the log counts the others once."""
+        """The usable ones among every ``stride``-th frame; the number of others is logged once."""
         source, walk = self._open(scene)
         registration = make_registration(source.camera, self.options.grid, self.where(scene))
         self.warn_once(scene, walk.missing_frames_remark(self.where(scene)))
@@ -136,7 +136,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return truth.scannet200_truth(scan, table)
 
     def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
-        """OpenScan's attributes of the annotated objects; void where an object has none."""
+        """OpenScan's attributes of the annotated objects; void for objects without attributes."""
         where, path = self.where(scene), self._openscan
         if path is None:
             raise GroundTruthMissing(
@@ -165,7 +165,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return truth.instance_mesh(self._annotated_scan(scene), self._label_tables)
 
     def surface(self, scene: str) -> Surface:
-        """The decimated mesh, with the published segments where they are here; scans without truth have both."""
+        """The decimated mesh, with the published segments if available; scans without ground truth have both."""
         self.folder(scene)
         mesh = folders.find_file(self.tree, scene, truth.mesh_name(scene))
         if mesh is None:
@@ -180,7 +180,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         return surface if motion is None else replace(surface, vertices=truth.moved(surface.vertices, motion))
 
     def problems(self, scene: str) -> Iterator[str]:
-        """Every fault of the scene's files, one line each; the readers stop at the first."""
+        """Every fault of the scene's files, one line each; readers stop at the first."""
         where, folder = self.where(scene), self.folder(scene)
         yield from recording_problems(
             lambda: recordings.find_source(folder, scene, where, self.options.source), self.options.grid, where
@@ -199,28 +199,28 @@ class ScanNet(FileDataset[ScannetOptions]):
         return source, recordings.read_walk(source)
 
     def _motion(self, scene: str) -> Float64Array | None:
-        """What is applied to the world; None for nothing."""
+        """The transform applied to the world; None for none."""
         return self._alignment(scene) if self.options.axis_align else None
 
     def axis_alignment(self, scene: str) -> Float64Array:
-        """The motion (4, 4) that turns the truth along the walls; the identity where ``axis_align`` did it already."""
+        """The motion (4, 4) that aligns the ground truth with the walls; the identity if ``axis_align`` already did."""
         return np.eye(4) if self.options.axis_align else self._alignment(scene)
 
     def _alignment(self, scene: str) -> Float64Array:
         path = folders.find_file(self.tree, scene, truth.meta_name(scene))
         if path is None:
             raise DataError(
-                f"{self.where(scene)}: {truth.meta_name(scene)} is missing; what lies along the walls needs it, copy "
+                f"{self.where(scene)}: {truth.meta_name(scene)} is missing; it is needed for wall alignment, copy "
                 f"it into {self.tree.folders[scene][0]}"
             )
         return truth.read_axis_alignment(path, self.where(scene))
 
     def nyu40_class(self, category: str) -> str | None:
-        """The class of NYU40 that the table of the release gives a raw category; None where it has none."""
+        """The NYU40 class of a raw category in the release's table; None if it has none."""
         table = next((table for table in self._label_tables if table.name == truth.TABLE_NAME), None)
         if table is None:
             raise DataError(
-                f"{self.name}: {truth.TABLE_NAME} of the release is missing, by which names of objects have classes; "
+                f"{self.name}: {truth.TABLE_NAME} of the release is missing, which maps object names to classes; "
                 f"put it into {folders.table_folders(self.tree)[0]}"
             )
         class_id = table.nyu40_of.get(category)
@@ -237,14 +237,14 @@ class ScanNet(FileDataset[ScannetOptions]):
         return tuple(path for path in (*paths, *folders.label_tables(self.tree), self._openscan) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
-        """The path of each file of the truth."""
+        """The path of each file of the ground truth."""
         self.folder(scene)
         path_of = {name: folders.find_file(self.tree, scene, name) for name in truth.truth_names(scene)}
         missing = [name for name, path in path_of.items() if path is None]
         if missing:
             reason = f"; expected in {self.tree.folders[scene][0]}"
             if scene in folders.split_scenes("test"):
-                reason = "; the benchmark keeps that of its test scans to itself"
+                reason = "; it is not published for test scans"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing{reason}")
         return {name: path for name, path in path_of.items() if path is not None}
 

@@ -1,6 +1,6 @@
-"""ScanNet recordings in whichever form they lie in a scan's folder: the ``.sens`` file, or what a reader exported.
+"""ScanNet recordings in any form found in a scan's folder: the ``.sens`` file, or an export of a reader.
 
-Finding one, opening it, describing it at a glance, and its key.
+Finding a recording, opening it, a quick summary, and its key.
 
 Sources: ScanNet, SensReader/python/SensorData.py and SensReader/c++/sensorData.h at commit 3830fce; OpenMask3D, README
 and openmask3d/configs at commit 3bc3fc5.
@@ -43,7 +43,7 @@ MATRIX_KEYS = tuple(
 
 @dataclass(frozen=True)
 class PythonLayout:
-    """The folders of an export that has one for each kind of file."""
+    """The folders of an export that has one per kind of file."""
 
     colour: str = "color"
     depth: str = "depth"
@@ -59,10 +59,10 @@ PYTHON_LAYOUTS = (
 
 
 def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto") -> sensors.RgbdSource:
-    """The recording in a scan's folder; where there are several the ``.sens`` file, else that of the Python reader.
+    """The recording in a scan's folder; if there are several, the ``.sens`` file, then the Python reader's export.
 
-    Exports may lie in the folder itself, in ``exported/`` or in a folder with the name of the scene. ``DataError``
-    names all that was looked for where there is none.
+    Exports may be in the folder itself, in ``exported/`` or in a folder named after the scene. A ``DataError``
+    lists everything that was looked for if there is none.
     """
     with reading(where):
         form, place = _find(folder, scene, kind) or (None, folder)
@@ -81,7 +81,7 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
 
 
 def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path] | None:
-    """The form of the recording in a scan's folder, and where it is: the ``.sens`` file or the folder of the export."""
+    """The form of the recording in a scan's folder, and its location: the ``.sens`` file or the export's folder."""
     sens = folder / f"{scene}.sens"
     if kind in ("auto", "sens") and sens.exists():
         return "sens", sens
@@ -96,7 +96,7 @@ def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path]
 
 
 def python_layout(folder: Path) -> PythonLayout | None:
-    """The layout in which frames lie in ``folder``; None where none do."""
+    """The layout of the frames in ``folder``; None if there are none."""
     layouts = [
         layout for layout in PYTHON_LAYOUTS if (folder / layout.colour).is_dir() or (folder / layout.pose).is_dir()
     ]
@@ -105,7 +105,7 @@ def python_layout(folder: Path) -> PythonLayout | None:
 
 
 def open_python_export(folder: Path, where: str) -> sensors.ExportedFrames:
-    """The export of ScanNet's Python reader in ``folder``, or one that OpenMask3D prepared."""
+    """The export of ScanNet's Python reader in ``folder``, or one prepared by OpenMask3D."""
     layout = python_layout(folder) or PYTHON_LAYOUTS[0]
     kinds = {
         f"{name}/{{}}{ending}": sensors.by_number(
@@ -120,7 +120,7 @@ def open_python_export(folder: Path, where: str) -> sensors.ExportedFrames:
     known = set().union(*kinds.values())
     if not known:
         raise DataError(
-            f"{where}: {layout.colour}/, {layout.depth}/ and {layout.pose}/ hold no frames; {sensors.EXPORT_AGAIN}"
+            f"{where}: {layout.colour}/, {layout.depth}/ and {layout.pose}/ have no frames; {sensors.EXPORT_AGAIN}"
         )
     expected = sensors.every_kth(known)
     sensors.check_complete(kinds, expected, where)
@@ -134,7 +134,7 @@ def open_python_export(folder: Path, where: str) -> sensors.ExportedFrames:
 def _python_camera(
     folder: Path, layout: PythonLayout, first: sensors.FrameFiles, where: str
 ) -> tuple[sensors.SensorPair, list[str]]:
-    """The cameras, and the names of the files that describe them."""
+    """The cameras, and the names of their files."""
     colour_size, depth_size = (
         sensors.read_size(folder, first.colour, where),
         sensors.read_size(folder, first.depth, where),
@@ -148,7 +148,7 @@ def _python_camera(
         raise DataError(f"{where}: {colour_name} is missing; {sensors.EXPORT_AGAIN}")
     if depth_name not in there and depth_size != colour_size:
         raise DataError(
-            f"{where}: {depth_name} is missing, and depth images of {depth_size[0]}x{depth_size[1]} cannot take the "
+            f"{where}: {depth_name} is missing, and depth images of {depth_size[0]}x{depth_size[1]} cannot use the "
             f"intrinsics of colour images of {colour_size[0]}x{colour_size[1]}; {sensors.EXPORT_AGAIN}"
         )
     colour_intrinsics = _fitted_intrinsics(folder, colour_name, where, colour_size, COLOUR_SIZE)
@@ -172,9 +172,9 @@ def _python_camera(
 
 
 def _fitted_intrinsics(folder: Path, name: str, where: str, size: Size, full_size: Size) -> Float64Array:
-    """The intrinsics (3, 3) of images of ``size``; where the images were made smaller but the file was left, scaled.
+    """The intrinsics (3, 3) of images of ``size``; scaled if images were resized but the file was not updated.
 
-    OpenMask3D's layouts and the Python reader's resizing leave the file as it was for images of ``full_size``.
+    OpenMask3D's layouts and the Python reader's resizing leave the file as for images of ``full_size``.
     """
     matrix = sensors.read_matrix(folder, name, where, (4, 3))[:3, :3]
     centre, sizes, full_sizes = matrix[:2, 2] + 0.5, np.array(size), np.array(full_size)
@@ -182,7 +182,7 @@ def _fitted_intrinsics(folder: Path, name: str, where: str, size: Size, full_siz
         return matrix
     if (np.abs(centre / full_sizes - 0.5) <= OFF_CENTRE).all():
         scaled = matrix.copy()
-        scaled[:2, 2] += 0.5  # the middle of the first pixel is at 0
+        scaled[:2, 2] += 0.5  # the centre of the first pixel is at 0
         scaled[:2] *= (sizes / full_sizes)[:, None]
         scaled[:2, 2] -= 0.5
         return scaled
@@ -211,7 +211,7 @@ def open_cpp_export(folder: Path, where: str) -> sensors.ExportedFrames:
     sensors.check_complete(kinds, expected, where)
     colours, depths, poses = kinds.values()
     frames = [sensors.FrameFiles(n, colours[n], depths[n], poses[n]) for n in expected]
-    return sensors.ExportedFrames(folder, where, camera, frames, [INFO], f"as {INFO} says")
+    return sensors.ExportedFrames(folder, where, camera, frames, [INFO], f"as in {INFO}")
 
 
 def read_info(path: Path, where: str) -> tuple[sensors.SensorPair, int]:
@@ -248,12 +248,12 @@ def _count(words: Sequence[str], key: str, where: str) -> int:
 
 
 def folder_of_recording(folders: Sequence[Path], scene: str, kind: SourceKind) -> Path:
-    """The first of a scan's folders that holds a recording of that kind; the first of all where none does."""
+    """The first of a scan's folders with a recording of that kind, otherwise the first folder."""
     return next((folder for folder in folders if _find(folder, scene, kind) is not None), folders[0])
 
 
 def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -> str:
-    """How many frames there are, lost ones among them, without reading more than a header or a list of names."""
+    """The number of frames, including lost ones, from a header or a list of names only."""
     form, place = _find(folder, scene, kind) or (None, folder)
     if form is None:
         return "no recording"
@@ -270,7 +270,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
 
 
 def digest_recording(source: sensors.RgbdSource, poses: Float64Array) -> str:
-    """A key of a recording's cameras, poses and time stamps, of the sizes of all images, and of the first and last."""
+    """A key of a recording's cameras, poses and time stamps, the sizes of all images, and the first and last image."""
     total = hashlib.sha256()
     if isinstance(source, SensFile):
         total.update(header_bytes(source.header, len(source)) + source.records().tobytes())
@@ -299,36 +299,36 @@ class RecordedPoses:
     is_usable: BoolArray
 
     def every(self, stride: int) -> Int64Array:
-        """Usable records among the first of every ``stride`` frames; one without a pose is not replaced."""
+        """Usable records among every ``stride``-th frame; one without a pose is not replaced."""
         _, first = np.unique(self.numbers // stride, return_index=True)
         kept: Int64Array = first[self.is_usable[first]]
         return kept
 
     def missing_frames_remark(self, where: str) -> str | None:
-        """A line that counts the records without a usable pose."""
+        """A message with the number of records without a usable pose."""
         if self.is_usable.all():
             return None
         n_lost, first = int((~self.is_usable).sum()), int(self.numbers[np.argmin(self.is_usable)])
-        return f"{where}: frames without a pose, left out: {n_lost} of {len(self.numbers)} (the first: {first})"
+        return f"{where}: frames without a pose, excluded: {n_lost} of {len(self.numbers)} (the first: {first})"
 
 
 def read_walk(source: sensors.RgbdSource) -> RecordedPoses:
-    """Which records can be used.
+    """Determine which records are usable.
 
-    A pose that is not finite was lost. ScanNet's own reader also takes 0 in the first element for lost, but an exact
-    quarter turn has it too: here such a pose is lost unless it is a rigid motion. Any other pose that is none is a
+    A non-finite pose was lost. ScanNet's own reader also treats a first element of 0 as lost, but exact
+    quarter turns have it too: here such a pose is lost unless it is a rigid motion. Any other non-rigid pose is a
     ``DataError``, and so is a recording without any pose.
     """
     walk, is_faulty = classify_poses(source)
     if is_faulty.any():
         raise DataError(faulty_pose(source.where, int(walk.numbers[np.argmax(is_faulty)])))
     if not walk.is_usable.any():
-        raise DataError(f"{source.where}: none of the {len(walk.poses)} frames has a pose; leave the scene out")
+        raise DataError(f"{source.where}: none of the {len(walk.poses)} frames has a pose; exclude the scene")
     return walk
 
 
 def classify_poses(source: sensors.RgbdSource) -> tuple[RecordedPoses, BoolArray]:
-    """The records as ``read_walk`` has them, and which of them (n,) have a pose that is neither lost nor right."""
+    """The records as in ``read_walk``, and which of them (n,) have a pose that is neither lost nor valid."""
     poses = source.poses()
     is_finite = np.isfinite(poses).all(axis=(1, 2))
     is_rigid = np.zeros(len(poses), bool)
@@ -341,7 +341,7 @@ def faulty_pose(where: str, number: int) -> str:
 
 
 class ScannetFrames(Sequence[Frame]):
-    """The frames of ``records``, each read and registered when it is asked for.
+    """The frames of ``records``, each read and registered on access.
 
     ``motion`` (4, 4) is applied to the world, None for none.
     """

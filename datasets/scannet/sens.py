@@ -1,4 +1,4 @@
-"""``.sens`` files read and written: cameras and compression in the header, then the frames, then motion data.
+"""Read and write ``.sens`` files: cameras and compression in the header, then the frames, then motion data.
 
 Little-endian, without padding. Source: ScanNet, SensReader/c++/sensorData.h at commit 3830fce.
 """
@@ -35,15 +35,15 @@ START = struct.Struct("<IQ")  # version, length of the sensor's name
 REST = struct.Struct("<64f2i4If")  # four matrices, two codes, two sizes, depth shift
 COUNT = struct.Struct("<Q")
 MAX_NAME_BYTES = 4096  # ScanNet has 15, 'StructureSensor'
-MAX_FRAMES = 10_000_000  # 92 hours at 30 frames a second
+MAX_FRAMES = 10_000_000  # 92 hours at 30 frames per second
 MAX_HEADER_BYTES = START.size + MAX_NAME_BYTES + REST.size + COUNT.size
 
 
 @dataclass(frozen=True)
 class SensHeader:
-    """What a ``.sens`` file says before its frames.
+    """The header of a ``.sens`` file.
 
-    The matrices are (4, 4) float64 and hold float32 values; sizes are in pixels; metres are depth / ``depth_shift``.
+    The matrices are (4, 4) float64 with float32 values; sizes are in pixels; metres are depth / ``depth_shift``.
     """
 
     sensor_name: str
@@ -60,7 +60,7 @@ class SensHeader:
     depth_shift: float
 
     def camera(self, where: str) -> SensorPair:
-        """The two cameras; a ``DataError`` where they cannot be."""
+        """The two cameras; a ``DataError`` if they are invalid."""
         return SensorPair(
             colour_size=(self.colour_width, self.colour_height),
             depth_size=(self.depth_width, self.depth_height),
@@ -74,7 +74,7 @@ class SensHeader:
 
 
 def parse_header(start: bytes, where: str) -> tuple[SensHeader, int, int]:
-    """The header in the first bytes of a file, how many frames it promises, and where it ends.
+    """The header at the start of a file, its stated number of frames, and where it ends.
 
     ``start`` needs no more than ``MAX_HEADER_BYTES``; ``where`` begins the message of the ``DataError``.
     """
@@ -82,12 +82,12 @@ def parse_header(start: bytes, where: str) -> tuple[SensHeader, int, int]:
         raise DataError(f"{where}: has {len(start)} bytes, too few for a .sens file; copy the file again")
     version, n_name = START.unpack_from(start)
     if version != VERSION:
-        raise DataError(f"{where}: not a .sens file of version {VERSION}, its version would be {version}")
+        raise DataError(f"{where}: not a .sens file of version {VERSION} (version field: {version})")
     end = START.size + n_name + REST.size + COUNT.size
     if n_name > MAX_NAME_BYTES or end > len(start):
         raise DataError(
             f"{where}: byte 4: the header with a sensor name of {n_name} bytes does not fit into the file; "
-            "it is cut short or damaged"
+            "it is truncated or damaged"
         )
     values = REST.unpack_from(start, START.size + n_name)
     matrices = np.array(values[:64], np.float64).reshape(4, 4, 4)
@@ -109,7 +109,7 @@ def _compression(code: int, names: Mapping[int, Name], what: str, where: str) ->
 
 
 def header_bytes(header: SensHeader, n_frames: int) -> bytes:
-    """The reverse of ``parse_header``; the file that it begins holds ``n_frames`` frames."""
+    """The reverse of ``parse_header``, for a file with ``n_frames`` frames."""
     name = header.sensor_name.encode()
     assert len(name) <= MAX_NAME_BYTES, len(name)
     matrices = [header.intrinsic_colour, header.extrinsic_colour, header.intrinsic_depth, header.extrinsic_depth]
@@ -132,18 +132,18 @@ FRAME_RECORD = np.dtype(
         ("depth_bytes", "<u8"),
     ]
 )
-MOTION_BYTES = 128  # of a record of motion data: five vectors and a time stamp
-FRAME_SIZES = struct.Struct("<2Q")  # the last two of a record
-BYTES_PER_PIXEL, BYTES_AROUND = 8, 1 << 20  # more than any stored image has
+MOTION_BYTES = 128  # a motion data record: five vectors and a time stamp
+FRAME_SIZES = struct.Struct("<2Q")  # the last two fields of a record
+BYTES_PER_PIXEL, BYTES_AROUND = 8, 1 << 20  # more than any stored image needs
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings
 MICROSECONDS = 1e6
 
 
 class SensFile:
-    """A ``.sens`` file of version 4 as an ``RgbdSource``; images are read and decoded when they are asked for.
+    """A ``.sens`` file of version 4 as an ``RgbdSource``; images are read and decoded on access.
 
-    No file stays open: it may be read by many threads, and pickled to other processes. A ``DataError`` begins with
-    ``where`` and the name of the file, and says frame and byte. Many recordings have zeros or random numbers for times.
+    No file stays open: threads may share it, and it can be pickled. A ``DataError`` begins with
+    ``where`` and the file name, and gives frame and byte. Many recordings have zero or random time stamps.
     """
 
     def __init__(self, path: Path, where: str) -> None:
@@ -154,8 +154,8 @@ class SensFile:
             self.camera = self.header.camera(self.place)
             if n_frames > MAX_FRAMES or n_frames * FRAME_RECORD.itemsize > n_bytes - at:
                 raise DataError(
-                    f"{self.place}: the header promises {n_frames} frames of {FRAME_RECORD.itemsize} or more bytes, "
-                    f"but only {n_bytes - at} bytes are left; the file is cut short or damaged"
+                    f"{self.place}: the header states {n_frames} frames of {FRAME_RECORD.itemsize} or more bytes, "
+                    f"but only {n_bytes - at} bytes remain; the file is truncated or damaged"
                 )
             self._records, self._starts, at = _read_records(handle, n_bytes, n_frames, at, self.header, self.place)
             _check_end(handle, n_bytes, at, self.place)
@@ -200,10 +200,10 @@ class SensFile:
         signature = images.PNG_SIGNATURE if header.colour_compression == "png" else images.JPEG_START
         if not content.startswith(signature) or images.image_size(content) is None:
             raise DataError(f"{where}: not a {header.colour_compression.upper()} image; copy the file again")
-        return images.sized(images.decode_colour, content, size, where, "as the header says")
+        return images.sized(images.decode_colour, content, size, where, "as in the header")
 
     def depth(self, i: int) -> images.UInt16Array:
-        """The depth image (H, W) of frame ``i`` in raw units, 0 where invalid."""
+        """The depth image (H, W) of frame ``i`` in raw units, 0 if invalid."""
         content, header = self.depth_bytes(i), self.header
         where = f"{self._place(i, self._depth_span(i)[0])}: depth"
         n_bytes = 2 * header.depth_width * header.depth_height
@@ -227,13 +227,13 @@ class SensFile:
         with _opened(self.path, self.place) as handle:
             content = os.pread(handle, n_bytes, at)
         if len(content) != n_bytes:
-            raise DataError(f"{self._place(i, at)}: the file became shorter while it was read; copy it again")
+            raise DataError(f"{self._place(i, at)}: the file was shortened while being read; copy it again")
         return content
 
 
 @contextmanager
 def _opened(path: Path, where: str) -> Iterator[int]:
-    """A descriptor of the file; what goes wrong with it is a ``DataError``."""
+    """A descriptor of the file; failures are a ``DataError``."""
     with reading(where, DataError), opened(path) as stream:
         yield stream.fileno()
 
@@ -241,10 +241,10 @@ def _opened(path: Path, where: str) -> Iterator[int]:
 def _read_records(
     handle: int, n_bytes: int, n_frames: int, at: int, header: SensHeader, where: str
 ) -> tuple[NDArray[Any], Int64Array, int]:
-    """The fixed part of each record, where each begins, and where the last one ends."""
-    if hasattr(os, "posix_fadvise"):  # not on macOS; reading ahead would fetch the images between the records
+    """The fixed part of each record, the start of each, and the end of the last one."""
+    if hasattr(os, "posix_fadvise"):  # not on macOS; read-ahead would fetch the images between the records
         os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_RANDOM)
-    # No image exceeds this: 16-bit RGBA of noise would need 8 bytes for each pixel and a few behind.
+    # Upper bound of an image: 16-bit RGBA noise needs 8 bytes per pixel and a small trailer.
     most_colour = BYTES_PER_PIXEL * header.colour_width * header.colour_height + BYTES_AROUND
     most_depth = BYTES_PER_PIXEL * header.depth_width * header.depth_height + BYTES_AROUND
     records = np.zeros(n_frames, FRAME_RECORD)
@@ -258,26 +258,26 @@ def _read_records(
         if n_read < step or end > n_bytes:
             raise DataError(
                 f"{where}: frame {i} of {n_frames} at byte {at}: its images of {colour} and {depth} bytes do not fit "
-                f"into the {max(0, n_bytes - at - step)} bytes left; the file is cut short or damaged"
+                f"into the {max(0, n_bytes - at - step)} bytes left; the file is truncated or damaged"
             )
         if colour > most_colour or depth > most_depth:
             raise DataError(
                 f"{where}: frame {i} of {n_frames} at byte {at}: images of {colour} and {depth} bytes; "
-                f"with the sizes in the header at most {most_colour} and {most_depth} are possible, the file is damaged"
+                f"the image sizes in the header allow at most {most_colour} and {most_depth}; the file is damaged"
             )
         starts[i], at = at, end
     return records, starts, at
 
 
 def _check_end(handle: int, n_bytes: int, at: int, where: str) -> None:
-    """A ``DataError`` unless the file ends behind the frames or with the motion data that it announces there."""
+    """Raise ``DataError`` unless the file ends after the frames or after the motion data announced there."""
     n_left = n_bytes - at
     n = COUNT.unpack(os.pread(handle, COUNT.size, at))[0] if n_left >= COUNT.size else 0
     n_needed = COUNT.size + n * MOTION_BYTES
     if n_left not in (0, n_needed):
         raise DataError(
-            f"{where}: the file goes on for {n_left} bytes behind the last frame, from byte {at}; expected nothing or "
-            f"motion data, of which {n} records take {n_needed}; it is longer than it should be, cut short or damaged"
+            f"{where}: {n_left} bytes follow the last frame, from byte {at}; expected none or "
+            f"{n_needed} bytes of motion data in {n} records; the file is too long, truncated or damaged"
         )
 
 
@@ -287,22 +287,22 @@ def _check_length(content: bytes, n_bytes: int, where: str) -> None:
 
 
 def _inflate(content: bytes, n_bytes: int, where: str) -> bytes:
-    """The bytes that ``content`` unpacks to; no more than ``n_bytes`` + 1 are ever made."""
+    """The decompressed ``content``; at most ``n_bytes`` + 1 are produced."""
     unpacking = zlib.decompressobj()
     try:
         values = unpacking.decompress(content, n_bytes + 1)
     except zlib.error as error:
-        raise DataError(f"{where}: does not unpack ({error}); the file is damaged") from error
+        raise DataError(f"{where}: cannot be decompressed ({error}); the file is damaged") from error
     if len(values) > n_bytes:
-        raise DataError(f"{where}: unpacks to more than the {n_bytes} bytes of an image; the file is damaged")
+        raise DataError(f"{where}: decompresses to more than the {n_bytes} bytes of an image; the file is damaged")
     if not unpacking.eof:
-        raise DataError(f"{where}: unpacks to {len(values)} bytes and breaks off; the file is damaged")
+        raise DataError(f"{where}: decompression stops after {len(values)} bytes; the file is damaged")
     return values
 
 
 @dataclass(frozen=True)
 class SensFrame:
-    """One frame to write: the pose (4, 4), time stamps in microseconds, and both images as they are to be stored."""
+    """A frame to write: the pose (4, 4), time stamps in microseconds, both images in their stored form."""
 
     camera_to_world: Float64Array
     colour_timestamp: int
@@ -312,7 +312,7 @@ class SensFrame:
 
     @property
     def stored(self) -> bytes:
-        """The frame record and its images, as the file holds them."""
+        """The frame record and its images as bytes of the file."""
         record = np.zeros((), FRAME_RECORD)
         record["camera_to_world"] = self.camera_to_world
         record["colour_timestamp"], record["depth_timestamp"] = self.colour_timestamp, self.depth_timestamp
@@ -321,9 +321,9 @@ class SensFrame:
 
 
 def write_sens(path: Path, header: SensHeader, frames: Iterable[bytes], end: bytes = COUNT.pack(0)) -> None:
-    """Write a recording, whole or not at all; ``frames`` are what ``SensFrame.stored`` gives of each.
+    """Write a recording atomically; ``frames`` are the results of ``SensFrame.stored``.
 
-    ``end`` is what stands behind the frames, the number of records of motion data and these.
+    ``end`` follows the frames: the number of motion data records, and the records.
     """
     with replacing(path) as stream:
         stream.write(header_bytes(header, 0))

@@ -1,13 +1,13 @@
-"""Ground truth of a scan, one row a vertex of ``_vh_clean_2.ply`` in the order of the file.
+"""Ground truth of a scan, one row per vertex of ``_vh_clean_2.ply`` in file order.
 
-As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 where no object claims the vertex; the
+As in Mask3D and OpenMask3D: an instance id is the object's id + 1, 0 if no object contains the vertex; the
 class is the NYU40 id in ``_vh_clean_2.labels.ply``, or for ScanNet200 the raw id of the object's category. Classes that
-a protocol does not have stay in the truth, they are void there.
+unknown to a protocol stay in the ground truth and are void there.
 
-The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes
-then come from the objects' categories, by that table or, where it is not here, by that of the second release. A file
-holds raw ids when more of its labels are the raw ids of the objects' categories in a table than are their NYU40 ids;
-where no table tells, when one exceeds 40. Three scans of the second release have single labels of 50 and 149 among
+The first release differs: its ``labels.ply`` has raw ids, which are row numbers of its own table. Classes
+then come from the objects' categories, by that table or, if missing, by that of the second release. A file
+has raw ids if more of its labels match the raw ids of the objects' categories in a table than their NYU40 ids;
+if no table decides, if one exceeds 40. Three scans of the second release have a few labels of 50 and 149 among
 those of NYU40 (ScanNet's issues 20 and 86), which are void.
 """
 
@@ -44,13 +44,13 @@ from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.json_models import FileModel, SegmentIds, read_json
 from su3d_bench.formats.ply import ListColumn, read_ply
 
-PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
-# Ground truth is label * 1000 + instance, and instances are ids + 1: a larger id would spill into the next label.
+PREFIX = "scannet."  # prefix of scene ids and file names in the second release only
+# Ground truth is label * 1000 + instance, and instances are ids + 1: a larger id would overflow into the next label.
 MAX_OBJECT_ID = 998
 
 
 class AnnotatedObject(FileModel):
-    """One object: its number in the scan, the raw category, and the ids of its segments."""
+    """An object: its number in the scan, the raw category, and the ids of its segments."""
 
     id: Annotated[int, Strict(False), Field(ge=0, le=MAX_OBJECT_ID)]
     category: Annotated[str, StringConstraints(strip_whitespace=True)] = Field(alias="label")
@@ -58,7 +58,7 @@ class AnnotatedObject(FileModel):
 
 
 class ScanFile(FileModel):
-    """A file that says of itself to which scan it belongs; Segmentator names it after the mesh file."""
+    """A file that states its scan; Segmentator names it after the mesh file."""
 
     sceneId: str  # noqa: N815 - as in the file
 
@@ -94,24 +94,24 @@ def read_segments(path: Path, scan: str, where: str) -> Int64Array:
 
 
 def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
-    """The objects in the order of the file, which must refer to the segments of the decimated mesh."""
+    """The objects in file order; they must refer to the segments of the decimated mesh."""
     where = f"{where}: {path.name}"
     content = read_json(path, where, Aggregation)
     content.check_scan(scan, where)
     if content.segmentsFile.removeprefix(PREFIX) != segments_name(scan):
         raise DataError(
-            f"{where}: 'segmentsFile' is {ascii(content.segmentsFile)[:80]}, but {segments_name(scan)} is read; take "
+            f"{where}: 'segmentsFile' is {ascii(content.segmentsFile)[:80]}, but {segments_name(scan)} is read; use "
             "the aggregation that belongs to it"
         )
     category_of: dict[int, str] = {}
     for entry in content.segGroups:
         if category_of.setdefault(entry.id, entry.category) != entry.category:
-            raise DataError(f"{where}: object {entry.id} stands there twice, with two categories; copy the file again")
+            raise DataError(f"{where}: object {entry.id} is listed twice, with two categories; copy the file again")
     return content.segGroups
 
 
 def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -> Int64Array:
-    """Row in ``objects`` of each vertex; -1 where its segment is in none."""
+    """Row in ``objects`` of each vertex; -1 if its segment is in none."""
     ids, segment_rows = np.unique(segments, return_inverse=True)
     owner = np.full(len(ids), -1, np.int64)
     for row, entry in enumerate(objects):
@@ -129,9 +129,9 @@ MAX_RAW_ID, MAX_NYU40_ID = 65535, 40  # labels are stored as 16 bits; the releas
 
 @dataclass(frozen=True)
 class LabelTable:
-    """``nyu40_of`` and ``raw_id_of`` a raw category; ``name_of_id``: the first category of each raw id.
+    """``nyu40_of`` and ``raw_id_of`` map a raw category; ``name_of_id``: the first category of each raw id.
 
-    ``name``: of the file, which tells the release.
+    ``name``: the file name, which identifies the release.
     """
 
     nyu40_of: Mapping[str, int]
@@ -142,20 +142,20 @@ class LabelTable:
 
 @cache
 def _known_classes() -> dict[str, dict[int, str]]:
-    """NYU40 by the names of nyu40class, those of the benchmark's 20 classes as the benchmark has them; ScanNet200."""
+    """NYU40 with the names of nyu40class, except the benchmark's names for its 20 classes; ScanNet200."""
     tables = json.loads(file_text(Path(__file__).with_name("labels.json")))
     return {name: {int(row["id"]): str(row["name"]) for row in rows} for name, rows in tables.items()}
 
 
 @cache
 def nyu40_label_set() -> LabelSet:
-    """The 40 classes of NYU40, the 20 of the benchmark among them."""
+    """The 40 classes of NYU40, including the 20 of the benchmark."""
     classes = _known_classes()["nyu40"]
     return LabelSet(LABEL_SPACE, tuple(classes), tuple(classes.values()))
 
 
 def raw_label_set(table: LabelTable) -> LabelSet:
-    """Every raw id of the table and of ScanNet200, whose 200 names stand first; no other id bears one of them."""
+    """Every raw id of the table and of ScanNet200, whose 200 names come first and are used for no other id."""
     classes = dict(_known_classes()["scannet200"])
     taken = set(classes.values())
     for raw_id, name in sorted(table.name_of_id.items()):
@@ -166,8 +166,8 @@ def raw_label_set(table: LabelTable) -> LabelSet:
 def read_label_table(path: Path, where: str) -> LabelTable:
     """The table in ``path``; ``where`` begins each message.
 
-    Of rows with the same category the first counts, as in ScanNet's scripts. Cells lose blanks at their ends, and lines
-    may end in CR, LF or both, even mixed. In that of the first release a row may lack its class of NYU40.
+    The first of several rows with the same category counts, as in ScanNet's scripts. Cells are stripped, and lines
+    may end in CR, LF or both, even mixed. In the first release's table, a row may lack its NYU40 class.
     """
     is_first = path.name == FIRST_TABLE_NAME
     columns = FIRST_COLUMNS if is_first else COLUMNS
@@ -195,7 +195,7 @@ def read_label_table(path: Path, where: str) -> LabelTable:
         if not is_first or cells[at[-1]]:
             nyu40_of.setdefault(cells[at[0]], _id_in_table(cells[at[-1]], MAX_NYU40_ID, f"{place}: '{NYU40_ID}'"))
     if not nyu40_of:
-        raise DataError(f"{where}: has no row below its header; copy the file again")
+        raise DataError(f"{where}: has no rows below the header; copy the file again")
     return LabelTable(nyu40_of, raw_id_of, name_of_id, path.name)
 
 
@@ -205,8 +205,8 @@ def _id_in_table(text: str, most: int, where: str) -> int:
     return int(text)
 
 
-ALIGNMENT = "axisAlignment"  # in the facts of a scan, ``<scan>.txt``
-SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates
+ALIGNMENT = "axisAlignment"  # in a scan's ``<scan>.txt``
+SAME_PLACE_M = 1e-3  # both files have the same mesh; text formats round coordinates
 logger = logging.getLogger(__name__)
 
 
@@ -219,13 +219,13 @@ def labels_name(scan: str) -> str:
 
 
 def truth_names(scan: str) -> tuple[str, ...]:
-    """The files that ground truth is read from, beside the label table."""
+    """The files of the ground truth, except the label table."""
     return mesh_name(scan), labels_name(scan), aggregation_name(scan), segments_name(scan)
 
 
 @dataclass(frozen=True)
 class AnnotatedScan:
-    """``vertices`` (V, 3) in the scan's frame; ``triangles`` (T, 3); ``labels`` (V,) as ``labels.ply`` has them;
+    """``vertices`` (V, 3) in the scan's frame; ``triangles`` (T, 3); ``labels`` (V,) as in ``labels.ply``;
     ``object_of_vertex`` (V,) rows of ``objects``, -1 for none; ``where`` begins each message."""
 
     where: str
@@ -241,7 +241,7 @@ class AnnotatedScan:
         return np.array([*(entry.id + 1 for entry in self.objects), 0], np.int32)[self.object_of_vertex]
 
     def of_category(self, value_of: Mapping[str, int]) -> Int32Array:
-        """What ``value_of`` says of each vertex's category; 0 where no object or no entry is."""
+        """``value_of`` each vertex's category; 0 if there is no object or entry."""
         values = [*(value_of.get(entry.category, 0) for entry in self.objects), 0]
         return np.array(values, np.int32)[self.object_of_vertex]
 
@@ -257,7 +257,7 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
 
 
 def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Surface:
-    """The mesh of ``scan`` without labels, with the published segments where their file is there."""
+    """The mesh of ``scan`` without labels, with the published segments if available."""
     vertices, triangles = _mesh(mesh, f"{where}: {mesh.name}")
     if segments is None:
         return Surface(vertices, triangles)
@@ -267,52 +267,52 @@ def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Su
 
 
 def moved(vertices: Float32Array, motion: Float64Array) -> Float32Array:
-    """``vertices`` (V, 3) moved by a rigid ``motion`` (4, 4)."""
+    """``vertices`` (V, 3) transformed by a rigid ``motion`` (4, 4)."""
     return (vertices.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32)
 
 
 def aligned(scan: AnnotatedScan, motion: Float64Array) -> AnnotatedScan:
-    """The scan moved by a rigid ``motion`` (4, 4)."""
+    """The scan transformed by a rigid ``motion`` (4, 4)."""
     return replace(scan, vertices=moved(scan.vertices, motion))
 
 
 def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64Array:
-    """The labels of a mesh that must be the one of ``vertices``, vertex by vertex."""
+    """The labels of a mesh that must match ``vertices``, vertex by vertex."""
     file = read_ply(path, where)
     labelled = meshes.vertex_positions(file, where)
     if len(labelled) != len(vertices):
-        raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; they belong to two meshes")
+        raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; the meshes differ")
     is_elsewhere = np.abs(labelled.astype(np.float64) - vertices).max(axis=1) > SAME_PLACE_M
     if is_elsewhere.any():
         row = int(np.argmax(is_elsewhere))
         raise DataError(
             f"{where}: vertex {row} is at {labelled[row].tolist()}, in {mesh} at {vertices[row].tolist()}; they belong "
-            "to two meshes"
+            "to different meshes"
         )
     element = file.element("vertex")
     assert element is not None
     labels = element.columns.get("label")
     if labels is None or isinstance(labels, ListColumn) or labels.dtype.kind == "f":
-        raise DataError(f"{where}: vertices have no property 'label' of whole numbers; take the file of the release")
+        raise DataError(f"{where}: vertices have no integer property 'label'; use the file of the release")
     if labels.min() < 0:
         raise DataError(f"{where}: vertex {int(np.argmin(labels))} has the label {labels.min()}; expected 0 or more")
     return labels.astype(np.int64)
 
 
 def _mesh(path: Path, where: str) -> tuple[Float32Array, Int32Array]:
-    """Vertices (V, 3) and rows of three of them; none where the file has no faces."""
+    """Vertices (V, 3) and triangles (T, 3) of vertex indices; no triangles if the file has no faces."""
     file = read_ply(path, where)
     vertices, element = meshes.vertex_positions(file, where), file.element("face")
     if element is None or element.n_rows == 0:
         return vertices, np.zeros((0, 3), np.int32)
     corners = meshes.face_corners(element, len(vertices), where)
     if (corners.lengths != 3).any():
-        raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
+        raise DataError(f"{where}: faces are not triangles in 'vertex_indices'; expected the mesh of the release")
     return vertices, corners.values.reshape(-1, 3).astype(np.int32)
 
 
 def nyu40_truth(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> GroundTruth:
-    """Classes of NYU40; one of ``tables`` is needed for files of the first release alone."""
+    """NYU40 classes; one of ``tables`` is needed only for files of the first release."""
     semantic, source = nyu40_of_vertex(scan, tables)
     return GroundTruth(
         scan.vertices,
@@ -338,7 +338,7 @@ def scannet200_truth(scan: AnnotatedScan, table: LabelTable) -> GroundTruth:
 
 
 def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[Int32Array, str]:
-    """The NYU40 class of each vertex, 0 for none, and where it is from."""
+    """The NYU40 class of each vertex, 0 for none, and its source."""
     is_annotated = scan.object_of_vertex >= 0
     agrees = {
         (table.name, kind): int((scan.labels == scan.of_category(value_of))[is_annotated].sum())
@@ -354,14 +354,14 @@ def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[
     if table is None:
         raise GroundTruthMissing(
             f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "
-            f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is beside the scans"
+            f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is next to the scans"
         )
     _warn_unknown_categories(scan, table)
     return scan.of_category(table.nyu40_of), f"the NYU40 classes of the objects' categories in {table.name}"
 
 
 def _warn_unknown_categories(scan: AnnotatedScan, table: LabelTable) -> None:
-    """A warning that counts the categories without a row; their vertices are void."""
+    """Warn with the number of categories without a row; their vertices are void."""
     unknown = [row for row, entry in enumerate(scan.objects) if entry.category not in table.nyu40_of]
     if unknown:
         categories = sorted({scan.objects[row].category for row in unknown})
@@ -373,9 +373,9 @@ def _warn_unknown_categories(scan: AnnotatedScan, table: LabelTable) -> None:
 
 
 def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> InstanceMesh:
-    """The triangles, each with the instance of most of its vertices, 0 where all three differ; classes of NYU40.
+    """The triangles, each with the instance of most of its vertices, 0 if all three differ; NYU40 classes.
 
-    The class of an instance is that of most of its vertices, the lowest where several have as many.
+    The class of an instance is that of most of its vertices, the lowest in a tie.
     """
     if len(scan.triangles) == 0:
         raise DataError(f"{scan.where}: the mesh has no faces to project; copy _vh_clean_2.ply again")
@@ -399,19 +399,19 @@ def meta_name(scan: str) -> str:
 
 
 def read_axis_alignment(path: Path, where: str) -> Float64Array:
-    """The rigid motion (4, 4) from the scan's frame to one along the walls; ``where`` begins each message.
+    """The rigid motion (4, 4) that aligns the scan with the walls; ``where`` begins each message.
 
-    The identity where the file has no such line, as that of some scans. Released meshes and poses are not aligned.
+    The identity if the file has no such line, as for some scans. Released meshes and poses are not aligned.
     """
     where = f"{where}: {path.name}"
     facts = {}
     for number, line in enumerate(read_text(path, where).splitlines(), 1):
         key, equals, value = line.partition("=")
         if line.strip() and not equals:
-            raise DataError(f"{where} line {number}: {line.strip()[:40]!r} is no 'key = value'; copy the file again")
+            raise DataError(f"{where} line {number}: {line.strip()[:40]!r} is not 'key = value'; copy the file again")
         facts[key.strip()] = value
     if not any(facts):
-        raise DataError(f"{where}: holds nothing; expected lines 'key = value'")
+        raise DataError(f"{where}: is empty; expected lines 'key = value'")
     return np.eye(4) if ALIGNMENT not in facts else _motion(facts[ALIGNMENT], f"{where}: '{ALIGNMENT}'")
 
 

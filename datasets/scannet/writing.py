@@ -1,4 +1,4 @@
-"""Scenes in the layout of ScanNet: ``scans/<scan>/`` with recording, mesh and annotation; the label table above."""
+"""Write scenes in the layout of ScanNet: ``scans/<scan>/`` with recording, mesh, annotation; label table above."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _facts() -> Mapping[str, Any]:
 
 @cache
 def categories() -> Mapping[str, Category]:
-    """The category of each class of the rooms."""
+    """The ScanNet category of each room class."""
     return {name: Category(*row) for name, row in _facts()["classes"].items()}
 
 
@@ -65,7 +65,7 @@ def nyu40_colours() -> tuple[tuple[int, int, int], ...]:
 
 
 def scan_name(room: str) -> str:
-    """The scan that a room is: kitchen7 is scene9207_00; raises ``DataError`` for a room beyond 99."""
+    """The scan name of a room: kitchen7 is scene9207_00; raises ``DataError`` for a room beyond 99."""
     match = ROOM_NAME.fullmatch(room)
     if match is None or match[1] not in _facts()["kinds"]:
         raise DataError(f"rooms/{room}: has no scan name; choose a room from 0 to 99 of its kind")
@@ -73,14 +73,14 @@ def scan_name(room: str) -> str:
 
 
 def scene_type(room: str) -> str:
-    """What ScanNet calls a place of this kind."""
+    """ScanNet's scene type for this kind of room."""
     match = ROOM_NAME.fullmatch(room)
     assert match is not None, room
     return str(_facts()["kinds"][match[1]][1])
 
 
 def label_table_text() -> str:
-    """``scannetv2-labels.combined.tsv`` with the categories of the rooms; columns of other vocabularies are empty."""
+    """``scannetv2-labels.combined.tsv`` with the rooms' categories; columns of other vocabularies are empty."""
     rows = ["\t".join(TABLE_COLUMNS)]
     for row in sorted(set(categories().values()), key=lambda row: row.id):
         known = {"id": row.id, "raw_category": row.raw_category, "category": row.raw_category, "count": 0}
@@ -89,16 +89,16 @@ def label_table_text() -> str:
     return "\n".join(rows) + "\n"
 
 
-MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
+MIN_COSINE = 0.9  # faces at an angle above 26 degrees belong to different segments
 
 
 def annotation_id(known: RoomObject) -> int:
-    """The id of an object in the annotation, which counts from 0."""
+    """The id of an object in the annotation, which starts at 0."""
     return known.id - 1
 
 
 def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> list[RoomObject]:
-    """Write the files of ``scene`` under the name ``scan`` into ``folder``; the objects that are annotated."""
+    """Write the files of ``scene`` as ``scan`` into ``folder``; return the annotated objects."""
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
     owner, segments = object_of_vertex(surface), segment_of_vertex(surface)
@@ -130,16 +130,16 @@ def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> lis
 
 
 def object_of_vertex(scan: RoomScan) -> Int64Array:
-    """Object id (V,) of each vertex, that of its last face; 0 where no face uses it."""
+    """Object id (V,) of each vertex, from its last face; 0 if no face uses it."""
     owner = np.zeros(len(scan.vertices), np.int64)
     owner[scan.faces] = scan.object_id[:, None]
     return owner
 
 
 def segment_of_vertex(scan: RoomScan) -> Int64Array:
-    """Segment (V,) of each vertex, named after its first vertex: a connected piece of one object that bends little.
+    """Segment (V,) of each vertex, named after its first vertex: a connected, nearly flat piece of one object.
 
-    A vertex has the direction of its first face, so that a box falls apart into its sides.
+    A vertex has the direction of its first face, so that a box is split into its sides.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -188,21 +188,21 @@ def _facts_of(dataset: Rooms, scene: str) -> str:
 
 
 def _write_json(path: Path, value: Any) -> None:
-    """JSON on one line: a mesh has a number a vertex."""
+    """JSON on one line: a mesh has one number per vertex."""
     write_text(path, json.dumps(value, separators=(",", ":")) + "\n")
 
 
-LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
-DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release
+LAYOUT_VERSION = 1  # increase it when the written bytes of a scene change
+DEPTH_SHIFT = 1000.0  # units per metre, in every recording of the release
 SCANS_FOLDER = "scans"
-SENSOR_NAME = "StructureSensor"  # as the release has it, readers may know it
+SENSOR_NAME = "StructureSensor"  # as in the release; readers may depend on it
 PIECES = ".frames"
 
 
 class ScannetLayout(Layout):
     """Rooms as scans ``scene9000_00`` and so on, each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
 
-    It is joined of the records that were written one by one. Time stamps are microseconds from the first frame.
+    It is joined from records that were written separately. Time stamps are microseconds from the first frame.
     """
 
     name = "scannet"
@@ -222,7 +222,7 @@ class ScannetLayout(Layout):
         return SceneTarget(scene, key, folder, f"{scan}.sens", tuple(folder / name for name in names))
 
     def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
-        write_shared_text(out / truth.TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
+        write_shared_text(out / truth.TABLE_NAME, label_table_text(), "differs from the label table of the rooms")
 
     def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
@@ -247,21 +247,21 @@ class ScannetLayout(Layout):
 
 
 def size_of(jpeg: bytes) -> tuple[int, int]:
-    """Width and height of a colour image, and so of the depth image beside it."""
+    """Width and height of a colour image, which are also those of its depth image."""
     size = image_size(jpeg)
     assert size is not None
     return size
 
 
 def intrinsics_4x4(intrinsics: Float64Array) -> Float64Array:
-    """The camera as ScanNet's files have it, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1, in the digits of float32."""
+    """The camera as in ScanNet's files, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1, in float32 precision."""
     matrix = np.eye(4)
     matrix[:3, :3] = intrinsics
     return matrix.astype(np.float32).astype(np.float64)
 
 
 def sens_header(intrinsics: Float64Array, size: tuple[int, int]) -> sens.SensHeader:
-    """The header of a recording whose two cameras are one."""
+    """The header of a recording whose two cameras are identical."""
     camera, (width, height) = intrinsics_4x4(intrinsics), size
     return sens.SensHeader(
         sensor_name=SENSOR_NAME,

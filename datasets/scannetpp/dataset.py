@@ -1,6 +1,6 @@
-"""ScanNet++, both releases: the iPhone's RGB-D recording, and truth from the annotated laser scans.
+"""ScanNet++, both releases: the iPhone's RGB-D recording, and ground truth from the annotated laser scans.
 
-The DSLR's images, which have no depth, are left out.
+The DSLR's images are not used because they have no depth.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ SCENE_NAMES = r"[0-9a-f]{10}"
 SPLITS_FOLDER = "splits"
 IPHONE, SCANS = "iphone", "scans"
 MAX_SCENES = 100_000
-LARGE_BYTES, END_BYTES = 64 << 20, 1 << 20  # of a larger file, a video or a packed recording, the two ends are digested
+LARGE_BYTES, END_BYTES = 64 << 20, 1 << 20  # of larger files (videos, packed recordings) only both ends are digested
 
 
 class ScannetppOptions(BaseModel):
-    """``poses``: COLMAP's, as the official toolkit takes them, or the phone's own tracking, aligned to the mesh;
-    ``auto`` takes COLMAP's where they are there. ``width``: columns of the frames, at most; the recording has 1920."""
+    """``poses``: COLMAP's, as used by the official toolkit, or the phone's own tracking, aligned to the mesh;
+    ``auto`` uses COLMAP's if available. ``width``: maximum columns of a frame; the recording has 1920."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -44,8 +44,8 @@ class ScannetppOptions(BaseModel):
 class ScanNetPP(FileDataset[ScannetppOptions]):
     """ScanNet++ (v1 and v2): the iPhone's frames and the annotated laser scans; read below the data root.
 
-    A scene is a folder such as ``data/036bce3393`` with ``iphone/`` and ``scans/``; ``metadata/`` and ``splits/`` lie
-    beside ``data/``. Both releases have this layout.
+    A scene is a folder such as ``data/036bce3393`` with ``iphone/`` and ``scans/``; ``metadata/`` and ``splits/`` are
+    next to ``data/``. Both releases have this layout.
     """
 
     name = "scannetpp"
@@ -53,8 +53,8 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     scene_names = SCENE_NAMES
     places_of_scenes = tuple(f"{base}/data" if base else "data" for base in truth.BASES)
     how_to_get = (
-        "/data or in scannetpp/data (a scene is a folder such as 036bce3393 with iphone/ and scans/); ask for the data "
-        "at https://kaldir.vc.in.tum.de/scannetpp/ and set SU3D_DATA to where it is"
+        "/data or in scannetpp/data (a scene is a folder such as 036bce3393 with iphone/ and scans/); request the data "
+        "at https://kaldir.vc.in.tum.de/scannetpp/ and set SU3D_DATA to its folder"
     )
     label_space = truth.LABEL_SPACE
     variants = (truth.VARIANT,)
@@ -68,11 +68,11 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
 
     @property
     def releases(self) -> list[Path]:
-        """The folders that hold ``data/``, ``metadata/`` and ``splits/``; a ``data/`` that is a link has two."""
+        """The folders with ``data/``, ``metadata/`` and ``splits/``; there are two if ``data/`` is a link."""
         return list(dict.fromkeys(path.parent for place in self.tree.places for path in (place, place.resolve())))
 
     def groups(self) -> Mapping[str, Sequence[str]]:
-        """The official splits as far as their lists lie in ``splits/``; whether their scenes are here or not."""
+        """The official splits whose lists are in ``splits/``, whether their scenes are available or not."""
         return self._splits
 
     @cached_property
@@ -85,7 +85,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return found
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: frames, and ground truth."""
+        """One-line summary of the scene from a quick look: frames, ground truth."""
         with reading(self.where(scene)):
             words = frames.describe_recording(self.folder(scene) / IPHONE, self.options.poses)
         try:
@@ -99,8 +99,8 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return len(self.recording(scene).every(stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """Every ``stride``-th of the frames that the poses name, in the order of the video; a line of the log counts
-        those that have none once."""
+        """Every ``stride``-th frame with a pose entry, in the order of the video; the number of
+        frames without a pose is logged once."""
         recording = self.recording(scene)
         self.warn_once(scene, recording.missing_frames_remark())
         return frames.IphoneFrames(recording, recording.every(stride), self.options.width)
@@ -109,7 +109,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return self.recording(scene).files()
 
     def files(self, scene: str) -> Sequence[Path]:
-        # A list of masked vertices may be empty: it is listed where it is not, because an empty file is else a fault.
+        # A list of masked vertices may be empty: it is listed only if not, because an empty file is otherwise a fault.
         return [path for path in super().files(scene) if path.name != truth.MASK_NAME or path.stat().st_size]
 
     def recording_key(self, scene: str) -> str:
@@ -134,13 +134,13 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         return truth.instance_mesh(self.annotated_scan(scene))
 
     def surface(self, scene: str) -> Surface:
-        """The mesh, with the published segments where they are here; scenes without truth have both."""
+        """The mesh, with the published segments if available; scenes without ground truth have both."""
         folder = self.folder(scene) / SCANS
         segments = folder / truth.SEGMENTS_NAME
         return truth.read_surface(folder / truth.MESH_NAME, segments if segments.is_file() else None, self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What is wrong with the recording's poses and with the truth, a line each; images are left to the frames."""
+        """Faults of the recording's poses and the ground truth, one line each; images are checked as frames."""
         yield from faults_of([lambda: self.recording(scene)])
         if (self.folder(scene) / SCANS).is_dir():
             yield from faults_of([lambda: self.annotated_scan(scene)])
@@ -151,20 +151,20 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
             return frames.open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
-        """The path of each file of the truth."""
+        """The path of each file of the ground truth."""
         folder = self.folder(scene) / SCANS
         missing = [name for name in truth.TRUTH_NAMES if not (folder / name).is_file()]
         if missing:
             reason = f"expected in {folder}"
             if missing[0] == truth.MASK_NAME:
-                reason += "; without it, vertices would be scored that the benchmark leaves out"
+                reason += "; without it, vertices excluded by the benchmark would be scored"
             elif missing[0] != truth.MESH_NAME:
-                reason += "; the benchmark keeps the annotation of its test scenes to itself"
+                reason += "; it is not published for test scenes"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing; {reason}")
         return {name: folder / name for name in truth.TRUTH_NAMES}
 
     def _find_benchmark_folder(self, scene: str) -> Path | None:
-        """Where the lists of the benchmark lie, beside the scene first; None where none has all of them."""
+        """The folder of the benchmark's lists, nearest to the scene first; None if no folder has all of them."""
         near = self.folder(scene).parent.parent
         places = [release / truth.BENCHMARK_FOLDER for release in (near, *self.releases)]
         return next((place for place in places if all((place / name).is_file() for name in truth.LIST_NAMES)), None)
@@ -188,17 +188,17 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
 
 
 def read_split(path: Path) -> tuple[str, ...]:
-    """The scenes that a split names, each once, in its order."""
+    """The scenes of a split in order, each once."""
     where = f"scannetpp: {SPLITS_FOLDER}/{path.name}"
     scenes = read_text(path, where).split()
     wrong = next((scene for scene in scenes if not re.fullmatch(SCENE_NAMES, scene)), None)
     if wrong is not None or len(scenes) > MAX_SCENES:
-        raise DataError(f"{where}: {(wrong or '')[:40]!a} is no scene; expected one a line, such as 036bce3393")
+        raise DataError(f"{where}: {(wrong or '')[:40]!a} is not a scene; expected one per line, such as 036bce3393")
     return tuple(dict.fromkeys(scenes))
 
 
 def _digest_of(path: Path) -> str:
-    """Of the whole content, or of the two ends of a large file."""
+    """A digest of the whole content, or of both ends of a large file."""
     if path.stat().st_size <= LARGE_BYTES:
         return digest_file(path)
     with opened(path) as stream:

@@ -1,8 +1,8 @@
-"""Posed RGB-D frames of the iPhone: which there are, where their images are, and both brought to one camera.
+"""Posed RGB-D frames of the iPhone: available frames, their images, and both registered to one camera.
 
-Colour comes from ``rgb/`` or else ``rgb.mkv``, depth from ``depth/`` or else ``depth.bin``. Both images show the same
-view in other sizes, so that they differ in scale alone. Frames have at most so many columns as is asked for: colour is
-averaged, of depth the nearest value is taken, as the toolkit's authors advise (scannetpp/scannetpp, issue 140).
+Colour comes from ``rgb/`` or ``rgb.mkv``, depth from ``depth/`` or ``depth.bin``. Both images show the same
+view and differ only in scale. Frames have at most the requested number of columns: colour is
+averaged, depth takes the nearest value, as the toolkit's authors advise (scannetpp/scannetpp, issue 140).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ DEPTH_M_OF_VALUE = depth_m_of_values(images.UNITS_PER_METRE)
 
 
 def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
-    """Which poses are read of the iPhone's ``folder``; those of COLMAP where both are there."""
+    """The poses to read in the iPhone's ``folder``; COLMAP's if both are available."""
     if kind != "auto":
         return kind
     return (
@@ -43,20 +43,20 @@ def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
 
 
 def describe_recording(folder: Path, kind: PoseSource) -> str:
-    """A word on the frames from a quick look at the iPhone's ``folder``."""
+    """One-line summary of the frames from a quick look at the iPhone's ``folder``."""
     source = pose_source(folder, kind)
     path = folder / poses.COLMAP / poses.IMAGES_NAME if source == "colmap" else folder / poses.TRACKING_NAME
     if not path.is_file():
         return "no frames of the iPhone"
     if source == "tracking":
-        return "frames with the poses of the phone"
+        return "frames with the phone's poses"
     n = poses.n_registered(path)
-    return "frames with the poses of COLMAP" if n is None else counted(n, "frame")
+    return "frames with COLMAP's poses" if n is None else counted(n, "frame")
 
 
 @dataclass(frozen=True, eq=False)
 class IphoneRecording:
-    """A recording with its poses; ``colour_of`` and ``depth_of`` are the extracted files by their frame, None where
+    """A recording with its poses; ``colour_of`` and ``depth_of`` are the extracted files by frame number, None if
     images come out of the video and ``depth.bin``."""
 
     folder: Path
@@ -67,7 +67,7 @@ class IphoneRecording:
 
     @cached_property
     def usable(self) -> list[int]:
-        """The rows of ``posed`` that have a pose."""
+        """The rows of ``posed`` with a usable pose."""
         return np.flatnonzero(np.isfinite(self.posed.poses).all(axis=(1, 2))).tolist()
 
     def every(self, stride: int) -> list[int]:
@@ -75,9 +75,9 @@ class IphoneRecording:
         return [row for row in self.usable if row % stride == 0]
 
     def missing_frames_remark(self) -> str | None:
-        """A line that counts the frames without a pose."""
+        """A message with the number of frames without a pose."""
         n, n_usable = len(self.posed.numbers), len(self.usable)
-        return None if n == n_usable else f"{self.where}: frames without a pose, left out: {n - n_usable} of {n}"
+        return None if n == n_usable else f"{self.where}: frames without a pose, excluded: {n - n_usable} of {n}"
 
     def files(self) -> list[Path]:
         numbers = [int(self.posed.numbers[row]) for row in self.usable]
@@ -91,7 +91,7 @@ def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> Iphon
     """The recording in the ``iphone`` folder of a scene."""
     if not folder.is_dir():
         raise DataError(
-            f"{where}: no iphone/ folder; the iPhone's frames are read, the DSLR's have no depth and are left out"
+            f"{where}: no iphone/ folder; only the iPhone's frames are used, because the DSLR's have no depth"
         )
     colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, images.VIDEO_NAME, where)
     depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, images.DEPTH_NAME, where)
@@ -113,16 +113,16 @@ def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> Iphon
 
 
 def _colour_size(folder: Path, colour_of: Mapping[int, str] | None, where: str) -> Size:
-    """The size of the colour images, told from the first of them."""
+    """The size of the colour images, from the first one."""
     if colour_of is None:
         return images.video_size(folder / images.VIDEO_NAME, where)
     if not colour_of:
-        raise DataError(f"{where}: {COLOUR_FOLDER}/ holds no frame; {EXTRACT_AGAIN}")
+        raise DataError(f"{where}: {COLOUR_FOLDER}/ has no frames; {EXTRACT_AGAIN}")
     return read_size(folder, colour_of[min(colour_of)], where)
 
 
 def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, where: str) -> Mapping[int, str] | None:
-    """The extracted files by their frame; None where the ``packed`` file is to be read."""
+    """The extracted files by frame number; None if the ``packed`` file is to be read."""
     if not (folder / name).is_dir():
         if not os.path.lexists(folder / packed):
             raise DataError(f"{where}: neither {name}/ nor {packed} is in {folder}; copy one of them there")
@@ -136,7 +136,7 @@ def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, whe
 
 
 class IphoneFrames(Sequence[Frame]):
-    """The frames of ``rows``, of at most ``width`` columns, each read when it is asked for."""
+    """The frames of ``rows``, at most ``width`` columns wide, each read on access."""
 
     def __init__(self, recording: IphoneRecording, rows: Sequence[int], width: int) -> None:
         self._recording, self._rows = recording, rows
@@ -167,7 +167,7 @@ class IphoneFrames(Sequence[Frame]):
         )
 
     def intrinsics(self, row: int) -> Float64Array:
-        """The camera (3, 3) of the frames' size, where the middle of the first pixel is at 0."""
+        """The intrinsics (3, 3) for the frames' size, with the centre of the first pixel at 0."""
         full = self._recording.posed
         matrix: Float64Array = full.intrinsics[row].copy()
         matrix[:2] *= np.array(self.size)[:, None] / np.array(full.size)[:, None]
@@ -179,7 +179,7 @@ class IphoneFrames(Sequence[Frame]):
             return self._video.image(number)
         where, content = self._content(self._recording.colour_of[number])
         size = self._recording.posed.size
-        return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
+        return self._colour_at_size(sized(decode_colour, content, size, where, "as in the camera file"))
 
     def _depth_values(self, number: int) -> UInt16Array:
         if self._recording.depth_of is None:
@@ -193,9 +193,9 @@ class IphoneFrames(Sequence[Frame]):
 
     @cached_property
     def _straightening(self) -> tuple[Float32Array, Float32Array] | None:
-        """Column and row of the image, as the lens bent it, that each pixel (H, W) sees; None where it bends nothing.
+        """Column and row in the distorted image for each pixel (H, W); None without distortion.
 
-        COLMAP gives all frames one camera where it gives a distortion.
+        If COLMAP gives a distortion, all frames have one camera.
         """
         distortion = self._recording.posed.distortion
         if not distortion.any():

@@ -1,10 +1,10 @@
 """Images of the iPhone: depth out of ``depth.bin``, colour out of ``rgb.mkv``, read forward.
 
-Depth is 256x192, millimetres as the official toolkit unpacks them.
+Depth is 256x192, millimetres as unpacked by the official toolkit.
 
-Three forms circulate: all images in one raw deflate stream of float32 metres; or one behind the other, each with its
-length in four bytes, as an LZ4 block of uint16 millimetres or as a raw deflate stream of float32 metres. Metres become
-millimetres by cutting off what is less than one.
+Three formats exist: all images in one raw deflate stream of float32 metres; or one after the other, each preceded by
+its length in four bytes, as an LZ4 block of uint16 millimetres or a raw deflate stream of float32 metres. Metres are
+truncated to whole millimetres.
 
 Source: scannetpp/scannetpp at commit f3b4712, iphone/prepare_iphone_data.py.
 """
@@ -32,11 +32,11 @@ MIN_MATCH = 4
 
 
 class NotLz4(Exception):
-    """The content is no block of the length that was asked for."""
+    """The content is not a block of the requested length."""
 
 
 def unpacked_block(content: bytes, n_bytes: int) -> bytes:
-    """The ``n_bytes`` that a block holds."""
+    """The ``n_bytes`` stored in a block."""
     out, at = bytearray(), 0
     try:
         while True:
@@ -56,7 +56,7 @@ def unpacked_block(content: bytes, n_bytes: int) -> bytes:
             start = len(out) - offset
             if offset >= n_match:
                 out += out[start : start + n_match]
-            else:  # the match reaches into what it writes: its pattern goes on
+            else:  # the match overlaps its own output: the pattern repeats
                 pattern = bytes(out[start:])
                 out += (pattern * (n_match // offset + 1))[:n_match]
     except IndexError:
@@ -67,7 +67,7 @@ def unpacked_block(content: bytes, n_bytes: int) -> bytes:
 
 
 def _length(content: bytes, first: int, at: int) -> tuple[int, int]:
-    """A length, whose ``first`` four bits say 15 where bytes follow, and where what comes next is."""
+    """A length (``first`` has its four bits; 15 means more bytes follow), and the position after it."""
     length = first
     if first == 15:
         while True:
@@ -79,11 +79,11 @@ def _length(content: bytes, first: int, at: int) -> tuple[int, int]:
 
 
 Item = TypeVar("Item")
-N_KEPT = 12  # wanted items that were passed; as many threads may ask out of their order before all begins anew
+N_KEPT = 12  # passed items kept, so that this many threads can ask out of order without a restart
 
 
 class ForwardReader(Generic[Item]):
-    """``begin`` opens what is read; each step of it gives a function that unpacks the item, called for those wanted."""
+    """Reads items forward: ``begin`` opens the input; each step returns a function that unpacks the item, if wanted."""
 
     def __init__(self, begin: Callable[[], Iterator[Callable[[], Item]]], wanted: frozenset[int]) -> None:
         self._begin, self._wanted = begin, wanted
@@ -93,7 +93,7 @@ class ForwardReader(Generic[Item]):
         self._lock = Lock()
 
     def at(self, number: int) -> Item | None:
-        """The item of that number; None where there are fewer."""
+        """The item with that number; None if there are fewer."""
         with self._lock:
             if number in self._kept:
                 return self._kept[number]
@@ -131,7 +131,7 @@ PIECE_BYTES = 1 << 16
 
 
 class DepthFile:
-    """The images of a file by their numbers; ``where`` begins each message, ``wanted`` are those that will be read."""
+    """The images of a file by number; ``where`` begins each message, ``wanted`` are those to be read."""
 
     def __init__(self, path: Path, where: str, wanted: frozenset[int]) -> None:
         self.path, self._where = path, f"{where}: {path.name}"
@@ -140,11 +140,11 @@ class DepthFile:
         self._stream = ForwardReader(self._stream_images, wanted)
 
     def values(self, number: int) -> UInt16Array:
-        """Millimetres (192, 256), 0 where there is none."""
+        """Millimetres (192, 256), 0 for no depth."""
         found = self._stream.at(number) if self._index is None else self._packed_values(self._index, number)
         if found is None:
             have = "fewer images" if self._index is None else f"{len(self._index)} images"
-            raise DataError(f"{self._where}: has {have}, frame {number} is not among them; copy the file again")
+            raise DataError(f"{self._where}: has {have}, but not frame {number}; copy the file again")
         return found
 
     def _packed_values(self, index: list[tuple[int, int]], number: int) -> UInt16Array | None:
@@ -181,7 +181,7 @@ class DepthFile:
                     unpacked = unpack.decompress(packed, 4 * N_PIXELS)
                 except zlib.error as error:
                     raise DataError(
-                        f"{self._where}: is none of the forms of the release ({error}); copy the file again"
+                        f"{self._where}: is not in any format of the release ({error}); copy the file again"
                     ) from error
                 waiting += unpacked
                 while len(waiting) >= 4 * N_PIXELS:
@@ -199,14 +199,14 @@ def _image(content: bytes) -> UInt16Array:
 
 
 def millimetres(depth_m: Float32Array) -> UInt16Array:
-    """Whole millimetres of metres, what is less cut off; 0 for what 16 bits do not hold."""
+    """Whole millimetres of metres, truncated; 0 if they exceed 16 bits."""
     with np.errstate(invalid="ignore", over="ignore"):
         values = depth_m * np.float32(UNITS_PER_METRE)
         return np.where((values >= 0) & (values < N_DEPTH_VALUES), values, 0).astype(np.uint16)
 
 
 def _index(path: Path) -> list[tuple[int, int]] | None:
-    """Start and length of each image where lengths lead from one to the next up to the end; None for one stream."""
+    """Start and length of each image if the lengths chain up to the end of the file; None for a single stream."""
     index: list[tuple[int, int]] = []
     with opened(path) as stream:
         n_bytes = stream.seek(0, 2)
@@ -223,8 +223,8 @@ def _index(path: Path) -> list[tuple[int, int]] | None:
 
 
 VIDEO_NAME = "rgb.mkv"
-MATROSKA = b"\x1a\x45\xdf\xa3"  # what else ffmpeg would open under this name may name other files and addresses
-QUIET = {"OPENCV_FFMPEG_LOGLEVEL": "-8"}  # the decoder's own words are not for the terminal
+MATROSKA = b"\x1a\x45\xdf\xa3"  # other formats that ffmpeg opens may refer to other files and addresses
+QUIET = {"OPENCV_FFMPEG_LOGLEVEL": "-8"}  # keeps the decoder's messages off the terminal
 ADVICE = "copy the file again, or extract it with the official toolkit into rgb/"
 
 
@@ -235,7 +235,7 @@ def video_size(path: Path, where: str) -> Size:
 
 
 class VideoFile:
-    """The images of a video by their numbers; each of ``wanted`` is kept as ``prepared`` makes it."""
+    """The images of a video by number; each of ``wanted`` is stored as returned by ``prepared``."""
 
     def __init__(
         self, path: Path, where: str, size: Size, wanted: frozenset[int], prepared: Callable[[UInt8Array], UInt8Array]
@@ -244,10 +244,10 @@ class VideoFile:
         self._images = ForwardReader(self._decoded, wanted)
 
     def image(self, number: int) -> UInt8Array:
-        """The prepared image of that number."""
+        """The prepared image with that number."""
         image = self._images.at(number)
         if image is None:
-            raise DataError(f"{self._where}: frame {number} cannot be decoded, or is not there; {ADVICE}")
+            raise DataError(f"{self._where}: frame {number} is missing or cannot be decoded; {ADVICE}")
         return image
 
     def _decoded(self) -> Iterator[Callable[[], UInt8Array]]:
@@ -275,14 +275,14 @@ def _opened_video(path: Path, where: str) -> Iterator[tuple[Any, Size]]:
 
     with reading(where), opened(path) as stream:
         if stream.read(len(MATROSKA)) != MATROSKA:
-            raise DataError(f"{where}: is no Matroska video; {ADVICE}")
+            raise DataError(f"{where}: is not a Matroska video; {ADVICE}")
     for name, value in QUIET.items():
         os.environ.setdefault(name, value)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         width, height = int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if not video.isOpened() or width < 1 or height < 1 or width * height > MAX_PIXELS:
-            raise DataError(f"{where}: is no video that can be decoded; {ADVICE}")
+            raise DataError(f"{where}: cannot be decoded; {ADVICE}")
         yield video, (width, height)
     except cv2.error as error:
         raise DataError(f"{where}: cannot be decoded ({error.code}); {ADVICE}") from error

@@ -1,11 +1,11 @@
 """Cameras and poses of ScanNet++'s iPhone, in the coordinates of the aligned mesh, metres.
 
-- ``colmap/cameras.txt`` and ``images.txt``: what the official toolkit reads; a part of the video's frames, one camera
+- ``colmap/cameras.txt`` and ``images.txt``: used by the official toolkit; a subset of the video's frames, one camera
   with distortion. Poses are world-to-camera, quaternions w x y z.
-- ``pose_intrinsic_imu.json``: every frame of the video as the phone's own tracking has it, ``aligned_pose`` turned into
-  the world of the mesh, camera-to-world; intrinsics a frame, without distortion.
+- ``pose_intrinsic_imu.json``: every frame of the video, from the phone's own tracking; ``aligned_pose`` is in
+  the world of the mesh, camera-to-world; intrinsics per frame, without distortion.
 
-Both have OpenCV's camera axes. In both files the corner of an image is at 0, in ``Frame`` the middle of its first
+Both have OpenCV's camera axes. Both files put the corner of an image at 0, ``Frame`` the centre of its first
 pixel.
 
 Source: scannetpp/scannetpp at commit f3b4712, common/utils/colmap.py, common/scene_release.py.
@@ -36,7 +36,7 @@ COLMAP, CAMERAS_NAME, IMAGES_NAME = "colmap", "cameras.txt", "images.txt"
 TRACKING_NAME = "pose_intrinsic_imu.json"
 OFF_CENTRE = 0.1  # of the image; an iPhone's principal point is within 0.02 of the middle
 FRAME_NAME = re.compile(r"frame_([0-9]{1,9})(?:\.[A-Za-z]{1,4})?")
-# Where each model of COLMAP keeps fx fy cx cy and k1 k2 p1 p2: src/colmap/sensor/models.h.
+# Position of fx fy cx cy and k1 k2 p1 p2 for each COLMAP model: src/colmap/sensor/models.h.
 MODELS = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
     "PINHOLE": ((0, 1, 2, 3), ()),
@@ -46,7 +46,7 @@ MODELS = {
 }
 N_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 MAX_DISTORTION = 10.0  # an iPhone has 0.2
-MAX_LINE_BYTES = 16 << 20  # of the points of one image, which are some thousands
+MAX_LINE_BYTES = 16 << 20  # the points of one image, a few thousand
 HEAD_BYTES = 4096
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -54,10 +54,10 @@ Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """Frames of the video by their ``numbers`` (n,), rising, each with its camera-to-world pose (n, 4, 4), not finite
-    where it was lost, and its intrinsics (n, 3, 3) for images of ``size``, the corner at 0.
+    """Frames of the video by ``numbers`` (n,), ascending, each with its camera-to-world pose (n, 4, 4), non-finite
+    if lost, and its intrinsics (n, 3, 3) for images of ``size``, the corner at 0.
 
-    ``distortion``: k1 k2 p1 p2 of all frames, zeros for none. ``files``: what they were read from.
+    ``distortion``: k1 k2 p1 p2 of all frames, zeros for none. ``files``: the source files.
     """
 
     numbers: Int64Array
@@ -69,7 +69,7 @@ class PosedFrames:
 
 
 def read_colmap(folder: Path, where: str) -> PosedFrames:
-    """The frames that COLMAP registered; ``folder`` holds ``cameras.txt`` and ``images.txt``."""
+    """The frames registered by COLMAP; ``folder`` has ``cameras.txt`` and ``images.txt``."""
     cameras, images = folder / CAMERAS_NAME, folder / IMAGES_NAME
     intrinsics, size, distortion = _read_camera(cameras, f"{where}: {COLMAP}/{CAMERAS_NAME}")
     pose_of = _read_images(images, f"{where}: {COLMAP}/{IMAGES_NAME}")
@@ -87,7 +87,7 @@ def read_colmap(folder: Path, where: str) -> PosedFrames:
 def _read_camera(path: Path, where: str) -> tuple[Float64Array, Size, Float64Array]:
     lines = [line.split() for line in read_text(path, where).splitlines() if line.strip() and line.strip()[0] != "#"]
     if len(lines) != 1:
-        raise DataError(f"{where}: has {len(lines)} cameras; expected one, as of an iPhone")
+        raise DataError(f"{where}: has {len(lines)} cameras; expected the iPhone's only")
     words = lines[0]
     model = words[1] if len(words) > 1 else ""
     if model not in MODELS:
@@ -110,7 +110,7 @@ def _size(words: Sequence[str], where: str) -> Size:
 
 
 def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
-    """Camera-to-world pose of each frame. Every second line lists points, and may be empty."""
+    """Camera-to-world pose of each frame. Every second line lists points and may be empty."""
     pose_of: dict[int, Float64Array] = {}
     uses_points = False
     for at, line in enumerate(_lines(path, where), 1):
@@ -123,15 +123,15 @@ def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
             raise DataError(f"{place}: has {len(words)} words; expected 'id qw qx qy qz tx ty tz camera name'")
         number = frame_number(words[9].rpartition("/")[2], place)
         if number in pose_of:
-            raise DataError(f"{place}: frame {number} stands there twice; copy the file again")
+            raise DataError(f"{place}: frame {number} is listed twice; copy the file again")
         pose_of[number] = _inverse_pose(numbers(words[1:8], place), place)
     if not pose_of:
-        raise DataError(f"{where}: lists no frame; copy the file again")
+        raise DataError(f"{where}: has no frames; copy the file again")
     return pose_of
 
 
 def _lines(path: Path, where: str) -> Iterator[bytes]:
-    """The lines of a file that may have hundreds of megabytes, for it lists every point of every image."""
+    """The lines of a file that may have hundreds of megabytes, because it lists every point of every image."""
     with reading(where), opened(path) as stream:
         while line := stream.readline(MAX_LINE_BYTES):
             if len(line) == MAX_LINE_BYTES:
@@ -140,24 +140,24 @@ def _lines(path: Path, where: str) -> Iterator[bytes]:
 
 
 def n_registered(path: Path) -> int | None:
-    """How many images the head of ``images.txt`` says it lists; None where it says nothing."""
+    """The number of images stated at the top of ``images.txt``; None if missing."""
     with opened(path) as stream:
         match = re.search(rb"^# Number of images: ([0-9]{1,7})\b", stream.read(HEAD_BYTES), re.MULTILINE)
     return None if match is None else int(match[1])
 
 
 def frame_number(name: str, where: str) -> int:
-    """The number in a name such as ``frame_000010.jpg``."""
+    """The frame number in a name such as ``frame_000010.jpg``."""
     match = FRAME_NAME.fullmatch(name)
     if match is None:
-        raise DataError(f"{where}: {name[:40]!a} is no frame of the iPhone; expected a name such as frame_000010")
+        raise DataError(f"{where}: {name[:40]!a} is not a frame of the iPhone; expected a name such as frame_000010")
     return int(match[1])
 
 
 def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
     length = math.hypot(*values[:4])
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in values) or abs(length - 1) > 1e-2:
-        raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a shift in metres; copy the file again")
+        raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a translation (m); copy the file again")
     w, x, y, z = (value / length for value in values[:4])
     to_camera = rotations_of(np.array([[x, y, z, w]]))[0]
     pose = np.eye(4)
@@ -167,19 +167,19 @@ def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
 
 
 class TrackedFrame(FileModel):
-    """What is read of a frame; numbers of a pose are not finite where tracking was lost."""
+    """The fields read of a frame; pose values are non-finite if tracking was lost."""
 
     aligned_pose: Annotated[list[Row4], Field(min_length=4, max_length=4)]
     intrinsic: Annotated[list[Row3], Field(min_length=3, max_length=3)]
 
 
 def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
-    """Every frame of the video, whose images have that ``size``, with its ``aligned_pose``."""
+    """Every frame of the video, with images of that ``size``, and its ``aligned_pose``."""
     where = f"{where}: {path.name}"
     entries = read_json(path, where, dict[str, TrackedFrame])
     entry_of = {frame_number(name, where): entry for name, entry in entries.items()}
     if not entry_of or len(entry_of) != len(entries):
-        raise DataError(f"{where}: has no frame, or one twice; copy the file again")
+        raise DataError(f"{where}: has no frames, or duplicates; copy the file again")
     order = sorted(entry_of)
     poses = np.array([entry_of[n].aligned_pose for n in order], np.float64)
     cameras = [(entry_of[n].intrinsic, f"{where}: frame {n}: 'intrinsic'") for n in order]
@@ -198,5 +198,5 @@ def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
     if faulty:
         raise DataError(f"{where}: frame {faulty[0]}: 'aligned_pose' is not a rigid motion; copy the file again")
     if not is_finite.any():
-        raise DataError(f"{where}: none of the {len(order)} frames has a pose; leave the scene out")
+        raise DataError(f"{where}: none of the {len(order)} frames has a pose; exclude the scene")
     return PosedFrames(np.array(order, np.int64), poses, intrinsics, size, np.zeros(4), (path,))

@@ -1,12 +1,12 @@
-"""Ground truth of a scan of ScanNet++, one row a vertex of ``mesh_aligned_0.05.ply``, as the official toolkit makes it.
+"""Ground truth of a ScanNet++ scan, one row per vertex of ``mesh_aligned_0.05.ply``, as in the official toolkit.
 
-Objects go in the order of the file. Each lays its class on its vertices, on each vertex at most three; a fourth finds
-no room. ``every_semantic`` are those classes, the truth of semantic evaluation (``multilabel.max_gt`` 3). Where there
-are several, that of the object that laid itself on fewest vertices stands for the vertex, of as many the first: the
-truth of instance evaluation.
+Objects are processed in file order. Each assigns its class to its vertices, at most three per vertex; a fourth is
+dropped. ``every_semantic`` are those classes, for semantic evaluation (``multilabel.max_gt`` 3). If a vertex has
+several, the object with the fewest vertices determines its class and instance, the first in a tie: the
+ground truth of instance evaluation.
 
-What the toolkit does besides, and so does this: an object whose word the benchmark does not have is passed over;
-instances are numbered by their place in the file from 0, and 0 counts as none, so that the first object of a file is
+As in the toolkit: objects whose label is not in the benchmark are skipped;
+instances are numbered by their position in the file from 0, and 0 means none, so the first object of a file is
 never an instance.
 
 Source: scannetpp/scannetpp at commit f3b4712, semantic/transforms/mesh.py, semantic/prep/prepare_semantic_gt.py.
@@ -37,7 +37,7 @@ MAX_VERTEX = re.compile(r"[0-9]{1,10}")
 
 
 class AnnotatedObject(FileModel):
-    """One object: the word that the annotator typed, and the ids of its segments."""
+    """An object: the label typed by the annotator, and the ids of its segments."""
 
     label: str
     segments: SegmentIds
@@ -57,7 +57,7 @@ def read_segments(path: Path, where: str) -> Int64Array:
 
 
 def vertices_of_segments(segments: Int64Array) -> _Members:
-    """A way from ids of segments to the vertices in them."""
+    """A lookup from segment ids to the vertices in them."""
     ids, row_of_vertex = np.unique(segments, return_inverse=True)
     rows = row_of_vertex.reshape(-1)
     starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(ids)))]).astype(np.int64)
@@ -71,7 +71,7 @@ class _Members:
     vertices: Int64Array
 
     def of(self, segments: Int64Array) -> Int64Array:
-        """The vertices in any of ``segments``; those that no vertex has are passed over."""
+        """The vertices in any of ``segments``; unknown segments are ignored."""
         places = np.searchsorted(self.ids, segments)
         is_known = places < len(self.ids)
         is_known[is_known] = self.ids[places[is_known]] == segments[is_known]
@@ -83,13 +83,13 @@ class _Members:
 
 
 def read_mask(path: Path, n_vertices: int, where: str) -> BoolArray:
-    """Which of the vertices (V,) evaluations leave out: the file lists them by their numbers, and may be empty."""
+    """The vertices (V,) excluded by evaluations: the file lists their numbers, and may be empty."""
     where = f"{where}: {path.name}"
     is_masked = np.zeros(n_vertices, np.bool_)
     words: Sequence[str] = read_text(path, where).split()
     wrong = next((word for word in words if not MAX_VERTEX.fullmatch(word) or int(word) >= n_vertices), None)
     if wrong is not None:
-        raise DataError(f"{where}: {wrong[:20]!a} is no vertex of {MESH_NAME}, which has {n_vertices} (from 0)")
+        raise DataError(f"{where}: {wrong[:20]!a} is not a vertex of {MESH_NAME}, which has {n_vertices} (from 0)")
     is_masked[[int(word) for word in words]] = True
     return is_masked
 
@@ -99,14 +99,14 @@ LABEL_SPACE = "scannetpp"
 BENCHMARK_FOLDER = "metadata/semantic_benchmark"
 CLASSES_NAME, INSTANCES_NAME, MAP_NAME = LIST_NAMES = ("top100.txt", "top100_instance.txt", "map_benchmark.csv")
 WORD, COUNT, TARGET = COLUMNS = ("class", "count", "semantic_map_to")
-NO_CLASS = "None"  # in the map: annotated, but not of the benchmark
+NO_CLASS = "None"  # in the mapping file: annotated, but not in the benchmark
 MAX_CLASSES = 10_000
 MAX_LETTERS = 200  # of the name of a class
 
 
 @dataclass(frozen=True)
 class BenchmarkClasses:
-    """``id_of``: of every word of annotators that the benchmark has, by way of the map, the class id;
+    """``id_of``: class id of every annotated label that the mapping sends to a benchmark class;
     ``with_instances``: the class ids of ``top100_instance.txt``."""
 
     labels: LabelSet
@@ -117,13 +117,13 @@ class BenchmarkClasses:
 def read_benchmark_classes(folder: Path, where: str) -> BenchmarkClasses:
     """The lists in ``folder``; ``where`` begins each message.
 
-    A word goes where its row sends it, and nowhere where that is no class of the list, or where no row has the word.
+    A label maps to the class in its row; to nothing if that class is not listed or no row has the label.
     """
     names = _read_names(folder / CLASSES_NAME, f"{where}: {CLASSES_NAME}")
     instances = _read_names(folder / INSTANCES_NAME, f"{where}: {INSTANCES_NAME}")
     row_of = {name: row for row, name in enumerate(names, 1)}
     if unknown := [name for name in instances if name not in row_of]:
-        raise DataError(f"{where}: {INSTANCES_NAME} has {unknown[0][:40]!a}, which {CLASSES_NAME} has not")
+        raise DataError(f"{where}: {INSTANCES_NAME} has {unknown[0][:40]!a}, which is missing in {CLASSES_NAME}")
     target_of = _read_map(folder / MAP_NAME, f"{where}: {MAP_NAME}")
     return BenchmarkClasses(
         LabelSet(LABEL_SPACE, tuple(row_of.values()), names),
@@ -134,13 +134,13 @@ def read_benchmark_classes(folder: Path, where: str) -> BenchmarkClasses:
 
 def _read_names(path: Path, where: str) -> tuple[str, ...]:
     names = read_text(path, where).splitlines()
-    while names and not names[-1].strip():  # blank lines at the end are no classes, and shift none
+    while names and not names[-1].strip():  # blank lines at the end are not classes
         names.pop()
     for number, name in enumerate(names, 1):
         if not name.strip() or not name.isprintable() or len(name) > MAX_LETTERS:
-            raise DataError(f"{where} line {number}: {name[:40]!a} is no name of a class; copy the file again")
+            raise DataError(f"{where} line {number}: {name[:40]!a} is not a class name; copy the file again")
     if not 1 <= len(names) <= MAX_CLASSES:
-        raise DataError(f"{where}: has {len(names)} lines; expected one a class")
+        raise DataError(f"{where}: has {len(names)} lines; expected one per class")
     if len(set(names)) != len(names):
         twice = next(name for row, name in enumerate(names) if name in names[:row])
         raise DataError(f"{where}: has {twice[:40]!a} twice; copy the file again")
@@ -148,15 +148,15 @@ def _read_names(path: Path, where: str) -> tuple[str, ...]:
 
 
 def _read_map(path: Path, where: str) -> dict[str, str]:
-    """Word -> class of each row with a count; an empty cell sends a word to itself, ``None`` nowhere."""
+    """Label -> class of each row with a count; an empty cell maps a label to itself, ``None`` to nothing."""
     text = read_text(path, where)
     try:
         rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
-        raise DataError(f"{where}: not a table of commas ({error}); copy the file again") from error
+        raise DataError(f"{where}: not CSV ({error}); copy the file again") from error
     header = rows[0] if rows else []
     if missing := [name for name in COLUMNS if name not in header]:
-        raise DataError(f"{where}: has no column '{missing[0]}'; expected the map of the release")
+        raise DataError(f"{where}: has no column '{missing[0]}'; expected the mapping file of the release")
     at = {name: header.index(name) for name in COLUMNS}
     target_of: dict[str, str] = {}
     for number, row in enumerate(rows[1:], 2):
@@ -165,7 +165,7 @@ def _read_map(path: Path, where: str) -> dict[str, str]:
         if len(row) <= max(at.values()):
             raise DataError(f"{where} row {number}: has {len(row)} cells of {len(header)}; copy the file again")
         word, count, target = (row[at[name]] for name in COLUMNS)
-        # A row is kept for count >= 0, which no count is not.
+        # A row counts if count >= 0, which is false for a missing count.
         if not count.strip() or not numbers([count.strip()], f"{where} row {number}: '{COUNT}'")[0] >= 0:
             continue
         if not target:
@@ -179,15 +179,15 @@ VARIANT = "scannetpp"
 TRUTH_NAMES = (MESH_NAME, MASK_NAME, SEGMENTS_NAME, OBJECTS_NAME)
 MAX_CLASSES_PER_VERTEX = 3  # multilabel_max of the toolkit
 LEFT_OUT = -1
-# Ground truth is class * 1000 + instance: a larger instance would spill into the next class.
+# Ground truth is class * 1000 + instance: a larger instance would overflow into the next class.
 MAX_OBJECTS = 1000
 
 
 @dataclass(frozen=True)
 class AnnotatedScan:
-    """The mesh of a scan with what lies on each vertex: ``every_class`` and ``every_object`` (V, 3), 0 for none.
+    """The mesh of a scan with its annotation: ``every_class`` and ``every_object`` (V, 3), 0 for none.
 
-    Objects are numbered by their place in the file from 1; ``chosen`` (V,) is the column that stands for the vertex.
+    Objects are numbered by their position in the file from 1; ``chosen`` (V,) is the column that counts for the vertex.
     """
 
     surface: Surface
@@ -221,8 +221,8 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
     class_of = {number: classes.id_of[one.label] for number, one in enumerate(objects, 1) if one.label in classes.id_of}
     if any(number > MAX_OBJECTS and class_of[number] in classes.with_instances for number in class_of):
         raise DataError(
-            f"{where}: {OBJECTS_NAME} has {len(objects)} objects; ground truth is class * 1000 + object, which cannot "
-            f"tell more than {MAX_OBJECTS} apart"
+            f"{where}: {OBJECTS_NAME} has {len(objects)} objects; ground truth is class * 1000 + object, which allows "
+            f"at most {MAX_OBJECTS}"
         )
     members = vertices_of_segments(segments)
     every_class, every_object = (np.zeros((n, MAX_CLASSES_PER_VERTEX), np.int32) for _ in range(2))
@@ -246,7 +246,7 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
 
 
 def vertex_truth(scan: AnnotatedScan) -> GroundTruth:
-    """The truth of both official evaluations; vertices that they leave out have the class ``LEFT_OUT``."""
+    """The ground truth of both official evaluations; excluded vertices have the class ``LEFT_OUT``."""
     instance = scan.object_of_vertex
     has_instance = np.isin(scan.class_of_vertex, list(scan.classes.with_instances)) & (instance > 1)
     return GroundTruth(
@@ -255,13 +255,13 @@ def vertex_truth(scan: AnnotatedScan) -> GroundTruth:
         np.where(has_instance & ~scan.is_masked, instance, 0).astype(np.int32),
         scan.classes.labels,
         VARIANT,
-        f"vertices of {MESH_NAME} with the objects of {OBJECTS_NAME}, words mapped to the benchmark's classes",
+        f"vertices of {MESH_NAME} with the objects of {OBJECTS_NAME}, labels mapped to the benchmark's classes",
         every_semantic=np.where(scan.is_masked[:, None], 0, scan.every_class).astype(np.int32),
     )
 
 
 def instance_mesh(scan: AnnotatedScan) -> InstanceMesh:
-    """The triangles, each with the object of most of its vertices, 0 where all three differ; walls and floors are
+    """The triangles, each with the object of most of its vertices, 0 if all three differ; walls and floors are
     objects here."""
     return InstanceMesh(
         scan.surface.vertices,
@@ -273,7 +273,7 @@ def instance_mesh(scan: AnnotatedScan) -> InstanceMesh:
 
 
 def read_surface(mesh: Path, segments: Path | None, where: str) -> Surface:
-    """The mesh without labels, with the published segments where their file is named."""
+    """The mesh without labels, with the published segments if their file is given."""
     surface = meshes.read_surface(mesh, f"{where}: {mesh.name}")
     if segments is None:
         return surface

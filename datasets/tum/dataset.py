@@ -1,13 +1,13 @@
-"""The layout of the TUM RGB-D benchmark: time stamps, images and a trajectory that were recorded side by side.
+"""The layout of the TUM RGB-D benchmark: time stamps, images and a trajectory that were recorded together.
 
 A sequence is a folder below the data root, ``tum/`` or ``TUM/`` with
 
 - ``rgb.txt``, ``depth.txt``: lines ``time file``, files relative to the folder; lines that begin with # are comments
 - ``associate.txt`` (optional): lines ``time colour-file time depth-file``; without it, images pair up by time
 - ``groundtruth.txt``: lines ``time tx ty tz qx qy qz qw``, camera-to-world, seconds and metres
-- ``camera.txt`` (optional, ours): one line ``fx fy cx cy``, pixels; without it, the benchmark's figures for the camera
-  that the sequence's name tells (``fr1``, ``freiburg2``, ...), else the ROS default
-- the images: 8-bit colour; 16-bit depth registered to it, 5000 units a metre, 0 where there is none
+- ``camera.txt`` (optional, ours): one line ``fx fy cx cy``, pixels; without it, the benchmark's values for the camera
+  in the sequence's name (``fr1``, ``freiburg2``, ...), otherwise the ROS default
+- the images: 8-bit colour; 16-bit depth registered to it, 5000 units per metre, 0 if there is none
 
 There is no ground truth of objects.
 """
@@ -43,12 +43,12 @@ Stamped = tuple[float, str]  # time in seconds, file name
 
 
 class TumOptions(BaseModel):
-    """How images and poses are put together.
+    """How images and poses are matched.
 
-    ``max_difference_s``: images further apart in time are no pair; a colour image without a pose within it is left out.
-    ``pose``: that at the colour image's time between its two neighbours (linear, spherical; the nearest alone where
-    the other is further away than ``max_difference_s``), or the ``nearest``. ``intrinsics``: fx fy cx cy, instead of
-    ``camera.txt`` and the benchmark's figures.
+    ``max_difference_s``: images further apart in time are not paired, nor are images and poses.
+    ``pose``: interpolated at the colour image's time (linear, spherical; only the nearest if
+    the other is further away than ``max_difference_s``), or the ``nearest``. ``intrinsics``: fx fy cx cy, replacing
+    ``camera.txt`` and the benchmark's values.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,7 +66,7 @@ class Tum(RecordedDataset[TumOptions]):
     places_of_scenes = (".", "tum", "TUM")
     how_to_get = (
         " or in its folder tum (a sequence is a folder with rgb.txt and depth.txt); unpack one there or set SU3D_DATA "
-        "to where they are"
+        "to their folder"
     )
     label_space = "none"
     no_mesh = "the benchmark has none"
@@ -80,7 +80,7 @@ class Tum(RecordedDataset[TumOptions]):
         return self._open(self.folder(scene), self.where(scene))
 
     def _open(self, path: Path, where: str) -> recorded_frames.Recording:
-        """The frames whose images and pose are there; what is missing is said once, as a warning."""
+        """The frames with images and a pose; missing ones are reported once, as a warning."""
         folder, limit_s = recorded_frames.Folder(path), self.options.max_difference_s
         has_pairs = (path / "associate.txt").exists()
         pairs = read_pairs(path, where) if has_pairs else associate(path, where, limit_s)
@@ -93,15 +93,15 @@ class Tum(RecordedDataset[TumOptions]):
             missing += absent
             if absent:
                 continue
-            # The colour image's time, as the benchmark's generate_registered_pointcloud.py: depth has its stamps late,
-            # and in fr1/desk depth images agree better with each other under it (88 % of the pixels against 80 %).
+            # The colour image's time, as in the benchmark's generate_registered_pointcloud.py: depth stamps are late,
+            # and in fr1/desk depth images agree better with each other this way (88 % of the pixels against 80 %).
             pose = pose_at(colour_s, times_s, poses, limit_s, interpolate=self.options.pose == "interpolate")
             if pose is None:
                 unposed.append(colour)
             else:
                 frames.append(recorded_frames.RecordedFrame(index, colour_s, colour, depth, pose))
         no_pose = f"colour images have no pose within {limit_s:g} s in groundtruth.txt"
-        remarks = recorded_frames.left_out(named, missing, "images named there are missing", len(frames))
+        remarks = recorded_frames.left_out(named, missing, "listed images are missing", len(frames))
         remarks += recorded_frames.left_out(where, unposed, no_pose, len(frames))
         if not frames:
             raise DataError(remarks[0] if remarks else f"{named}: no two images within {limit_s:g} s")
@@ -135,7 +135,7 @@ def read_pairs(folder: Path, where: str) -> list[tuple[Stamped, Stamped]]:
 
 
 def associate(folder: Path, where: str, max_difference_s: float) -> list[tuple[Stamped, Stamped]]:
-    """Colour and depth images nearest in time, the nearest pair first, each image once, as associate.py does it."""
+    """Pairs of colour and depth images, nearest in time first, each image once, as in associate.py."""
     lists = []
     for name in ("rgb.txt", "depth.txt"):
         rows = rows_of(folder / name, f"{where}: {name}", 2, "'time file'")
@@ -161,7 +161,7 @@ def associate(folder: Path, where: str, max_difference_s: float) -> list[tuple[S
 
 
 def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:
-    """(line number, words) of every line that is no comment; commas and tabs part words, as in associate.py."""
+    """(line number, words) of every non-comment line; commas and tabs separate words, as in associate.py."""
     rows = []
     for number, line in enumerate(read_text(path, where).replace(",", " ").split("\n"), start=1):
         words = line.split()
@@ -197,7 +197,7 @@ def read_trajectory(path: Path, where: str) -> tuple[Float64Array, Float64Array]
 def pose_at(
     time_s: float, times_s: Float64Array, rows: Float64Array, max_difference_s: float, *, interpolate: bool
 ) -> Float64Array | None:
-    """Camera-to-world pose (4, 4) at ``time_s``; None where no row is within ``max_difference_s``."""
+    """Camera-to-world pose (4, 4) at ``time_s``; None if no row is within ``max_difference_s``."""
     after = int(np.searchsorted(times_s, time_s))
     near = [k for k in (after - 1, after) if 0 <= k < len(times_s) and abs(times_s[k] - time_s) <= max_difference_s]
     if not near:
@@ -209,7 +209,7 @@ def pose_at(
     part = (time_s - times_s[near[0]]) / (times_s[near[1]] - times_s[near[0]])
     sign = 1.0 if before[3:] @ behind[3:] >= 0 else -1.0  # a quaternion and its negative are one rotation
     angle = np.arccos(min(1.0, abs(float(before[3:] @ behind[3:]))))
-    # Below 1e-6 rad the sines are too small to divide by, and the straight line is as good.
+    # Below 1e-6 rad the sines are too small to divide by, and linear interpolation is as good.
     weights = (1 - part, part) if angle < 1e-6 else np.sin([(1 - part) * angle, part * angle]) / np.sin(angle)
     quaternion = weights[0] * before[3:] + sign * weights[1] * behind[3:]
     translation = (1 - part) * before[:3] + part * behind[:3]
@@ -224,7 +224,7 @@ def quaternion_poses(translations: Float64Array, quaternions: Float64Array) -> F
 
 
 def unit_quaternion(values: Sequence[float], where: str) -> list[float]:
-    """The quaternion at length 1; one without a direction is a ``DataError``."""
+    """The normalized quaternion; one of length 0 is a ``DataError``."""
     length = float(np.linalg.norm(values))
     if not (np.isfinite(length) and length > 1e-6):
         raise DataError(f"{where}: the quaternion has the length {length:g}; expected 1")

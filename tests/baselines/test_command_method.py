@@ -1,4 +1,4 @@
-"""Programs of others as a method: the folder they get, what they leave, how they are run, measured and ended."""
+"""User programs as methods: their input folder, their output, how they are run, measured and ended."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SURFACE = Surface(
     np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [3, 0, 0]], np.float32),
     np.array([[0, 1, 2], [0, 1, 3]], np.int32),
 )
-# Two masks over five vertices as ScanNet's text has them, with the class ids of chair and wall in the rooms.
+# Two masks over five vertices in ScanNet's text format, with the class ids of chair and wall in the rooms.
 MASKS = """
 import os, sys
 out = sys.argv[1]
@@ -91,7 +91,7 @@ def refused(one: Command) -> str:
     return text
 
 
-def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:
+def test_exported_folder_reads_back_as_the_same_frames(tmp_path: Path) -> None:
     shots = frames()
     folder = FrameFolder(tmp_path / "rgbd" / "here", SCENE, surface=SURFACE)
     folder.open()
@@ -121,7 +121,7 @@ def test_masks_over_the_mesh_become_instances_on_its_vertices(tmp_path: Path) ->
     one.close()
 
 
-def test_points_of_its_own_need_no_mesh(tmp_path: Path) -> None:
+def test_prediction_with_points_needs_no_mesh(tmp_path: Path) -> None:
     text = """
 import sys, json, tomllib
 import numpy as np
@@ -138,9 +138,9 @@ np.savez(out + "/prediction.npz", kind="Partition", points=points.astype("f4"),
     one.close()
 
 
-def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> None:
+def test_ambiguous_class_numbers_need_a_protocol() -> None:
     content = vertex_masks("m", [np.zeros(0, np.int32)], 5, class_numbers=np.array([3], np.int32))
-    with pytest.raises(PredictionError, match="whose are its class numbers"):
+    with pytest.raises(PredictionError, match="its class numbers are ambiguous"):
         class_names(content, "scannet", None)
     assert class_names(content, "scannet", "scannet-instance")[3] == "cabinet"
     places = replace(content, numbering="index")
@@ -155,24 +155,24 @@ def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> N
             {},
             "rooms/a b: command: exit code 3; its last line: \\x1b[31mno weights\\x07",
         ),
-        ("import os; os.kill(os.getpid(), 9)", {}, "was ended by signal 9; it wrote nothing to stderr"),
-        ("", {}, "it ended without an error and left nothing in {output}"),
-        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: is in no known format"),
+        ("import os; os.kill(os.getpid(), 9)", {}, "terminated by signal 9; it wrote nothing to stderr"),
+        ("", {}, "it ended without an error but wrote nothing to {output}"),
+        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: in none of the known formats"),
         ("import sys; open(sys.argv[1] + '/p.npz', 'wb').write(b'?')", {"format": "openmask3d"}, "{output}"),
     ],
     ids=["exit-code", "signal", "nothing", "unknown-format", "wrong-format"],
 )
-def test_what_goes_wrong_is_one_line_that_says_it(tmp_path: Path, text: str, config: dict[str, Any], line: str) -> None:
+def test_each_failure_is_one_line(tmp_path: Path, text: str, config: dict[str, Any], line: str) -> None:
     assert line in refused(method(tmp_path, text, **config))
 
 
-def test_a_program_that_takes_too_long_is_ended_and_its_last_line_told() -> None:
+def test_slow_program_is_terminated_and_its_last_line_reported() -> None:
     # a shell starts at once, however busy the machine is
     one = fed(Command(CommandConfig(command="echo loading >&2; sleep 60", shell=True, timeout_s=2.0)))
-    assert "was ended after 2 s (timeout_s); its last line: loading" in refused(one)
+    assert "terminated after 2 s (timeout_s); its last line: loading" in refused(one)
 
 
-def test_only_the_variables_that_are_allowed_reach_the_program(
+def test_only_allowed_variables_reach_the_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("SECRET_TOKEN", "x")
@@ -187,7 +187,7 @@ def test_only_the_variables_that_are_allowed_reach_the_program(
     assert "PATH" not in told
 
 
-def test_placeholders_are_filled_and_no_shell_reads_them(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_placeholders_are_filled_without_a_shell(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     text = "import sys; print(sys.argv[2:])" + MASKS
     one = method(tmp_path, text, "{output}", "{dataset}/{scene}", "--seed={seed}", "$(id);{}")
     one.finish()
@@ -195,7 +195,7 @@ def test_placeholders_are_filled_and_no_shell_reads_them(tmp_path: Path, caplog:
     assert "stdout: ['rooms/a b', '--seed=7', '$(id);{}']" in caplog.text
 
 
-def test_a_line_is_split_into_words_and_a_shell_reads_it_only_when_asked(tmp_path: Path) -> None:
+def test_line_is_split_into_words_and_uses_a_shell_only_on_request(tmp_path: Path) -> None:
     path = program(tmp_path, MASKS)
     for config in (
         CommandConfig(command=f"'{sys.executable}' {path} {{output}}"),
@@ -222,10 +222,10 @@ SHOWN = "import sys; open(sys.argv[1] + '/../shown', 'w').write(repr(sys.argv[2:
         'for s in {scene}; do RUN {output} "$s"; done',
     ],
 )
-def test_a_shell_gets_what_a_scene_is_called_as_a_value_alone(tmp_path: Path, line: str) -> None:
+def test_shell_gets_the_scene_name_only_as_a_value(tmp_path: Path, line: str) -> None:
     line = line.replace("RUN", f"'{sys.executable}' '{program(tmp_path, SHOWN)}'")
     one = fed(Command(CommandConfig(command=line, shell=True)), scene=replace(SCENE, scene=HOSTILE))
-    with pytest.raises(PredictionError, match="it ended without an error and left nothing"):
+    with pytest.raises(PredictionError, match="it ended without an error but wrote nothing"):
         one.finish()
     assert one._scratch is not None
     assert (one._scratch.path / "shown").read_text() == repr([HOSTILE])
@@ -246,12 +246,12 @@ def test_a_shell_gets_what_a_scene_is_called_as_a_value_alone(tmp_path: Path, li
         "sh <<E\nb {scene}\nE",
     ],
 )
-def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str) -> None:
+def test_placeholder_read_as_shell_commands_is_rejected(line: str) -> None:
     with pytest.raises(ValueError, match="where a shell would read its value as commands; write "):
         check_placeholders(line, is_shell=True)
 
 
-def test_finish_midway_gives_the_map_of_the_frames_so_far_and_changes_nothing(tmp_path: Path) -> None:
+def test_finish_midway_gives_the_map_so_far_and_changes_nothing(tmp_path: Path) -> None:
     text = """
 import os, sys
 out, frames = sys.argv[1:]
@@ -277,7 +277,7 @@ def _n_masks(one: Command) -> int:
     return len(found)
 
 
-def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_files_are_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     (tmp_path / "scratch").mkdir()
     one = method(tmp_path, MASKS)
@@ -297,7 +297,7 @@ def test_another_version_of_the_program_is_another_run(tmp_path: Path) -> None:
     assert [name for name in before if before[name] != after[name]] == [f"file {path}"]
 
 
-def test_a_run_scores_a_program_keeps_its_words_and_refuses_another_version_of_it(
+def test_run_scores_a_program_logs_its_output_and_rejects_another_version(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     see_painted(monkeypatch)

@@ -1,4 +1,4 @@
-"""How programs of others are run, measured and ended: as they are, in docker, in conda."""
+"""How user programs are run, measured and ended: directly, in docker, in conda."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.baselines.command.process import run_program
 
 
-def test_a_timeout_ends_children_too_even_those_that_left_the_group(tmp_path: Path) -> None:
+def test_timeout_kills_children_including_those_outside_the_group(tmp_path: Path) -> None:
     line = f"sleep 60 & echo $! >> {tmp_path}/pids; setsid sleep 60 & echo $! >> {tmp_path}/pids; wait"
     refused(fed(Command(CommandConfig(command=line, shell=True, timeout_s=2.0))))
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2
-    wait_until(lambda: not any(_runs(pid) for pid in pids), "a child runs on")
+    wait_until(lambda: not any(_runs(pid) for pid in pids), "a child is still running")
 
 
 def _runs(pid: int) -> bool:
     return bool(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
 
 
-def test_memory_and_time_are_those_of_the_program_and_its_children(tmp_path: Path) -> None:
+def test_memory_and_time_include_the_children(tmp_path: Path) -> None:
     child = "import time; held = bytearray(150_000_000); time.sleep(1.5)"
     text = f"import subprocess, sys; held = bytearray(100_000_000); subprocess.run([sys.executable, '-c', {child!r}])"
     done = run_program(
@@ -40,7 +40,7 @@ def test_memory_and_time_are_those_of_the_program_and_its_children(tmp_path: Pat
     assert done.wall_s >= 1.5
 
 
-def test_a_flood_of_output_is_kept_from_its_end_only(tmp_path: Path) -> None:
+def test_only_the_end_of_a_flood_of_output_is_kept(tmp_path: Path) -> None:
     text = "import sys\nfor i in range(40000): print('line', i)\nsys.stderr.write('end')"
     done = run_program([sys.executable, "-c", text], folder=tmp_path, environment={}, timeout_s=60)
     assert len(done.stdout) < 101_000
@@ -50,7 +50,7 @@ def test_a_flood_of_output_is_kept_from_its_end_only(tmp_path: Path) -> None:
 
 
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, body: str) -> Path:
-    """A program called ``name``, first on PATH, that writes down its arguments and then does ``body``."""
+    """A program called ``name``, first on PATH, that records its arguments and then runs ``body``."""
     folder = tmp_path / "bin"
     folder.mkdir(exist_ok=True)
     log = tmp_path / f"{name}.jsonl"
@@ -71,7 +71,7 @@ if words[0] == "run":
 """
 
 
-def test_docker_gets_read_only_frames_no_network_and_the_paths_inside(
+def test_docker_gets_read_only_frames_no_network_and_inside_paths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = fake(tmp_path, monkeypatch, "docker", FAKE_DOCKER + MASKS)
@@ -100,12 +100,12 @@ def test_docker_gets_read_only_frames_no_network_and_the_paths_inside(
     assert words[words.index("--gpus") + 1] == "all"
 
 
-def test_a_container_that_takes_too_long_is_killed_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_container_is_killed_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake(tmp_path, monkeypatch, "docker", "")
     docker, log = tmp_path / "bin" / "docker", tmp_path / "docker.log"
     docker.write_text(f'#!/bin/sh\necho "$@" >> {log}\nif [ "$1" = run ]; then sleep 60; fi\n')
     one = fed(Command(CommandConfig(command="x {output}", runner="docker", image="i", timeout_s=2.0)))
-    assert "was ended after 2 s" in refused(one)
+    assert "terminated after 2 s" in refused(one)
     started, killed = (line.split() for line in log.read_text().splitlines())
     assert killed == ["kill", started[started.index("--name") + 1]]
 

@@ -1,4 +1,4 @@
-"""ConceptFusion on hand-worked values: the mixing of features, the field of pixels, the means over views."""
+"""ConceptFusion on hand-worked values: mixing of features, the pixel field, means over views."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def unit(*values: float) -> np.ndarray:
 # ---- 4.1: weights and mixtures
 
 
-def test_weights_are_a_softmax_over_the_regions_of_their_cosines_with_the_image() -> None:
+def test_weights_are_a_softmax_over_cosines_of_regions_and_image() -> None:
     e = np.e
     assert mixing_weights(rows(*E1), rows(E1, E2), "softmax") == pytest.approx([e / (e + 1), 1 / (e + 1)])
     half = mixing_weights(rows(*E1), rows(E1, E2), "softmax", temperature=0.5)
     assert half == pytest.approx([e**2 / (e**2 + 1), 1 / (e**2 + 1)])
 
 
-def test_the_feature_of_a_region_is_the_normalised_mixture() -> None:
+def test_region_feature_is_the_normalised_mixture() -> None:
     mixed = mixed_features(rows(*E1), rows(E2, E1), np.array([0.25, 0.75]))
     assert mixed[0] == pytest.approx(unit(0.25, 0.75))
     assert mixed[1] == pytest.approx(E1)
@@ -54,7 +54,7 @@ def test_the_feature_of_a_region_is_the_normalised_mixture() -> None:
 
 
 def field_of(features: list[np.ndarray], overlaps: Any = "sum", boxes: Any = None) -> np.ndarray:
-    """The field of one pixel under all of ``features``, in their order."""
+    """The field of one pixel under all ``features``, in order."""
     masks = np.ones((len(features), 1, 1), bool)
     boxes = np.tile(BOX, (len(features), 1)) if boxes is None else rows(*boxes)
     painted = paint(masks, boxes, np.array(features), overlaps, 1, 1)
@@ -62,14 +62,14 @@ def field_of(features: list[np.ndarray], overlaps: Any = "sum", boxes: Any = Non
     return of_pixel
 
 
-def test_where_masks_overlap_the_last_counts_as_much_as_all_before_it() -> None:
+def test_last_of_overlapping_masks_counts_as_much_as_all_before() -> None:
     assert field_of([E1, E2]) == pytest.approx(unit(1, 1), abs=1e-3)
     assert field_of([E1, E2, E2]) == pytest.approx(unit(0.5**0.5, 0.5**0.5 + 1), abs=1e-3)
     assert field_of([E2, E2, E1]) == pytest.approx(unit(1, 1), abs=1e-3)
 
 
 @pytest.mark.parametrize("overlaps", ["sum", "small-over-large"])
-def test_the_field_is_that_of_painting_mask_after_mask_at_full_size(overlaps: Any) -> None:
+def test_field_matches_painting_masks_at_full_size(overlaps: Any) -> None:
     rng = np.random.default_rng(2)
     masks, features = rng.random((11, 12, 9)) < 0.3, rng.normal(size=(11, 5))
     features /= np.linalg.norm(features, axis=1, keepdims=True)
@@ -87,7 +87,7 @@ def test_the_field_is_that_of_painting_mask_after_mask_at_full_size(overlaps: An
 
 
 def wall(index: int = 0, depth_m: float = 1.0) -> Frame:
-    """A wall 1 m before the world's origin, seen from ``depth_m`` away."""
+    """A wall 1 m in front of the world's origin, seen from ``depth_m`` away."""
     camera = np.eye(4)
     camera[2, 3] = 1.0 - depth_m
     depth = np.full((SIDE, SIDE), depth_m, np.float32)
@@ -95,7 +95,7 @@ def wall(index: int = 0, depth_m: float = 1.0) -> Frame:
 
 
 def seen(index: int, *parts: tuple[Any, np.ndarray], whole: np.ndarray | None = None) -> Detections:
-    """Regions at slices of columns; by default the image's feature is theirs, so that the mixture is too."""
+    """Regions at slices of columns; by default the image's feature equals theirs, and so does the mixture."""
     masks = np.zeros((len(parts), SIDE, SIDE), bool)
     for mask, (columns, _) in zip(masks, parts, strict=True):
         mask[:, columns] = True
@@ -125,7 +125,7 @@ EVERYWHERE = slice(0, SIDE)
 A, B = unit(3, 4), unit(4, 3)
 
 
-def test_two_observations_give_the_mean_weighted_by_alpha_which_is_not_normalised() -> None:
+def test_two_observations_give_the_unnormalised_mean_weighted_by_alpha() -> None:
     method = fused((wall(0), seen(0, (EVERYWHERE, A))), (wall(1), seen(1, (EVERYWHERE, B))))
     prediction = method.finish()
     assert method.n_points == len(prediction.points) == SIDE * SIDE
@@ -133,7 +133,7 @@ def test_two_observations_give_the_mean_weighted_by_alpha_which_is_not_normalise
     assert np.linalg.norm(prediction.features[0].astype(float)) < 0.995
 
 
-def test_a_pixel_without_a_mask_makes_a_point_of_zero_feature_whose_confidence_dilutes_what_comes_later() -> None:
+def test_pixel_without_mask_creates_a_zero_feature_that_dilutes_later_ones() -> None:
     left = slice(0, SIDE // 2)
     method = fused((wall(0), seen(0, (left, A))))
     first = method.finish()
@@ -144,13 +144,13 @@ def test_a_pixel_without_a_mask_makes_a_point_of_zero_feature_whose_confidence_d
     np.testing.assert_allclose(after[bare], np.tile(B / 2, (bare.sum(), 1)), atol=1e-3)
 
 
-def test_a_feature_with_a_zero_channel_is_never_averaged_in_unless_any_channel_will_do() -> None:
+def test_feature_with_a_zero_channel_is_averaged_only_with_any_channel() -> None:
     updates = (wall(0), seen(0, (EVERYWHERE, E1))), (wall(1), seen(1, (EVERYWHERE, E2)))
     assert fused(*updates).finish().features[0].tolist() == [1.0, 0.0]
     assert fused(*updates, valid_features="any-channel").finish().features[0].tolist() == [0.5, 0.5]
 
 
-# ---- products in half precision, as gradslam has them
+# ---- products in half precision, as in gradslam
 
 
 def table_of(features: np.ndarray, confidences: np.ndarray, place: Any = "memory") -> FeatureTable:
@@ -159,8 +159,8 @@ def table_of(features: np.ndarray, confidences: np.ndarray, place: Any = "memory
     return table
 
 
-def test_products_in_half_precision_are_those_of_whole_arrays() -> None:
-    """Against gradslam's formula for all points at once, half in the first step and single from then on."""
+def test_half_precision_products_match_whole_arrays() -> None:
+    """Against gradslam's formula for all points at once, half precision in the first step and single afterwards."""
     rng = np.random.default_rng(5)
     n, d = 40, 16
     confidences = np.where(rng.random(n) < 0.4, 1e-7, rng.random(n))
@@ -201,4 +201,4 @@ def test_finish_midway_changes_nothing() -> None:
     np.testing.assert_array_equal(method.finish().points, whole.points)
 
 
-# ---- what it does unlike the others
+# ---- differences from other methods

@@ -1,4 +1,4 @@
-"""Segments of meshes: ScanNet's algorithm, worked by hand, against plain Python, and against the original program."""
+"""Segments of meshes: ScanNet's algorithm, by hand, against plain Python, and against the original program."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HEAP_SORTED = [
 
 
 def sheet(heights: list[list[float]], spacing_m: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh over a grid of heights, two triangles a cell, normals up."""
+    """A mesh over a grid of heights, two triangles per cell, normals up."""
     z = np.array(heights, np.float32)
     rows, columns = z.shape
     row, column = np.divmod(np.arange(z.size), columns)
@@ -35,7 +35,7 @@ def sheet(heights: list[list[float]], spacing_m: float = 0.1) -> tuple[np.ndarra
 
 
 def rough_sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rough sheet with a fold, the same bits everywhere: on it the original program was run."""
+    """A rough sheet with a fold, bit-identical everywhere: the input given to the original program."""
     row, column = np.divmod(np.arange(n * n), n)
     height = ((row * row * 31 + row * column * 17 + column * column * 13) % 97).astype(np.float32) * F(0.00008)
     height += np.where(column > n // 2, column - n // 2, 0).astype(np.float32) * F(0.015)
@@ -53,13 +53,13 @@ def rough_sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
         (0.1, "e5f59faf2641adc5b7b7609b5d9bbb713cf98b1079bea78e8e298b616ffab133"),
     ],
 )
-def test_segments_are_those_of_scannets_program_to_the_last_id(threshold: float, digest: str) -> None:
-    """Digests of the answer of segmentator.cpp (b38b278, GCC 12) on the same triangles, as little-endian int32."""
+def test_segments_match_scannets_program_to_the_last_id(threshold: float, digest: str) -> None:
+    """Digests of the output of segmentator.cpp (b38b278, GCC 12) on the same triangles, as little-endian int32."""
     segments = mesh_segments(*rough_sheet(60), threshold)
     assert hashlib.sha256(segments.astype("<i4").tobytes()).hexdigest() == digest
 
 
-def test_equal_weights_come_in_the_order_of_gnus_sort() -> None:
+def test_equal_weights_are_ordered_as_by_gnus_sort() -> None:
     numbers = np.arange(60, dtype=np.int32)
     weights, edges = ((numbers * 7919) % 5).astype(np.float32), np.stack([numbers, numbers], axis=1)
     sort_as_gnu(weights, edges)
@@ -67,22 +67,22 @@ def test_equal_weights_come_in_the_order_of_gnus_sort() -> None:
     assert (np.diff(weights) >= 0).all() and (edges[:, 0] == edges[:, 1]).all()
 
 
-def test_heap_sort_moves_equal_weights_as_gnus() -> None:
-    numbers = np.arange(40, dtype=np.int32) - 2  # not from the beginning of the list
+def test_heap_sort_orders_equal_weights_as_gnus() -> None:
+    numbers = np.arange(40, dtype=np.int32) - 2  # not starting at the beginning of the list
     weights, edges = ((numbers * 7919) % 5).astype(np.float32), np.stack([numbers, numbers], axis=1)
     _heap_sort(weights, edges, 2, 39)
     assert edges[2:39, 0].tolist() == HEAP_SORTED
     assert edges[[0, 1, 39], 0].tolist() == [-2, -1, 37]
 
 
-def test_a_vertex_normal_is_the_running_mean_of_its_triangles() -> None:
+def test_vertex_normal_is_the_running_mean_of_its_triangles() -> None:
     """A horizontal triangle, then a vertical one over the edge 0-1: the mean of (0,0,1) and (0,-1,0) at both."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]], np.int32))
     assert normals.tolist() == [[0, -0.5, 0.5], [0, -0.5, 0.5], [0, 0, 1], [0, -1, 0]]
 
 
-def test_a_concave_edge_weighs_one_minus_the_dot_product_and_a_convex_one_its_square() -> None:
+def test_concave_edge_weighs_one_minus_the_dot_product_and_convex_its_square() -> None:
     """Of the two triangles above: the product is 0.5 along each edge; only from 2 to 1 the end's normal leans away."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     edges, weights = edges_of(vertices, np.array([[0, 1, 2], [0, 1, 3]], np.int32))

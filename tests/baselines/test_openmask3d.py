@@ -1,4 +1,4 @@
-"""OpenMask3D by hand: projection, views, prompts, crops, means, and what its being bound to proposals means."""
+"""OpenMask3D by hand: projection, views, prompts, crops, means, and its dependence on proposals."""
 
 from __future__ import annotations
 
@@ -54,31 +54,31 @@ def seen(points: Sequence[Sequence[float]], view: Frame, tolerance_m: float = 0.
 
 
 class TestProjection:
-    def test_a_pixel_is_the_projection_truncated_toward_zero(self) -> None:
-        """-0.9 lies in pixel 0, -1.1 in none; 11.9 is the last column, 12.0 is outside."""
+    def test_pixel_is_the_projection_truncated_toward_zero(self) -> None:
+        """-0.9 is in pixel 0, -1.1 in none; 11.9 is the last column, 12.0 is outside."""
         found = seen([(-0.09, 0, 1), (-0.11, 0, 1), (1.19, 0, 1), (1.2, 0, 1), (0.39, 0.29, 1)], frame())
         assert found == [0, -1, 11, -1, 2 * WIDTH + 3]
 
-    def test_the_depth_may_differ_by_the_tolerance_itself_and_no_more(self) -> None:
+    def test_depth_may_differ_by_exactly_the_tolerance(self) -> None:
         assert seen([(0, 0, 1.25), (0, 0, 0.75), (0, 0, 1.26), (0, 0, 0.74)], frame(), 0.25) == [0, 0, -1, -1]
 
-    def test_beside_holes_points_near_the_cameras_plane_count_on_either_side_of_it(self) -> None:
+    def test_points_near_the_camera_plane_count_at_holes_on_either_side(self) -> None:
         """No test for a positive depth: a hole has depth 0, which is within 0.2 m of -0.1 m."""
         holes = frame(depth_m=0.0)
         assert seen([(0.015, 0.015, 0.1), (-0.015, -0.015, -0.1), (0, 0, -0.3)], holes) == [WIDTH + 1, WIDTH + 1, -1]
         assert seen([(-0.015, -0.015, -0.1)], frame()) == [-1]
 
-    def test_a_point_in_the_cameras_plane_falls_on_the_first_pixel(self) -> None:
+    def test_point_in_the_camera_plane_falls_on_the_first_pixel(self) -> None:
         assert seen([(5, 5, 0)], frame(depth_m=0.0)) == [0] and seen([(5, 5, 0)], frame()) == [-1]
 
-    def test_the_centres_are_scaled_by_each_others_factor(self) -> None:
+    def test_centres_are_scaled_by_the_other_axis(self) -> None:
         """640 x 480 of 1296 x 968: fx floor(478.02) / 968, fy 640 / 1296, cx 479 / 967, cy 639 / 1295."""
         colour = np.array([[1000.0, 0, 967], [0, 1000, 1295], [0, 0, 1]])
         scaled = swapped_intrinsics(colour, (968, 1296), 480, 640)
         assert np.diag(scaled)[:2] == pytest.approx([1000 * 478 / 968, 1000 * 640 / 1296])
         assert scaled[:2, 2] == pytest.approx([479, 639])
 
-    def test_of_a_frame_of_full_size_nothing_changes_and_of_a_smaller_one_the_centre_moves(self) -> None:
+    def test_full_size_frame_is_unchanged_and_a_smaller_one_shifts_the_centre(self) -> None:
         whole = replace(frame(), intrinsics=np.array([[1170.0, 0, 647], [0, 1170, 483], [0, 0, 1]]))
         whole = replace(whole, rgb=np.zeros((968, 1296, 3), np.uint8), depth_m=np.zeros((968, 1296), np.float32))
         assert as_openmask3d(whole, (968, 1296)) == pytest.approx(whole.intrinsics)
@@ -92,14 +92,14 @@ class TestProjection:
 
 
 class TestViews:
-    def test_pixels_count_once_however_many_points_hit_them(self) -> None:
+    def test_pixels_count_once_even_if_several_points_hit_them(self) -> None:
         points = np.array([(0, 0, 1), (0.01, 0, 1), (0.3, 0, 1), (9, 9, 9)])
         proposals = made_proposals(points, [0, 1, 2, 3], [1, 2], [3], [])
         pixels = visible_pixels(proposals.points, frame(), INTRINSICS, 0.2)
         assert count_pixels(pixels, proposals, WIDTH * HEIGHT).tolist() == [2, 2, 0, 0]
         assert pixels_of_mask(pixels, proposals.mask(0), WIDTH).tolist() == [[0, 0], [3, 0]]
 
-    def test_the_views_with_most_pixels_stay_and_of_equal_ones_the_earlier(self) -> None:
+    def test_views_with_most_pixels_are_kept_and_ties_go_to_the_earlier(self) -> None:
         views = MaskViews(2, 2)
         for position, counts in enumerate([(3, 0), (5, 0), (5, 1), (3, 1), (6, 1)]):
             views.add(position, np.array(counts))
@@ -107,7 +107,7 @@ class TestViews:
 
 
 class Prompts:
-    """Regions that answer the k-th prompt with the k-th score and remember the points."""
+    """Regions that answer the k-th prompt with the k-th score and record the points."""
 
     dim = 2
 
@@ -139,7 +139,7 @@ class TestPrompts:
             assert {tuple(point) for point in points} <= {tuple(pixel) for pixel in PIXELS.tolist()}
         assert len({str(sorted(points)) for points in prompts.asked}) > 5
 
-    def test_the_surest_round_wins_and_of_equal_ones_the_first(self) -> None:
+    def test_best_round_wins_and_ties_go_to_the_first(self) -> None:
         scores = [0.2, 0.7, 0.3, 0.9, 0.9, 0.1, 0.9, 0, 0, 0]
         best = prompted_mask(Prompts(scores), frame(), PIXELS, 10, 5, np.random.default_rng(0))
         assert best is not None and best.sum() == 4  # the fourth round
@@ -147,7 +147,7 @@ class TestPrompts:
 
 class TestCrops:
     def test_levels_grow_by_the_floor_of_a_tenth_on_every_side(self) -> None:
-        """19 wide, 29 high: floor(1.9) = 1 and floor(2.9) = 2 a level."""
+        """19 wide, 29 high: floor(1.9) = 1 and floor(2.9) = 2 per level."""
         mask = np.zeros((60, 60), bool)
         mask[20:49, 10:29] = True
         expected = [[10, 20, 29, 49], [9, 18, 30, 51], [8, 16, 31, 53]]
@@ -163,7 +163,7 @@ class TestCrops:
 
 
 class WallOfPatches:
-    """Regions of a wall of coloured patches: columns 0-3, 4-7 and 8-11 of the image, each with an axis of its own."""
+    """Regions of a wall of coloured patches: columns 0-3, 4-7 and 8-11 of the image, each with its own axis."""
 
     dim = 3
 
@@ -225,22 +225,22 @@ class TestMethod:
         assert np.array_equal(found.points, WALL) and found.mask(1).tolist() == MIDDLE
         assert found.boxes[0].tolist() == [WALL[LEFT].min(axis=0).tolist(), WALL[LEFT].max(axis=0).tolist()]
 
-    def test_the_feature_is_the_plain_mean_over_all_crops(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_feature_is_the_plain_mean_over_all_crops(self, monkeypatch: pytest.MonkeyPatch) -> None:
         crops = np.eye(3, dtype=np.float32)[[0, 1, 1]]
         monkeypatch.setattr(WallOfPatches, "encode_regions", lambda *_: crops)
         features = ran(made_proposals(WALL, LEFT), [frame(0), frame(1)])[1].features
         assert features is not None and features[0] == pytest.approx([1 / 3, 2 / 3, 0])
 
-    def test_two_objects_that_a_proposal_merges_stay_merged(self) -> None:
+    def test_two_objects_merged_by_a_proposal_stay_merged(self) -> None:
         _, found, _, _ = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])
         assert len(found) == 2 and found.mask(0).tolist() == LEFT + MIDDLE
-        assert found.features is not None and found.features[0].max() == 1  # the surest prompt saw one of the two
+        assert found.features is not None and found.features[0].max() == 1  # the best prompt saw one of the two
 
-    def test_an_object_without_a_proposal_is_never_found(self) -> None:
+    def test_object_without_a_proposal_is_never_found(self) -> None:
         _, found, _, regions = ran(made_proposals(WALL, LEFT), [frame(0), frame(1), frame(2)])
         assert not set(found.indices.tolist()) & set(MIDDLE + RIGHT) and regions.masks.any(axis=0).all()
 
-    def test_a_mask_without_a_usable_view_has_a_zero_feature_and_so_the_first_class(self) -> None:
+    def test_mask_without_a_usable_view_has_a_zero_feature_and_the_first_class(self) -> None:
         """As NaN becomes 0 and argmax 0 in the original; the protocols' rule is the same."""
         hidden = np.concatenate([WALL, [(0.5, 0.5, 3)]]).astype(np.float32)
         _, found, _, _ = ran(made_proposals(hidden, LEFT, [len(WALL)], []), [frame()])
@@ -248,8 +248,8 @@ class TestMethod:
         assert most_similar(found.features, np.eye(3)[[1, 0, 2]]).tolist() == [1, 0, 0]
         assert found.boxes[2].tolist() == [[0, 0, 0], [0, 0, 0]] and np.diff(found.view_indptr).tolist() == [1, 0, 0]
 
-    def test_only_the_best_views_are_looked_at_each_frame_once_and_in_order(self) -> None:
-        """Seen from further right fewer columns show; frames 0 and 3 show all, so two views are these."""
+    def test_only_the_best_views_are_read_each_frame_once_in_order(self) -> None:
+        """Farther to the right fewer columns are visible; frames 0 and 3 show all, so they are the two views."""
         frames = [frame(10 * k, x_m=x) for k, x in enumerate((0.0, 0.6, 0.3, 0.0))]
         method, found, counted, regions = ran(
             made_proposals(WALL, list(range(len(WALL))), LEFT), frames, OpenMask3DConfig(proposals="oracle", top_k=2)
@@ -260,7 +260,7 @@ class TestMethod:
         assert (method.n_points, method.n_instances) == (len(WALL), 2)
         assert method.map_bytes > 12 * len(WALL)
 
-    def test_finish_midway_changes_nothing_and_the_same_run_gives_the_same(self) -> None:
+    def test_finish_midway_changes_nothing_and_runs_are_reproducible(self) -> None:
         proposals, frames = made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame(0), frame(10, x_m=0.1)]
         method, first, _, _ = ran(proposals, frames)
         again, (_, other, _, _) = method.finish(), ran(proposals, frames)
@@ -268,17 +268,17 @@ class TestMethod:
         assert first.features.tobytes() == again.features.tobytes() == other.features.tobytes()
         assert np.array_equal(first.views, other.views)
 
-    def test_a_masks_prompts_do_not_depend_on_the_other_masks(self) -> None:
+    def test_prompts_of_a_mask_do_not_depend_on_other_masks(self) -> None:
         alone = ran(made_proposals(WALL, LEFT + MIDDLE), [frame()])[1].features
         beside = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])[1].features
         assert alone is not None and beside is not None and alone[0].tolist() == beside[0].tolist()
 
-    def test_a_score_of_a_proposal_is_a_confidence_where_asked_for(self) -> None:
+    def test_proposal_score_is_the_confidence_on_request(self) -> None:
         config = OpenMask3DConfig(proposals="oracle", confidence="proposal")
         _, found, _, _ = ran(made_proposals(WALL, LEFT, RIGHT, scores=[0.3, 0.8]), [frame()], config)
         assert found.scores.tolist() == [0.3, 0.8]
 
-    def test_other_intrinsics_move_the_views(self) -> None:
+    def test_other_intrinsics_change_the_views(self) -> None:
         config = OpenMask3DConfig(proposals="oracle", intrinsics="openmask3d", intrinsic_resolution=(16, 12))
         as_is, moved = (
             ran(made_proposals(WALL, LEFT), [frame()])[0],
@@ -286,13 +286,13 @@ class TestMethod:
         )
         assert as_is._views.n_pixels[0, 0] == 32 != moved._views.n_pixels[0, 0]
 
-    def test_a_frame_that_is_another_when_read_again_is_an_error(self) -> None:
+    def test_frame_that_differs_when_read_again_is_an_error(self) -> None:
         method, _, counted, _ = ran(made_proposals(WALL, LEFT), [frame()])
         counted.frames = [frame(5)]
         with pytest.raises(DataError, match="update 0 was frame 0, read again it is frame 5"):
             method.finish()
 
-    def test_without_frames_or_proposals_there_are_empty_answers(self) -> None:
+    def test_without_frames_or_proposals_results_are_empty(self) -> None:
         assert ran(made_proposals(WALL, LEFT), [])[1].features is not None
         assert len(ran(made_proposals(WALL), [frame()])[1]) == 0
 
@@ -307,7 +307,7 @@ class TestMethod:
 
 
 class TestVariants:
-    def test_the_defaults_are_the_published_ones(self) -> None:
+    def test_defaults_are_the_published_ones(self) -> None:
         config = OpenMask3DConfig()
         assert (config.stride, config.top_k, config.vis_threshold) == (10, 5, 0.2)
         assert (config.num_random_rounds, config.num_selected_points) == (10, 5)
@@ -317,7 +317,7 @@ class TestVariants:
         assert (other.part_eps_m, other.part_min_points, other.part_max_dropped) == (0.05, 5, 15)
         assert (other.part_kept_share, other.surface_max, config.surface_max) == (0.8, 400, 150)
 
-    def test_segment3ds_parts_are_split_by_density_where_openmask3ds_are_by_gaps(self) -> None:
+    def test_segment3d_splits_parts_by_density_and_openmask3d_by_gaps(self) -> None:
         """Two rows of points 30 cm apart, and a lone point: one part, but for Segment3D two and noise."""
         points = np.array([(0.01 * k, y, 0) for y in (0, 0.3) for k in range(20)] + [(0.1, 0.15, 0)], np.float32)
         surface = Surface(points, np.zeros((0, 3), np.int32), np.zeros(41, np.int32))
@@ -331,7 +331,7 @@ class TestVariants:
         assert sizes == {"openmask3d": [41], "openmask3d-segment3d": [20]}  # of two equal parts floor(0.8 * 2) stay
 
     @pytest.mark.parametrize("name", ["openmask3d", "openmask3d-segment3d"])
-    def test_they_are_registered_need_no_masks_and_say_what_they_are(self, name: str) -> None:
+    def test_methods_are_registered_need_no_masks_and_state_their_caveats(self, name: str) -> None:
         cls = registry.load("method", name)
         method = cls(cls.Config())
         assert cls.name == name and method.needs.masks == "none" and not method.needs.true_proposals

@@ -1,4 +1,4 @@
-"""PointFusion as gradslam has it: projection, unique matches, confidence-weighted means, on hand-worked values."""
+"""PointFusion as in gradslam: projection, unique matches, confidence-weighted means, on hand-worked values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TOWARDS = np.array([0.0, 0.0, 1.0])
 
 
 def row_of_pixels(width: int = 4, depth_m: float = 1.0) -> View:
-    """One row of pixels a metre apart at depth 1 m, seen by a camera of focal length 1 at the origin."""
+    """One row of pixels per metre apart at depth 1 m, seen by a camera of focal length 1 at the origin."""
     points = np.stack([np.arange(width) * depth_m, np.zeros(width), np.full(width, depth_m)], axis=1)
     return View(
         1, width, points, np.tile(TOWARDS, (width, 1)), np.ones(width, bool), np.ones(width), np.eye(3), np.eye(4)
@@ -33,7 +33,7 @@ def a_map(
     return fusion
 
 
-def test_alpha_falls_with_the_distance_to_the_camera_and_stands_at_its_floor_beyond_3_4_metres() -> None:
+def test_alpha_falls_with_distance_to_its_minimum_beyond_3_4_metres() -> None:
     distances = np.array([0.0, 0.6, 1.2, 3.40, 3.41, 8.0])
     values = alpha(np.stack([np.zeros(6), np.zeros(6), distances], axis=1), 0.6)
     assert values[:3] == pytest.approx([1.0, np.exp(-0.5), np.exp(-2.0)])
@@ -41,7 +41,7 @@ def test_alpha_falls_with_the_distance_to_the_camera_and_stands_at_its_floor_bey
     assert values[4:].tolist() == [1e-7, 1e-7]
 
 
-def test_normals_are_the_cross_product_of_the_steps_right_and_down_and_the_last_ones_repeat() -> None:
+def test_normals_are_cross_products_of_steps_and_the_last_ones_repeat() -> None:
     x, y = np.meshgrid(np.arange(3.0), np.arange(2.0))
     flat = normals_of(np.stack([x, y, np.full_like(x, 2.0)], axis=-1))
     assert flat.tolist() == [[[0, 0, 1]] * 3] * 2
@@ -51,7 +51,7 @@ def test_normals_are_the_cross_product_of_the_steps_right_and_down_and_the_last_
     assert normals_of(folded)[0, :, 0].tolist() == pytest.approx([0, -(0.5**0.5), -(0.5**0.5)])
 
 
-def test_a_pixel_without_depth_has_no_point_no_normal_and_makes_no_map_point() -> None:
+def test_pixel_without_depth_has_no_point_and_creates_none() -> None:
     depth_m = np.array([[1.0, 0.0], [np.nan, 1.0]], np.float32)
     frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), depth_m, np.eye(4), np.eye(3))
     view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
@@ -64,14 +64,12 @@ def test_a_pixel_without_depth_has_no_point_no_normal_and_makes_no_map_point() -
 @pytest.mark.parametrize(
     ("u", "pixel"), [(0.5, 0), (0.51, 1), (1.5, 2), (2.4, 2), (-0.0005, 0), (3.0005, 3), (-0.002, None), (3.002, None)]
 )
-def test_a_map_point_goes_to_the_nearest_pixel_and_out_of_the_outermost_centres_to_none(
-    u: float, pixel: int | None
-) -> None:
+def test_map_point_goes_to_the_nearest_pixel_or_outside_to_none(u: float, pixel: int | None) -> None:
     matched = a_map((u, 0, 1)).associate(row_of_pixels())
     assert np.flatnonzero(matched != ABSENT).tolist() == ([] if pixel is None else [pixel])
 
 
-def test_a_match_is_strictly_nearer_than_the_distance_and_within_the_angle() -> None:
+def test_match_is_nearer_than_the_distance_and_within_the_angle() -> None:
     view = row_of_pixels(2)
     for z, matches in ((1.0499, True), (1.05, False), (0.96, True)):
         assert (a_map((0, 0, z), distance_m=0.05).associate(view)[0] == 0) == matches, z
@@ -81,7 +79,7 @@ def test_a_match_is_strictly_nearer_than_the_distance_and_within_the_angle() -> 
         assert (a_map((0, 0, 1)).associate(seen)[0] == 0) == matches, degrees
 
 
-def test_of_several_points_the_most_confident_is_matched_then_the_nearest_then_the_oldest() -> None:
+def test_most_confident_point_is_matched_then_nearest_then_oldest() -> None:
     near, far = (0.0, 0.0, 1.01), (0.0, 0.0, 1.04)
     view = row_of_pixels(2)
     assert a_map(near, far, counts=[1, 2], distance_m=0.05).associate(view).tolist() == [1, ABSENT]
@@ -89,7 +87,7 @@ def test_of_several_points_the_most_confident_is_matched_then_the_nearest_then_t
     assert a_map(near, near, counts=[1, 1], distance_m=0.05).associate(view).tolist() == [0, ABSENT]
 
 
-def test_a_matched_point_moves_to_the_weighted_mean_and_its_normal_is_not_normalised() -> None:
+def test_matched_point_moves_to_the_weighted_mean_with_unnormalised_normal() -> None:
     fusion = a_map((0, 0, 1.04), counts=[0.5], distance_m=0.05)
     tilt = np.array([0.28, 0, 0.96])
     view = row_of_pixels(2)._replace(alpha=np.array([0.25, 1.0]), normals=np.tile(tilt, (2, 1)))

@@ -1,4 +1,4 @@
-"""3D proposals: read from files, made from the mesh's shape, carried over from the truth; each rule by hand."""
+"""3D proposals from files, from the mesh's shape and from the ground truth; each rule by hand."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ def masks_of(proposals: Proposals) -> list[list[int]]:
 
 
 class TestFiles:
-    def test_mask3ds_and_segment3ds_export_is_read_from_its_last_decoder(self, tmp_path: Path) -> None:
+    def test_mask3d_and_segment3d_export_is_read_from_the_last_decoder(self, tmp_path: Path) -> None:
         write_scannet_text(tmp_path / "decoder_-1", SCENE | {"labels": ["0.0"] * 3})
         found = read_proposals(tmp_path, "room0", flat())
         assert masks_of(found) == [[0, 1], [1, 2, 3], []]
         assert found.scores.tolist() == [0.9, 0.4, 0.2] and "scannet-text" in found.source
 
-    def test_openmask3ds_matrix_is_read_without_its_features(self, tmp_path: Path) -> None:
+    def test_openmask3d_matrix_is_read_without_its_features(self, tmp_path: Path) -> None:
         write_openmask3d(tmp_path, SCENE, np.zeros((3, 4)))
         found = read_proposals(tmp_path, "room0", flat())
         assert masks_of(found) == [[0, 1], [1, 2, 3], []] and found.scores.tolist() == [1, 1, 1]
@@ -84,33 +84,33 @@ class TestFiles:
     @pytest.mark.parametrize("write", [write_scannet_text, write_openyolo3d])
     def test_masks_of_another_mesh_are_one_clear_error(self, tmp_path: Path, write: Any) -> None:
         write(tmp_path, SCENE)
-        with pytest.raises(PredictionError, match="of 6 points, but the mesh of 'room0' has 7 vertices; take"):
+        with pytest.raises(PredictionError, match="of 6 points, but the mesh of 'room0' has 7 vertices; use"):
             read_proposals(tmp_path, "room0", flat(7))
 
-    def test_groups_of_points_are_masks_and_maps_with_own_points_are_not(self, tmp_path: Path) -> None:
+    def test_point_groups_are_masks_but_maps_with_points_are_not(self, tmp_path: Path) -> None:
         np.save(tmp_path / "room0.npy", np.array([0, 0, 1, -1, 1, 1]))
         assert masks_of(read_proposals(tmp_path, "room0", flat())) == [[0, 1], [2, 4, 5]]
         other = tmp_path / "labels"
         other.mkdir()
         (other / "room0.txt").write_text("1\n2\n" * 3)
-        with pytest.raises(PredictionError, match="'scannet-semantic-text' holds no masks over the mesh"):
+        with pytest.raises(PredictionError, match="'scannet-semantic-text' has no masks over the mesh"):
             read_proposals(other, "room0", flat())
 
 
 class TestParts:
     ROW = np.array([(x, 0, 0) for x in (0.0, 0.9, 1.8, 3.0, 3.5, 9.0)])
 
-    def test_with_one_point_parts_are_what_gaps_up_to_eps_link(self) -> None:
+    def test_with_one_point_parts_are_linked_by_gaps_up_to_eps(self) -> None:
         """0, 0.9 and 1.8 are linked by gaps of 0.9, 3.0 and 3.5 by 0.5; from 1.8 to 3.0 it is too far."""
         assert linked_within(self.ROW, 0.95).tolist() == [0, 0, 0, 1, 1, 2]
-        assert linked_within(self.ROW[:2], 0.9).tolist() == [0, 0]  # a gap of eps itself links
+        assert linked_within(self.ROW[:2], 0.9).tolist() == [0, 0]  # a gap of exactly eps links
 
-    def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
+    def test_each_part_is_a_mask_with_its_score_best_first(self) -> None:
         proposals = made_proposals(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
         parts = split_into_parts(proposals, 0.95, 1, 0, 1.0)
         assert masks_of(parts) == [[5], [0, 1], [3, 4], [1, 2]] and parts.scores.tolist() == [0.9, 0.2, 0.2, 0.2]
 
-    def test_small_parts_go_and_of_five_the_best_four_fifths_stay(self) -> None:
+    def test_small_parts_are_dropped_and_four_of_five_kept(self) -> None:
         points = np.array([(x, 0, 0) for x in range(12)])
         masks = [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10]]
         proposals = made_proposals(points, *masks, scores=[0.1, 0.6, 0.5, 0.4, 0.3, 0.9])
@@ -118,14 +118,14 @@ class TestParts:
         assert masks_of(parts) == [[2, 3], [4, 5], [6, 7], [8, 9]]
         assert len(split_into_parts(made_proposals(points, [0]), 1.0, 1, 0, 0.8)) == 0  # floor(0.8)
 
-    def test_a_mask_takes_segments_of_which_it_holds_more_than_half(self) -> None:
+    def test_mask_takes_segments_it_covers_by_more_than_half(self) -> None:
         segments = np.array([0, 0, 1, 1, 1, 2])
         voted = voted_by_segments(made_proposals(self.ROW, [0, 2, 3], [5], [0]), segments)
         assert masks_of(voted) == [[2, 3, 4], [5], []]  # half of segment 0 is not more than half
 
 
 def box_on_a_floor() -> Surface:
-    """A floor of 4 x 4 m with a box of 1 x 1 x 1 m on it, in vertices 10 cm apart; the box's bottom is open."""
+    """A floor of 4 x 4 m with a box of 1 x 1 x 1 m on it, with vertices 10 cm apart; the box's bottom is open."""
     heights = np.zeros((41, 41))
     vertices, triangles = sheet(heights.tolist(), 0.1)
     under = np.all((vertices[:, :2] > 1.55) & (vertices[:, :2] < 2.45), axis=1)
@@ -151,7 +151,7 @@ def box_on_a_floor() -> Surface:
 
 
 class TestTree:
-    def test_the_cheapest_pair_is_merged_first(self) -> None:
+    def test_cheapest_pair_is_merged_first(self) -> None:
         """Three flat squares in a row, 0 and 1 level, 2 leaning: 0 and 1 become node 3, all of them node 4."""
         flat_part, flat_faces = sheet(np.zeros((4, 4)).tolist(), 0.01)
         parts = [
@@ -169,12 +169,12 @@ class TestTree:
         assert (tree.start[4], tree.end[4]) == (0, 3)
         assert is_within(tree, np.array([0, 2, 3, 4]), 3).tolist() == [True, False, True, True]
 
-    def test_the_cost_grows_with_bend_and_size_and_falls_with_the_shared_border(self) -> None:
+    def test_cost_grows_with_bend_and_size_and_falls_with_the_shared_border(self) -> None:
         assert merge_cost(5.0, 10, 40, 100) == pytest.approx(0.52 * 0.76 * 10)
         assert merge_cost(5.0, 10, 10, 100) == pytest.approx(0.52 * 0.01 * 10)
         assert merge_cost(1.0, 10, 40, 400) == pytest.approx(0.12 * 0.76 * 20)
 
-    def test_contrast_is_the_borders_bend_over_its_relative_length(self) -> None:
+    def test_contrast_is_border_bend_over_relative_length(self) -> None:
         """1250 patches of 4 cm² are 0.5 m²: full size; 50 of them count by the root of 0.04."""
         tree = SegmentTree(
             parent=np.array([-1, -1]),
@@ -189,7 +189,7 @@ class TestTree:
         expected = [0.4 / (100 / 1250**0.5 + 0.2), 0.3 * 0.04**0.5 / 0.2]
         assert contrast(tree) == pytest.approx(expected)
 
-    def test_of_two_nested_parts_that_are_nearly_one_the_better_stays(self) -> None:
+    def test_better_of_two_nearly_equal_nested_parts_is_kept(self) -> None:
         tree = SegmentTree(
             parent=np.array([3, 3, 4, 4, -1]),
             n_patches=np.array([9, 1, 10, 10, 20]),
@@ -205,7 +205,7 @@ class TestTree:
         assert chosen.tolist() == [3, 1, 2, 4]  # 0 is 9 of the 10 points of 3; 4 has twice the points: IoU 0.5 itself
         assert chosen_nodes(tree, points, scores, choice(2, 2, 0.5, 1.0)).tolist() == [3, 0]
 
-    def test_a_box_on_a_floor_is_the_part_that_stands_out_most(self) -> None:
+    def test_box_on_a_floor_stands_out_most(self) -> None:
         surface = box_on_a_floor()
         found = surface_proposals(surface, segments_of(surface), choice(5, 20, 0.5, 0.5))
         is_box = (np.abs(surface.vertices - (2, 2, 0.5)) <= 0.501).all(axis=1)
@@ -213,7 +213,7 @@ class TestTree:
         assert (best & is_box).sum() / (best | is_box).sum() > 0.8
         assert (np.diff(found.scores) <= 0).all() and "not a network's" in found.source
 
-    def test_published_segments_are_taken_where_they_are(self) -> None:
+    def test_published_segments_are_used_if_available(self) -> None:
         vertices, triangles = sheet([[0.0] * 6] * 6)
         published = Surface(vertices, triangles, np.where(vertices[:, 0] < 0.25, 40, 7).astype(np.int32))
         assert segments_of(published).tolist() == np.where(vertices[:, 0] < 0.25, 1, 0).tolist()
@@ -231,13 +231,13 @@ def tools(surface: Surface | None, truth: Proposals | None = None) -> SceneTools
 
 
 class TestConfig:
-    def test_true_proposals_are_carried_to_the_nearest_vertices_overlaps_included(self) -> None:
+    def test_true_proposals_are_mapped_to_the_nearest_vertices_with_overlaps(self) -> None:
         truth = made_proposals(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
         found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
         assert masks_of(found) == [[0, 1, 2, 3], [2, 3, 4, 5]] and found.source == "made"  # 3 is 0.9 from 2.1
         assert OpenMask3D(OpenMask3DConfig(proposals="oracle")).caveat is None
 
-    def test_files_stay_as_exported_unless_parts_are_asked_for(self, tmp_path: Path) -> None:
+    def test_files_are_kept_as_exported_unless_parts_are_requested(self, tmp_path: Path) -> None:
         write_openyolo3d(tmp_path, SCENE | {"masks": np.array([[1, 1, 0, 0, 1, 1]] * 3, bool)})
         segments = np.arange(6, dtype=np.int32)
         surface = Surface(flat().vertices, flat().triangles, segments)

@@ -1,4 +1,4 @@
-"""SAM3D as a method: what overlap joins and what it does not, its schedules, its map on the mesh, its features."""
+"""SAM3D as a method: joining by overlap, its schedules, its map on the mesh, its features."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_one_plate_in_many_frames_is_one_group_with_all_its_views(config: SAM3DC
 
 
 @pytest.mark.parametrize("config", [TREE, INCREMENTAL])
-def test_one_mask_over_both_joins_plates_whose_features_are_opposed(config: SAM3DConfig) -> None:
+def test_mask_over_two_plates_joins_them_despite_opposite_features(config: SAM3DConfig) -> None:
     apart = [look([LEFT, replace(RIGHT, feature=axis(1))], 0)]
     both = look([plate(-0.6, 0.6, 2)], 1)
     found = run([*apart, both], config).finish()
@@ -71,9 +71,9 @@ def test_one_mask_over_both_joins_plates_whose_features_are_opposed(config: SAM3
     assert views_of(found, 0) == [(0, 1), (0, 0), (1, 0)]  # the last mask of an image is its first group
 
 
-def test_the_order_of_merging_decides() -> None:
-    # A strip over the seam of two plates joins both where it comes alone. Merged with the right plate first it is
-    # mostly that plate, and what it shares with the left one is too little.
+def test_order_of_merging_matters() -> None:
+    # A strip over the seam of two plates joins both if merged alone. Merged with the right plate first it is
+    # mostly that plate, and shares too little with the left one.
     left, right, strip = plate(-1, 0), plate(0, 1), plate(-0.2, 0.2)
     views = [look([one], index) for index, one in enumerate((left, right, strip, right))]
     assert len(run(views, SAM3DConfig(ratio=0.4)).finish()) == 2
@@ -90,7 +90,7 @@ def test_finish_midway_changes_nothing(config: SAM3DConfig) -> None:
     assert contents(method.finish()) == contents(run(views, config).finish())
 
 
-def test_a_feature_is_the_mean_of_the_views_or_that_of_the_largest() -> None:
+def test_feature_is_the_mean_of_the_views_or_that_of_the_largest() -> None:
     views = [
         look([LEFT], 0),
         look([replace(LEFT, feature=axis(1))], 1),
@@ -116,7 +116,7 @@ def grid_mesh(x: tuple[float, float], segments: bool = True) -> Surface:
     return Surface(vertices, triangles, of_vertex if segments else None)
 
 
-def test_the_map_is_on_the_meshs_vertices_and_none_is_taken_beyond_the_limit() -> None:
+def test_map_is_on_mesh_vertices_within_the_distance_limit() -> None:
     mesh = grid_mesh((-2.0, 1.0))
     found = run([look([LEFT], 0)], surface=mesh).finish()
     assert found.points.tobytes() == mesh.vertices.tobytes()
@@ -126,12 +126,12 @@ def test_the_map_is_on_the_meshs_vertices_and_none_is_taken_beyond_the_limit() -
     assert mesh.vertices[near.mask(0)][:, 0].min() == pytest.approx(-0.7, abs=0.06)
 
 
-def test_the_ensemble_gives_segments_whole_to_the_group_that_claims_them() -> None:
+def test_ensemble_assigns_whole_segments_to_their_group() -> None:
     mesh = grid_mesh((-0.6, 0.6))
     views = [look([replace(LEFT, feature=axis(1)), replace(RIGHT, feature=axis(2))], 0)]
     apart = run(views, surface=mesh).finish()
     found = run(views, SAM3DConfig(ensemble=True), mesh).finish()
-    # The seam of the groups at x = 0 moves to that of the segments at 0.1.
+    # The border of the groups at x = 0 moves to that of the segments at 0.1.
     seams = [max(mesh.vertices[each.mask(k)][:, 0].min() for k in range(2)) for each in (apart, found)]
     assert seams == [pytest.approx(0, abs=0.03), pytest.approx(0.1, abs=0.001)]
     assert set(found.names) == {"left", "right"}

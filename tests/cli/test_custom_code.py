@@ -83,7 +83,7 @@ DATASETS = {
         "rgb, (depth_m * 1000).astype(np.uint16), camera",
         "depth is uint16; expected",
     ),
-    "a pose that scales": ("camera_to_world, INTR", "2 * camera_to_world, INTR", "the pose is no rigid motion"),
+    "a pose that scales": ("camera_to_world, INTR", "2 * camera_to_world, INTR", "the pose is not a rigid motion"),
     "unknown classes": (
         "[0, *LABELS.ids]",
         "[0, 7, 8, 9]",

@@ -40,7 +40,7 @@ def test_list_shows_datasets_folders_scenes_and_how_to_get_missing_ones(
     text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
     assert (
-        "su3d-bench datasets fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms" in text
+        "with su3d-bench datasets fetch replica frames, set SU3D_DATA to their folder, or create rooms in this" in text
     )
 
 

@@ -106,7 +106,7 @@ REFUSED = [
     (["--protocol", "rooms-semantic", "--encoder", "embeded"], "unknown encoder 'embeded'; did you mean 'embedded'?"),
     (["--protocol", "class-agnostic-open3dis"], "does not compare features with texts; there is nothing to encode"),
     (["--protocol", "rooms-semantic", "--queries", "q.txt"], "uses its classes as texts; remove --queries"),
-    (["--protocol", "query-ap", "--queries", "q.txt", "--encoder", "embedded"], "q.txt: is not there"),
+    (["--protocol", "query-ap", "--queries", "q.txt", "--encoder", "embedded"], "q.txt: is missing"),
     (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "t.txt"], "expected a file that ends in .npz"),
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The corridor that ``make bench-methods`` walks along."""
+"""The corridor used by ``make bench-methods``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def normals_and_volume(mesh: Any) -> tuple[Float64Array, float]:
     return np.cross(b - a, c - a), float((a * np.cross(b, c)).sum() / 6)
 
 
-def test_the_scan_covers_what_is_cast_and_faces_the_same_way() -> None:
+def test_scan_covers_the_ray_cast_surface_with_the_same_orientation() -> None:
     dataset = load("dataset", f"{ROOT / 'benchmarks/scale/corridor.py'}:Corridor")
     corridor = dataset(Path(), dataset.Options(surface_edge_m=0.5))
     scan, cast = corridor.surface("3m"), corridor.instance_mesh("3m")
@@ -32,7 +32,7 @@ def test_the_scan_covers_what_is_cast_and_faces_the_same_way() -> None:
     assert set(scan.triangles.reshape(-1)) == set(range(len(scan.vertices)))
 
 
-def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> None:
+def test_medians_by_size_use_equal_ranges_on_a_log_axis() -> None:
     sizes = np.array([1.0, 1.1, 1.2, 500.0, 1024.0, 1024.0])
     x, y = medians_by_size(sizes, np.array([3.0, 9.0, 4.0, 7.0, 10.0, 30.0]))
     np.testing.assert_allclose(x, [1.1, 500.0, 1024.0])

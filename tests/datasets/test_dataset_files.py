@@ -1,4 +1,4 @@
-"""What all datasets of files do: a line for each fault of a file, a hint where no data is, a digest of every file."""
+"""All file-based datasets: one line per fault of a file, a hint if data is missing, a digest of every file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from test_tum import write_sequence
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing
 
-Content = Any  # of a file: None removes it, a function of the data root changes what it likes
+Content = Any  # of a file: None removes it, a function of the data root may change anything
 RENDER, HABITAT = "Replica/room0", "replica_v1/room_0/habitat"
 SCANS, IPHONE, WALK = f"scans/{SCAN}", f"data/{pp.SCENE}/iphone", f"hm3dsem_walks/val/{hm.SCENE}"
 VIDEO, MESHES = f"ChallengeDevelopmentSet/{ark.SCENE}", f"data/{pp.SCENE}/scans"
@@ -75,7 +75,7 @@ def change(root: Path, name: str, content: Content) -> None:
 
 
 def faults(dataset: Any, scene: str) -> list[str]:
-    """The line of everything that fails; ground truth that is not there is no fault."""
+    """The message of everything that fails; missing ground truth is not a fault."""
     lines: list[str] = []
     variants = [*dataset.variants, *dict(getattr(dataset, "extra_ground_truths", {})).values()]
     asks: list[Callable[[], object]] = [lambda: lines.extend(dataset.problems(scene))]
@@ -92,7 +92,7 @@ def faults(dataset: Any, scene: str) -> list[str]:
 
 
 def boxed(**changes: Any) -> dict[str, Any]:
-    """The table of objects with a box, some of whose parts are other ones."""
+    """The table of objects with a box, with ``changes`` to the first box."""
     table = rep.info_table(rep.TWO_OBJECTS)
     table["objects"][0]["oriented_bbox"] = rep.box(**changes)
     return table
@@ -137,12 +137,12 @@ QUERIES = "video_id,visit_id,query\n"
 ANNOTATION = f"hm3d/val/{hm.SCENE}/{hm.SHORT}.semantic.txt"
 FAULTS: list[tuple[str, str, Content, str]] = [
     ("replica", f"{RENDER}/results/frame000001.jpg", None, "results/frame000001.jpg is missing; copy results/ again"),
-    ("replica", f"{RENDER}/results/frame000001.jpg", GREY, "frame000001.jpg is 30x20, the camera file says 12x8"),
+    ("replica", f"{RENDER}/results/frame000001.jpg", GREY, "frame000001.jpg is 30x20, the camera file has 12x8"),
     ("replica", "", flip(f"{RENDER}/results/depth000001.png", 45), "depth000001.png: not a readable PNG image"),
     ("replica", f"{RENDER}/traj.txt", f"{IDENTITY}\nnan{IDENTITY[1:]}\n", "traj.txt line 2: the pose has 'nan'"),
     ("replica", "Replica/cam_params.json", {"camera": rep.CAMERA | {"fy": "600"}}, "camera.fy: Input should be"),
     ("replica", f"{HABITAT}/info_semantic.json", b"{", "info_semantic.json: not JSON"),
-    ("replica", f"{HABITAT}/info_semantic.json", rep.info_table([(4, 20), (4, 21)]), "object 4 stands there twice"),
+    ("replica", f"{HABITAT}/info_semantic.json", rep.info_table([(4, 20), (4, 21)]), "object 4 is listed twice"),
     ("replica", f"{HABITAT}/info_semantic.json", boxed(rotation=[0, 0, 0, 0]), "'rotation' has the length 0; expected"),
     ("replica", "", lambda root: write_mesh(root / HABITAT / "mesh_semantic.ply", *grid(3, 3)), "have no 'object_id'"),
     ("replica", f"{rep.CLOUDS}/pc_points.h5", np.full((3, 3), np.nan), "pc_points.h5: point 0 is at [nan, nan, nan]"),
@@ -152,17 +152,17 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("replica", "Replica/ground_truth/room0.txt", "1\n" * 3, "has 3 labels, room0_mesh.ply 9 and habitat/mesh_sem"),
     ("replica", "Replica/ground_truth/room0.txt", "102005\n" * 9, "102005 is of class 102, Replica has 1 to 101"),
     ("replica", "Replica/ground_truth/room0.txt", "1\n\x1b[31m\n", r"line 2 is '\x1b[31m'; expected one whole number"),
-    ("replica", "Replica/semantic_gt/room0.txt", "1\n" * 9, "holds the class 1, none of the 51 Replica ids"),
+    ("replica", "Replica/semantic_gt/room0.txt", "1\n" * 9, "has class 1, not one of the 51 Replica ids"),
     ("scannet", "", of_other_scene, "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
-    ("scannet", "", lambda root: write_mesh(root / SCANS / f"{SCAN}_vh_clean_2.ply", *grid()), "belong to two meshes"),
+    ("scannet", "", lambda root: write_mesh(root / SCANS / f"{SCAN}_vh_clean_2.ply", *grid()), "of different meshes"),
     ("scannet", TABLE, "id\tnyu40id\n1\t1\n", "has no column 'raw_category'"),
     ("scannet", TABLE, table_text([("chair", 2, 41, "")]), "line 2: 'nyu40id' is '41'; expected a whole number from 1"),
     ("scannet", TABLE, table_text() + "3\tla\x1bmp\t\t\t4\n", "line 8: has no raw_category, id, nyu40id"),
-    ("scannet", f"{SCANS}/{SCAN}.txt", "colorHeight\n", "line 1: 'colorHeight' is no 'key = value'"),
+    ("scannet", f"{SCANS}/{SCAN}.txt", "colorHeight\n", "line 1: 'colorHeight' is not 'key = value'"),
     ("scannet", f"{SCANS}/{SCAN}.txt", f"axisAlignment = {IDENTITY[2:]}\n", "has 15 values; expected 16 finite"),
     ("scannet", f"{SCANS}/{SCAN}.txt", f"axisAlignment = 2{IDENTITY[1:]}\n", "'axisAlignment' is not a rigid motion"),
     ("scannet", "openscan_val_raw.json", [RECORD, RECORD], "record 2: object 0 of scene0000_00 has a record already"),
-    ("scannet", "openscan_val_raw.json", [RECORD | {"affordance": "slep"}], "has the affordance 'slep', which is none"),
+    ("scannet", "openscan_val_raw.json", [RECORD | {"affordance": "slep"}], "the affordance 'slep', which is not one"),
     ("scannet python", f"{SCANS}/color/2.jpg", None, "color/2.jpg is missing; export the recording again"),
     ("scannet python", f"{SCANS}/depth/0.jpg", b"", "depth/ holds '0.jpg', which belongs to no frame"),
     ("scannet python", f"{SCANS}/intrinsic/intrinsic_color.txt", None, "intrinsic/intrinsic_color.txt is missing"),
@@ -170,7 +170,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("scannet python", f"{SCANS}/depth/1.png", DEEP, "depth/1.png is 30x20; expected 32x24, as the first frame"),
     ("scannet cpp", f"{SCANS}/frame-000002.color.jpg", None, "frame-000002.color.jpg is missing; "),
     ("scannet cpp", f"{SCANS}/frame-000004.pose.txt", IDENTITY, "has 4 frames, but there is also frame-000004.pose"),
-    ("scannet cpp", f"{SCANS}/frame-000001.depth.pgm", pgm_bytes(DEEP), "is 30x20; expected 32x24, as _info.txt says"),
+    ("scannet cpp", f"{SCANS}/frame-000001.depth.pgm", pgm_bytes(DEEP), "is 30x20; expected 32x24, as in _info.txt"),
     ("scannet cpp", f"{SCANS}/_info.txt", b"\xff\xfe", "_info.txt: not a text file"),
     *(
         ("scannet cpp", f"{SCANS}/_info.txt", RECORDED["info_cpp"].replace(old, new), message)
@@ -187,24 +187,24 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("scannetpp", f"{IPHONE}/colmap/images.txt", "1 1 0 0 0 0 0 0 1 frame_000007.jpg\n", "frame_000007.jpg is missing"),
     ("scannetpp", f"{MESHES}/segments.json", {"segIndices": [1, 2]}, "has 2 vertices, mesh_aligned_0.05.ply has 861"),
     ("scannetpp", f"{MESHES}/segments_anno.json", {"segGroups": [{"segments": [1]}]}, "segGroups.0.label: Field requ"),
-    ("scannetpp", f"{MESHES}/mesh_aligned_0.05_mask.txt", "861\n", "'861' is no vertex of mesh_aligned_0.05.ply"),
+    ("scannetpp", f"{MESHES}/mesh_aligned_0.05_mask.txt", "861\n", "'861' is not a vertex of mesh_aligned_0.05.ply"),
     ("scannetpp", f"{pp.LISTS}/top100.txt", "wall\nwall\n", "top100.txt: has 'wall' twice"),
-    ("scannetpp", f"{pp.LISTS}/top100_instance.txt", "piano\n", "has 'piano', which top100.txt has not"),
+    ("scannetpp", f"{pp.LISTS}/top100_instance.txt", "piano\n", "has 'piano', which is missing in top100.txt"),
     ("scannetpp", f"{pp.LISTS}/map_benchmark.csv", f"{pp.MAP}sofa\n", "row 7: has 1 cells of 4"),
     ("scannetpp tracking", TRACKING, pp.tracking(aligned_pose=(2 * np.eye(4)).tolist()), "'aligned_pose' is not"),
     ("hm3dsem", f"{WALK}/scene_info.json", {}, "levels: Field required"),
-    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("regions", 0, floor_id=3), "a 'floor_id' names no level"),
-    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("objects", 1, id=3), "an object stands there twice"),
+    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("regions", 0, floor_id=3), "a 'floor_id' does not match a level"),
+    ("hm3dsem", f"{WALK}/scene_info.json", walk_info("objects", 1, id=3), "an object is listed twice"),
     ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", None, "pose/..._000001.txt is missing"),
-    ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", " ".join(["2"] * 16), "is no rigid pose"),
+    ("hm3dsem", f"{WALK}/pose/{hm.SHORT}_000001.txt", " ".join(["2"] * 16), "not a rigid transform"),
     ("hm3dsem", f"{WALK}/depth/notes.txt", "x", "belongs to no frame"),
     ("hm3dsem", f"{WALK}/objects/7.ply", b"ply", "objects/7.ply"),
     ("hm3dsem", ANNOTATION, "HM3D Semantic Annotations\n3,0A0B0C,chair\n", ":2: is '3,0A0B0C,chair'"),
-    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"a",5\n3,0A,"b",5\n', ":3: object 3 stands there twice"),
-    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"sofa, old",5\n', "object 3 is not that of the scene's"),
+    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"a",5\n3,0A,"b",5\n', ":3: object 3 is listed twice"),
+    ("hm3dsem", ANNOTATION, 'HM3D Semantic Annotations\n3,0A,"sofa, old",5\n', "object 3 differs from the scene's"),
     ("arkitscenes", ark.TRUTH, "version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer, not the file"),
-    ("arkitscenes", ark.TRUTH, "0\n1\n", "has 2 lines, the mesh has 8 vertices; both must be of one scene"),
-    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query, the video of eight"),
+    ("arkitscenes", ark.TRUTH, "0\n1\n", "has 2 lines, the mesh has 8 vertices; both must belong to one scene"),
+    ("arkitscenes", ark.QUERIES, f"{QUERIES}1,2,a\n", "row 2: expected video_id,visit_id,query, with an"),
     ("arkitscenes", ark.QUERIES, f"{QUERIES}{ark.SCENE},2,a\n{ark.SCENE},2,b\n", f"scene {ark.SCENE} has two queries"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "1 2 3\n", "lowres_wide.traj line 1: has 3 values; expected time"),
     ("arkitscenes", f"{VIDEO}/lowres_wide.traj", "900 0 0 0 0 0 0\n", "3 images have no pose nearer than 0.3 s"),
@@ -213,7 +213,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("rgbd", "", described(depth=None, dept="a"), "rgbd.toml:7: unknown key 'dept'; did you mean 'depth'?"),
     ("rgbd", "", described(colour="**/*.png"), "expected a pattern with one {index}, or with * or ?"),
     ("rgbd", "", described(pose=None, trajectory="intrinsics.txt"), "has 3 lines; expected blocks of five"),
-    ("rgbd", "", described(intrinsics=None, intrinsics_file="wide.json"), "the camera file says 640x8; intrinsics"),
+    ("rgbd", "", described(intrinsics=None, intrinsics_file="wide.json"), "the camera file has 640x8; intrinsics"),
     ("rgbd", "", link_away("rgbd/desk/data/colour/frame-0.png"), "'colour/frame-0.png' leads out of the folder"),
     ("rgbd", "", link_away("rgbd/desk/data/frame-1.pose.txt"), "'frame-1.pose.txt' leads out of the folder"),
     ("tum", f"{SEQUENCE}/groundtruth.txt", None, "groundtruth.txt is missing; copy the file again"),
@@ -225,7 +225,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
 
 
 @pytest.mark.parametrize(("name", "file", "content", "message"), FAULTS)
-def test_each_fault_of_a_file_is_one_line(tmp_path: Path, name: str, file: str, content: Content, message: str) -> None:
+def test_each_file_fault_is_one_line(tmp_path: Path, name: str, file: str, content: Content, message: str) -> None:
     scene, make = MAKERS[name]
     make(tmp_path)
     if name == "rgbd":
@@ -239,7 +239,7 @@ def test_each_fault_of_a_file_is_one_line(tmp_path: Path, name: str, file: str, 
 
 
 @pytest.mark.parametrize("name", [name for name in MAKERS if " " not in name])
-def test_without_data_it_is_said_how_to_get_it_and_an_unknown_scene_suggests_another(tmp_path: Path, name: str) -> None:
+def test_missing_data_hints_how_to_get_it_and_unknown_scene_suggests_another(tmp_path: Path, name: str) -> None:
     with pytest.raises(ScenesMissing, match=rf"^{name}: no scene in "):
         opened(tmp_path, name).scenes()
     scene, make = MAKERS[name]
@@ -276,7 +276,7 @@ def test_without_data_it_is_said_how_to_get_it_and_an_unknown_scene_suggests_ano
         ("tum", f"{SEQUENCE}/groundtruth.txt", "100 0 0 0 0 0 0 1\n100.1 9 0 0 0 0 0 1\n"),
     ],
 )
-def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path, name: str, file: str, content: Content) -> None:
+def test_digest_changes_with_every_file_that_is_read(tmp_path: Path, name: str, file: str, content: Content) -> None:
     scene, make = MAKERS[name]
     make(tmp_path)
     before = opened(tmp_path, name).digest(scene)

@@ -1,4 +1,4 @@
-"""``datasets check``: a whole scene has no finding, each fault is named, and the digest is that of results."""
+"""``datasets check``: a complete scene has no findings, each fault is named, and the digest is that of results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(whole: Path, tmp_path: Path) -> Path:
-    """A copy of the whole scene, to damage."""
+    """A copy of the complete scene, to damage."""
     shutil.copytree(whole, tmp_path / "data")
     return tmp_path / "data"
 
@@ -53,7 +53,7 @@ def checks(found: Inspection) -> set[str]:
     return {one.check for one in found.findings}
 
 
-def test_a_whole_scene_has_no_finding_and_its_counts(whole: Path) -> None:
+def test_complete_scene_has_no_findings(whole: Path) -> None:
     found = look(whole, n_threads=2)
     assert found.findings == ()
     assert (found.scene, found.n_frames, found.n_read, found.size) == ("replica/room0", N_FRAMES, N_FRAMES, (48, 36))
@@ -78,14 +78,14 @@ def test_every_damaged_file_is_named(root: Path) -> None:
     assert look(root).n_read == N_FRAMES - 3
 
 
-def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: Path) -> None:
+def test_wrong_depth_scale_is_an_error_with_a_suggested_factor(root: Path) -> None:
     path = root / "Replica/cam_params.json"
     table = json.loads(path.read_text())
     table["camera"]["scale"] = 1000.0
     path.write_text(json.dumps(table))
     found = look(root)
     (said,) = [one.text for one in found.findings if one.check == "frame-of-reference"]
-    assert "with the depth times 0.1526" in said
+    assert "with depth times 0.1526" in said
     table["camera"]["scale"] = 6.5535
     path.write_text(json.dumps(table))
     assert "depth-scale" in checks(look(root))
@@ -103,7 +103,7 @@ def test_cameras_outside_the_mesh_are_an_error(root: Path) -> None:
     assert "only 0.0%" in said[1] and "the clouds do not overlap" in said[1]
 
 
-def test_rooms_made_on_demand_have_no_finding(tmp_path: Path) -> None:
+def test_generated_rooms_have_no_findings(tmp_path: Path) -> None:
     options = RoomOptions(width=64, height=48, n_frames=SAMPLED_FRAMES + 5, mesh_spacing_m=0.1)
     found = inspect(Rooms(tmp_path, options), "living0")
     assert found.findings == ()
@@ -127,7 +127,7 @@ def test_faults_of_any_dataset_are_found(tmp_path: Path, fault: str, severity: s
 
 
 class Faulty(Painted):
-    """Names two faults of its own, one with a terminal escape in it."""
+    """Reports two faults itself, one with a terminal escape in it."""
 
     def problems(self, scene: str) -> Sequence[str]:
         return (f"painted/{scene}: a\x1b[31mb.jpg is missing\n; copy it again", "painted/x: y.png: not readable")
@@ -136,7 +136,7 @@ class Faulty(Painted):
         raise DataError(f"painted/{scene}: y.png: not an image")
 
 
-def test_what_the_dataset_itself_names_is_an_error_once_and_has_no_escape_in_it(tmp_path: Path) -> None:
+def test_faults_reported_by_a_dataset_appear_once_and_escaped(tmp_path: Path) -> None:
     found = inspect(Faulty(tmp_path, Painted.Options()), "a")
     assert [one.text for one in found.findings] == [
         r"a\x1b[31mb.jpg is missing ; copy it again",
@@ -174,11 +174,11 @@ def found_in(*frames: Frame) -> list[tuple[str, str, str]]:
         ({"camera_to_world": np.array([[1.0, 0, 0, 500], *np.eye(4)[1:]])}, ("warning", "motion", "")),
     ],
 )
-def test_a_fault_of_a_frame_is_found_where_it_is(changes: dict[str, Any], expected: tuple[str, str, str]) -> None:
+def test_frame_fault_is_located(changes: dict[str, Any], expected: tuple[str, str, str]) -> None:
     assert expected in found_in(frame(), frame(index=1, **changes), frame(index=2))
 
 
-def test_a_camera_that_stands_still_and_images_that_repeat_are_warnings() -> None:
+def test_static_camera_and_repeated_images_are_warnings() -> None:
     still = [frame(index=index, camera_to_world=np.eye(4)) for index in range(3)]
     assert found_in(*still) == [("warning", "motion", "")]
     same = frame()
@@ -186,7 +186,7 @@ def test_a_camera_that_stands_still_and_images_that_repeat_are_warnings() -> Non
     assert found_in(*repeated) == [("warning", "motion", "")]
 
 
-def test_the_command_caps_what_it_lists_and_ends_with_1(
+def test_command_limits_its_list_and_ends_with_1(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(root))
@@ -202,7 +202,7 @@ def test_the_command_caps_what_it_lists_and_ends_with_1(
     assert json.loads(capsys.readouterr().out)["scenes"][0]["n_errors"] == 14
 
 
-def test_the_digest_is_the_one_that_a_run_records(
+def test_digest_equals_the_one_recorded_by_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
 
@@ -218,7 +218,7 @@ def test_the_digest_is_the_one_that_a_run_records(
     assert digest in (tmp_path / "run/scenes/painted.a/collector/done.json").read_text()
 
 
-def test_text_of_files_reaches_the_terminal_without_control_characters() -> None:
+def test_control_characters_from_files_do_not_reach_the_terminal() -> None:
     assert printable("a\x1b]0;title\x07\n b\u202e\x00c") == r"a\x1b]0;title\x07 b\u202e\x00c"
     assert printable("é \U0001f600 日本") == "é \U0001f600 日本"
     assert len(printable("x" * 9_999)) == 500

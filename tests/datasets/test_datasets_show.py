@@ -1,4 +1,4 @@
-"""``datasets show``: what is looked at, the picture that comes out, and each fault of a request in one line."""
+"""``datasets show``: its data, the picture, and each faulty request in one line."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def n_near(picture: np.ndarray, rgb: tuple[int, int, int] | np.ndarray) -> int:
     return int((np.abs(picture.astype(int) - rgb).max(axis=-1) < 14).sum())
 
 
-def test_a_look_holds_frames_walk_points_and_truth(whole: Path) -> None:
+def test_view_has_frames_trajectory_points_and_ground_truth(whole: Path) -> None:
     steps: list[tuple[int, int]] = []
     look = look_at(Replica(whole), "room0", progress=lambda n_done, n: steps.append((n_done, n)))
     assert (look.scene, look.n_frames, look.poses.shape) == ("replica/room0", 12, (12, 4, 4))
@@ -52,7 +52,7 @@ def test_a_look_holds_frames_walk_points_and_truth(whole: Path) -> None:
     assert 0.3 < look.depth_m[0] < look.depth_m[1] < 5
 
 
-def test_a_damaged_frame_is_an_error_and_no_truth_is_none(whole: Path, tmp_path: Path) -> None:
+def test_damaged_frame_is_an_error_but_missing_ground_truth_is_not(whole: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="class id 777"):
         look_at(Painted(tmp_path, Painted.Options(fault="unknown-class")), "b")
     with pytest.raises(DataError, match="frame 2 is missing"):
@@ -62,19 +62,19 @@ def test_a_damaged_frame_is_an_error_and_no_truth_is_none(whole: Path, tmp_path:
     assert "room_1" in look.no_truth
 
 
-def test_the_picture_shows_frames_classes_and_walk(whole: Path, tmp_path: Path) -> None:
+def test_picture_shows_frames_classes_and_trajectory(whole: Path, tmp_path: Path) -> None:
     draw_scene_picture(look_at(Replica(whole), "room0"), tmp_path / "new" / "room0.png")
     picture = pixels(tmp_path / "new" / "room0.png")
     height, width = picture.shape[:2]
     assert width == WIDTH and 900 < height < 1400
-    assert n_near(picture, (0xD6, 0x24, 0x6E)) > 300  # the walk
+    assert n_near(picture, (0xD6, 0x24, 0x6E)) > 300  # the trajectory
     assert n_near(picture, (0x1A, 0x98, 0x50)) > 30  # its start
     assert sum(n_near(picture, rgb) > 1000 for rgb in COLOURS) >= 4  # the frames
     assert n_near(picture, (208, 203, 196)) > 20_000  # the floor by class and by instance
     assert (picture == 255).all(axis=-1).mean() < 0.5
 
 
-def test_the_command_writes_the_picture_and_tells_counts(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_the_picture_and_prints_counts(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["datasets", "show", "replica/room0"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("replica/room0: 12 frames of 48x36 · depth 1.")

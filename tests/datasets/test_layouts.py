@@ -1,4 +1,4 @@
-"""A room in each layout, read through the adapter that reads others' data: the same frames, the same ground truth."""
+"""A room in each layout, read through the dataset of that layout: the same frames, the same ground truth."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def frames(made: dict[str, Path], name: str) -> list[Frame]:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_the_adapter_finds_the_room_and_knows_that_it_is_rendered(made: dict[str, Path], name: str) -> None:
+def test_dataset_finds_the_room_and_marks_it_as_rendered(made: dict[str, Path], name: str) -> None:
     dataset = reader(made, name)
     assert list(dataset.scenes()) == [ADDRESS[name]]
     info = dataset.info(ADDRESS[name], 1)
@@ -57,7 +57,7 @@ def test_the_adapter_finds_the_room_and_knows_that_it_is_rendered(made: dict[str
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("replica", 0.0), ("scannet", 5e-7)])
-def test_frames_are_those_of_the_room_within_what_the_format_holds(
+def test_frames_match_the_room_within_format_precision(
     made: dict[str, Path], rooms: Rooms, name: str, tolerance: float
 ) -> None:
     units = UNITS_PER_METRE[name]
@@ -72,9 +72,7 @@ def test_frames_are_those_of_the_room_within_what_the_format_holds(
 
 
 @pytest.mark.parametrize("variant", ["mesh-vertices", "face-corners"])
-def test_ground_truth_in_the_layout_of_replica_is_that_of_the_room(
-    made: dict[str, Path], rooms: Rooms, variant: str
-) -> None:
+def test_replica_layout_has_the_ground_truth_of_the_room(made: dict[str, Path], rooms: Rooms, variant: str) -> None:
     ours, theirs = rooms.ground_truth(ROOM, variant), reader(made, "replica").ground_truth(ROOM, variant)
     np.testing.assert_array_equal(ours.points, theirs.points)
     np.testing.assert_array_equal(ours.semantic, theirs.semantic)
@@ -82,7 +80,7 @@ def test_ground_truth_in_the_layout_of_replica_is_that_of_the_room(
 
 
 @pytest.mark.parametrize("variant", ["nyu40-vertices", "scannet200-vertices"])
-def test_ground_truth_of_a_scan_is_that_of_the_room_in_scannets_classes(
+def test_scannet_layout_has_the_ground_truth_of_the_room_in_scannet_classes(
     made: dict[str, Path], rooms: Rooms, variant: str
 ) -> None:
     ours, theirs = rooms.ground_truth(ROOM, "mesh-vertices"), reader(made, "scannet").ground_truth(SCAN, variant)
@@ -94,7 +92,7 @@ def test_ground_truth_of_a_scan_is_that_of_the_room_in_scannets_classes(
     assert len(set(theirs.semantic.tolist())) > 8
 
 
-def test_segments_cut_objects_into_pieces_and_never_cross_one(made: dict[str, Path], rooms: Rooms) -> None:
+def test_segments_split_objects_and_never_cross_them(made: dict[str, Path], rooms: Rooms) -> None:
     scan = rooms.scan(ROOM)
     segments, owner = segment_of_vertex(scan), scan.object_of_vertex()
     path = made["scannet"] / "scans" / SCAN / f"{SCAN}_vh_clean_2.0.010000.segs.json"
@@ -103,7 +101,7 @@ def test_segments_cut_objects_into_pieces_and_never_cross_one(made: dict[str, Pa
     assert np.median([len(np.unique(segments[owner == one])) for one in np.unique(owner)]) >= 3
 
 
-def test_every_room_has_a_scan_name_of_its_own_outside_scannets() -> None:
+def test_every_room_has_a_unique_scan_name_outside_scannets() -> None:
     kinds = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
     names = {scan_name(f"{kind}{number}") for kind in kinds for number in range(100)}
     assert len(names) == 600 and min(names) > "scene0806_00"
@@ -112,7 +110,7 @@ def test_every_room_has_a_scan_name_of_its_own_outside_scannets() -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_the_verb_makes_each_layout_and_the_same_command_again_does_nothing(
+def test_command_makes_each_layout_and_repeating_it_does_nothing(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "cache"))

@@ -1,4 +1,4 @@
-"""OpenScan's attributes: its file, which word is which class, as the truth of a scan and of the built-in rooms."""
+"""OpenScan's attributes: the file, words and classes, ground truth of a scan and of the built-in rooms."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol
 
-# A record as README.md of the release has it.
+# A record as in README.md of the release.
 RECORD = {
     "scene_id": SCAN,
     "object_id": "0",
@@ -44,7 +44,7 @@ SENTENCES = {
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data root with one annotated scan, whose only object has the id 0, and OpenScan's records of it."""
+    """A data root with one annotated scan, whose only object has id 0, and OpenScan's records of it."""
     root = tmp_path_factory.mktemp("openscan")
     write_floor_truth(write_scan(root, n_frames=1), spacing_m=0.5)
     write(root / RAW_NAME, [RECORD])
@@ -56,7 +56,7 @@ def write(path: Path, records: Any) -> Path:
     return path
 
 
-def test_the_words_of_a_record_are_the_sentences_of_the_lists(tmp_path: Path) -> None:
+def test_words_of_a_record_match_the_sentences_of_the_lists(tmp_path: Path) -> None:
     known = read_attributes(write(tmp_path / RAW_NAME, [RECORD]))[SCAN]
     for variant, sentence in SENTENCES.items():
         (class_id,) = attribute_ids(known, variant, "here").values()
@@ -64,14 +64,14 @@ def test_the_words_of_a_record_are_the_sentences_of_the_lists(tmp_path: Path) ->
     assert set(SENTENCES) == set(KEYS)
 
 
-def test_a_word_is_the_shortest_sentence_that_ends_with_it_and_a_part_of_a_word_is_none() -> None:
+def test_word_matches_the_shortest_sentence_ending_with_it() -> None:
     names = {word: attribute_id("openscan-type", word) for word in ("bag", "handbag", "toy animal", "toy_animal", "ag")}
     assert names == {"bag": 69, "handbag": 38, "toy animal": 70, "toy_animal": 70, "ag": None}
     assert [attribute_id("openscan-affordance", f"{blank}hang clothes") for blank in ("", "\u00a0")] == [79, 34]
     assert attribute_id("openscan-element", "keys") == 24 and attribute_id("openscan-element", "88 keys") == 26
 
 
-def test_the_truth_of_a_scan_has_the_attributes_of_its_objects(scan: Path) -> None:
+def test_ground_truth_of_a_scan_has_the_attributes_of_its_objects(scan: Path) -> None:
     truth = dataset(scan).ground_truth(SCAN, "openscan-material")
     plain = dataset(scan).ground_truth(SCAN, "nyu40-vertices")
     assert (truth.labels, truth.variant) == (label_set("openscan-material"), "openscan-material")
@@ -82,12 +82,12 @@ def test_the_truth_of_a_scan_has_the_attributes_of_its_objects(scan: Path) -> No
     assert truth_incompatibility(load_protocol("rooms-instance"), facts) is not None
 
 
-def test_an_object_without_a_word_is_void(tmp_path: Path) -> None:
+def test_object_without_a_word_is_void(tmp_path: Path) -> None:
     words = read_attributes(write(tmp_path / RAW_NAME, [RECORD | {"material": "", "element": "other"}]))[SCAN]
     assert attribute_ids(words, "openscan-material", "here") == attribute_ids(words, "openscan-element", "x") == {0: 0}
 
 
-def test_a_missing_file_or_scan_says_how_to_get_it(scan: Path, tmp_path: Path) -> None:
+def test_missing_file_or_scan_hints_how_to_get_it(scan: Path, tmp_path: Path) -> None:
     bare = dataset(tmp_path)
     write_floor_truth(write_scan(tmp_path, n_frames=1), spacing_m=0.5)
     with pytest.raises(GroundTruthMissing, match=rf"{RAW_NAME} is missing, get it by https://github.com/YoujunZhao"):

@@ -1,4 +1,4 @@
-"""Real recordings, where they are: what the adapters make of sensor data that nobody here wrote."""
+"""Real recordings, if available: how the datasets read sensor data not written by this project."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ SCENES = {
 @pytest.fixture(autouse=True)
 def _recordings() -> None:
     if not REAL_RECORDINGS.is_dir():
-        pytest.fail("SU3D_RECORDINGS names no folder of real recordings (see CONTRIBUTING.md)", pytrace=False)
+        pytest.fail("SU3D_RECORDINGS is not a folder of real recordings (see CONTRIBUTING.md)", pytrace=False)
 
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A data root whose descriptions point at the recordings, which stay where they are."""
+    """A data root whose descriptions refer to the recordings in place."""
     for scene, keys in SCENES.items():
         folder = tmp_path / "data" / "rgbd" / scene
         folder.mkdir(parents=True)
@@ -74,7 +74,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run(scene: str, *words: str) -> Instances:
-    """The map that the command line makes of every frame of ``scene``."""
+    """The map that the command line creates from every frame of ``scene``."""
     words = ("run", "--scenes", scene, "--stride", "1", "--out", "out", "--quiet", *words)
     assert main(list(words)) == 0
     prediction = read_prediction(next(Path("out").glob("scenes/*/opensu3d/prediction.npz")))
@@ -82,7 +82,7 @@ def run(scene: str, *words: str) -> Instances:
     return prediction
 
 
-def test_fifteen_labelled_frames_give_exactly_the_two_labelled_objects_never_swapped(root: Path) -> None:
+def test_fifteen_labelled_frames_give_exactly_the_two_objects_never_swapped(root: Path) -> None:
     (root / "names.toml").write_text('48 = "parcel"\n132 = "carton"\n')
     stored = {"folder": REAL_RECORDINGS.resolve() / "label_fusion/labels", "images": "frame-{index}.segm.png"}
     words = [f"perception.stored.{key}={value}" for key, value in (stored | {"names": root / "names.toml"}).items()]
@@ -125,24 +125,24 @@ def test_recordings_run_unscored_with_the_embedded_segmenter(
     np.testing.assert_allclose(np.ptp(found.points, axis=0), extent_m, atol=0.3)
 
 
-def test_the_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
+def test_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
     for scene in SCENES:
         assert judge_scene(Rgbd(root), scene) is None
     tum = Tum(REAL_RECORDINGS.resolve())
     assert judge_scene(tum, "tum_fr1desk_9") is None
 
 
-def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_reports_missing_images(caplog: pytest.LogCaptureFixture) -> None:
     tum = Tum(REAL_RECORDINGS.resolve())
     frames = tum.frames("tum_fr1desk_9", 1)
     assert [frame.index for frame in frames] == list(range(9))
     assert len(list(tum.problems("tum_fr1desk_9"))) == 1
-    assert "associate.txt: 1128 images named there are missing (the first: rgb/1305031453.659600.png)" in caplog.text
+    assert "associate.txt: 1128 listed images are missing (the first: rgb/1305031453.659600.png)" in caplog.text
     assert frames[0].intrinsics[0, 0] == 517.3
 
 
-def test_images_of_other_cameras_are_read_as_their_formats_say(root: Path) -> None:
-    """One frame each as NYU, SUN and TUM store them; PGM is big-endian."""
+def test_images_of_other_cameras_follow_their_formats(root: Path) -> None:
+    """One frame each as stored by NYU, SUN and TUM; PGM is big-endian."""
     from su3d_bench.formats.images import decode_colour, decode_depth
 
     folder = REAL_RECORDINGS / "open3d_rgbd/other_formats"

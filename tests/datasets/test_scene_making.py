@@ -1,4 +1,4 @@
-"""Scenes written as files: wherever the maker is killed there is no half scene, and the next one finishes the work."""
+"""Scenes written as files: a kill at any time leaves no partial scene, and the next process finishes the work."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def reader(name: str, root: Path) -> Any:
 
 
 def scenes(name: str, root: Path) -> list[str]:
-    """The scenes with frames that the adapter finds; nothing where it says that there is none."""
+    """The scenes with frames that the dataset finds; empty if it reports none."""
     try:
         dataset = reader(name, root)
         return [scene for scene in dataset.scenes() if dataset.info(scene, 1).n_frames]
@@ -147,7 +147,7 @@ def dies_at(n: int, replace: Callable[..., None]) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_wherever_a_make_is_killed_no_half_scene_is_seen_and_the_next_one_ends_with_the_same_bytes(
+def test_kill_leaves_no_partial_scene_and_resuming_gives_the_same_bytes(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, dict[str, bytes]]
 ) -> None:
     for n in range(100):
@@ -168,14 +168,14 @@ def test_wherever_a_make_is_killed_no_half_scene_is_seen_and_the_next_one_ends_w
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_frames_of_a_killed_make_are_taken_over_and_those_of_another_are_not(name: str, tmp_path: Path) -> None:
+def test_frames_of_a_killed_process_are_reused_only_for_the_same_inputs(name: str, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_scene(LAYOUTS[name], Stage(dies_at=3), ROOM, tmp_path / "one")
     assert scenes(name, tmp_path / "one") == []
     next((tmp_path / "one").rglob(".*.partial")).joinpath(".half.0123456789ab.unfinished").write_bytes(b"half")
     again = Stage()
     write_scene(LAYOUTS[name], again, ROOM, tmp_path / "one")
-    assert set(again.rendered) - {0} == {3, 4}  # the first is asked for the size of the images
+    assert set(again.rendered) - {0} == {3, 4}  # the first is rendered for the image size
     check_is_whole(name, tmp_path / "one")
     assert not list((tmp_path / "one").rglob(".*"))
     with pytest.raises(KeyboardInterrupt):
@@ -186,7 +186,7 @@ def test_frames_of_a_killed_make_are_taken_over_and_those_of_another_are_not(nam
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_whole_scene_is_left_alone_and_lost_ground_truth_is_made_again_without_the_frames(
+def test_complete_scene_is_kept_and_lost_ground_truth_is_restored_without_frames(
     name: str, tmp_path: Path, undisturbed: dict[str, dict[str, bytes]]
 ) -> None:
     layout = LAYOUTS[name]
@@ -203,7 +203,7 @@ def test_a_whole_scene_is_left_alone_and_lost_ground_truth_is_made_again_without
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_scene_of_another_making_is_never_overwritten(name: str, tmp_path: Path) -> None:
+def test_scene_from_elsewhere_is_never_overwritten(name: str, tmp_path: Path) -> None:
     layout = LAYOUTS[name]
     write_scene(layout, Stage(), ROOM, tmp_path)
     with pytest.raises(StoreError, match=ADDRESS[name]):
@@ -213,17 +213,17 @@ def test_a_scene_of_another_making_is_never_overwritten(name: str, tmp_path: Pat
         write_scene(layout, Stage(), ROOM, tmp_path)
 
 
-def test_what_scenes_share_is_refused_where_it_is_another(tmp_path: Path) -> None:
+def test_conflicting_shared_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "scannetv2-labels.combined.tsv").write_text("id\traw_category\n1\twall\n")
-    with pytest.raises(StoreError, match=r"combined\.tsv: is another label table"):
+    with pytest.raises(StoreError, match=r"combined\.tsv: differs from the label table"):
         write_scene(LAYOUTS["scannet"], Stage(), ROOM, tmp_path)
     write_scene(LAYOUTS["replica"], Stage(), ROOM, tmp_path)
-    with pytest.raises(StoreError, match=r"cam_params\.json: is another camera .*20x12"):
+    with pytest.raises(StoreError, match=r"cam_params\.json: differs from the camera .*20x12"):
         write_scene(LAYOUTS["replica"], Stage(width=20), "living8", tmp_path)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_full_disk_is_one_line_and_leaves_nothing_half(
+def test_full_disk_is_one_line_and_leaves_nothing_partial(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(handle: int) -> None:

@@ -1,4 +1,4 @@
-"""The mesh without labels, dataset by dataset, and the keys that move with its file."""
+"""The unlabelled mesh of each dataset, and the keys that depend on its file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
     return Rooms(tmp_path_factory.mktemp("data"), RoomOptions(width=32, height=24, n_frames=2, mesh_spacing_m=0.2))
 
 
-def test_a_room_is_its_scan_in_triangles_with_the_vertices_of_the_truth(rooms: Rooms) -> None:
+def test_room_surface_is_its_scan_in_triangles_with_ground_truth_vertices(rooms: Rooms) -> None:
     surface, truth = rooms.surface("bathroom0"), rooms.ground_truth("bathroom0", "mesh-vertices")
     assert np.array_equal(surface.vertices, truth.points) and surface.segments is None
     faces = rooms.scan("bathroom0").faces
@@ -32,7 +32,7 @@ def test_a_room_is_its_scan_in_triangles_with_the_vertices_of_the_truth(rooms: R
     assert (truth.instance[surface.triangles] == truth.instance[surface.triangles[:, :1]]).all()
 
 
-def test_replicas_surface_is_the_renders_mesh_in_fans_without_labels(tmp_path: Path) -> None:
+def test_replica_surface_is_the_render_mesh_in_fans_without_labels(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
     dataset = Replica(tmp_path)
@@ -54,14 +54,14 @@ def write_scan(root: Path, segments: list[int]) -> Path:
     return folder
 
 
-def test_scannets_surface_has_the_published_segments(tmp_path: Path) -> None:
+def test_scannet_surface_has_the_published_segments(tmp_path: Path) -> None:
     write_scan(tmp_path, [7] * 10 + [4_000_000_000] * 14)
     surface = dataset(tmp_path).surface(SCAN)
     assert np.array_equal(surface.vertices, grid()[0]) and np.array_equal(surface.triangles, grid()[1])
     assert surface.segments is not None and surface.segments.tolist() == [0] * 10 + [1] * 14
 
 
-def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_path: Path) -> None:
+def test_scan_without_annotation_has_a_surface_even_without_segments(tmp_path: Path) -> None:
     folder = write_scan(tmp_path, [7] * 24)
     scans = dataset(tmp_path)
     before = scans.digest(SCAN)
@@ -76,9 +76,9 @@ def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_pa
         scans.surface(SCAN)
 
 
-def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:
+def test_described_folder_may_have_a_mesh(tmp_path: Path) -> None:
     folder = write_scene(tmp_path)
-    with pytest.raises(DataError, match=r'rgbd\.toml names no mesh; add one in the world of the poses: mesh = "mesh'):
+    with pytest.raises(DataError, match=r'rgbd\.toml has no mesh; add one in the world of the poses: mesh = "mesh'):
         Rgbd(tmp_path).surface(folder.name)
     write_scene(tmp_path / "with", mesh="mesh.ply")
     data = tmp_path / "with" / "rgbd" / folder.name / "data"

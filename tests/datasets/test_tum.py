@@ -1,4 +1,4 @@
-"""The adapter of the TUM RGB-D layout on small sequences: pairing, poses, cameras, each fault once, damaged lists."""
+"""The TUM RGB-D layout on small sequences: pairing, poses, cameras, each fault once, damaged lists."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_sequence(root: Path, scene: str = SCENE, n_frames: int = 4) -> Path:
     return root / scene
 
 
-def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+def test_frames_match_the_files(tmp_path: Path) -> None:
     write_sequence(tmp_path)
     frames = Tum(tmp_path).frames(SCENE, 2)
     last = frames[-1]
@@ -58,7 +58,7 @@ def test_sequences_are_found_in_the_usual_places(tmp_path: Path, place: str) -> 
 
 
 @pytest.mark.parametrize(("scene", "focal"), [("rgbd_dataset_freiburg1_desk", 517.3), ("own", 525.0)])
-def test_without_a_camera_file_the_name_tells_the_camera(tmp_path: Path, scene: str, focal: float) -> None:
+def test_sequence_name_selects_the_camera_without_a_camera_file(tmp_path: Path, scene: str, focal: float) -> None:
     folder = write_sequence(tmp_path, scene)
     (folder / "camera.txt").unlink()
     large = np.zeros((480, 640), np.uint16)
@@ -78,13 +78,13 @@ def test_missing_images_are_counted_once_and_the_others_used(tmp_path: Path, cap
         assert [frame.index for frame in tum.frames(SCENE, 1)] == [0, 2]
         assert tum.info(SCENE, 1).n_frames == 2
     assert [record.getMessage() for record in caplog.records] == [
-        f"tum/{SCENE}: rgb.txt and depth.txt: 2 images named there are missing (the first: rgb/100.100000.png); "
-        "left out, 2 frames are used"
+        f"tum/{SCENE}: rgb.txt and depth.txt: 2 listed images are missing (the first: rgb/100.100000.png); "
+        "excluded, 2 frames are used"
     ]
     assert list(tum.problems(SCENE)) == [record.getMessage() for record in caplog.records]
 
 
-def test_frames_without_a_pose_in_time_are_counted_and_left_out(
+def test_frames_without_a_pose_in_time_are_counted_and_excluded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = write_sequence(tmp_path)
@@ -97,7 +97,7 @@ def test_frames_without_a_pose_in_time_are_counted_and_left_out(
 
 
 def reference_pairs(first: list[float], second: list[float], limit: float) -> list[tuple[float, float]]:
-    """The benchmark's associate.py, its two loops over everything."""
+    """The benchmark's associate.py: two loops over everything."""
     near = sorted((abs(a - b), a, b) for a in first for b in second if abs(a - b) < limit)
     matches = []
     left, right = set(first), set(second)
@@ -114,7 +114,7 @@ stamps = st.lists(st.integers(0, 400).map(lambda k: k / 1000), min_size=1, max_s
 
 @settings(max_examples=150, deadline=None)
 @given(stamps, stamps)
-def test_images_pair_up_as_the_benchmarks_tool_pairs_them(
+def test_images_pair_up_as_in_the_benchmark_tool(
     tmp_path_factory: pytest.TempPathFactory, colours: list[float], depths: list[float]
 ) -> None:
     folder = tmp_path_factory.mktemp("lists")
@@ -124,7 +124,7 @@ def test_images_pair_up_as_the_benchmarks_tool_pairs_them(
     assert pairs == reference_pairs(colours, depths, 0.02)
 
 
-def test_poses_between_two_rows_turn_and_move_evenly() -> None:
+def test_poses_between_two_rows_are_interpolated() -> None:
     angle = np.radians(80)
     rows = np.array([[0, 0, 0, 0, 0, 0, 1], [4, 2, 0, 0, 0, np.sin(angle / 2), np.cos(angle / 2)]], np.float64)
     for sign in (1, -1):  # a quaternion and its negative are one rotation
@@ -138,7 +138,7 @@ def test_poses_between_two_rows_turn_and_move_evenly() -> None:
     np.testing.assert_allclose(nearest, np.eye(4), atol=1e-12)
 
 
-def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path) -> None:
+def test_quaternions_of_any_length_become_rotations(tmp_path: Path) -> None:
     quarter = quaternion_poses(np.zeros((1, 3)), np.array([[0, 0, 1, 1]]) / np.sqrt(2))[0]
     np.testing.assert_allclose(quarter[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
     (tmp_path / "groundtruth.txt").write_text("2 0 0 0 0 0 3 3\n1 0 0 0 0 0 0 -7\n")
@@ -147,7 +147,7 @@ def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path)
     np.testing.assert_allclose(rows[:, 3:], [[0, 0, 0, -1], [0, 0, 0.5**0.5, 0.5**0.5]])
 
 
-def test_times_denser_than_any_camera_are_refused_before_pairs_are_made(tmp_path: Path) -> None:
+def test_too_dense_time_stamps_are_rejected_before_pairing(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path)
     lines = "".join(f"{k / 1e6:.6f} a\n" for k in range(2000))
     for name in ("rgb.txt", "depth.txt"):

@@ -127,7 +127,7 @@ def edited(**changes: Any) -> str:
 
 
 FAULTS = (
-    (release.read_prompts, " \n \n", "has no prompt; expected one a line"),
+    (release.read_prompts, " \n \n", "has no prompts; expected one per line"),
     (release.read_categories, "[]", "expected an object; found []"),
     (release.read_categories, '{"dataset": {}}', "dataset.samples: Field required"),
     (
@@ -158,5 +158,5 @@ def test_unusable_openlex3d_file_gives_one_line(tmp_path: Path, read: Reader, co
 @pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])
 def test_name_outside_its_folder_is_refused(tmp_path: Path, name: str) -> None:
     for dataset, scene in ((name, "room0"), ("replica", name)):
-        with pytest.raises(DataError, match="is no name of a dataset or scene"):
+        with pytest.raises(DataError, match="is not a dataset or scene name"):
             release.OpenLexFiles(tmp_path, dataset, scene)

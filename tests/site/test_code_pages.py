@@ -141,11 +141,11 @@ def test_site_check_finds_dead_links_and_external_resources(tmp_path: Path) -> N
         if not line.startswith("reference/")
     ]
     assert found == [
-        "index.html: b.html#gone: the page has no such place",
-        "index.html: gone.html is not there",
-        "index.html: #no: the page has no such place",
+        "index.html: b.html#gone: the page has no such anchor",
+        "index.html: gone.html does not exist",
+        "index.html: #no: the page has no such anchor",
         "index.html: loads //example.org/x.js",
-        "index.html: gone.png is not there",
+        "index.html: gone.png does not exist",
         "index.html: loads https://example.org/x.css",
         "index.html: a style loads from elsewhere",
         "a.css: loads from elsewhere",

@@ -1,4 +1,4 @@
-"""Where tests find what stands in files."""
+"""Paths of files for tests."""
 
 from __future__ import annotations
 
@@ -8,4 +8,4 @@ SUPPORT = Path(__file__).resolve().parent
 TESTS = SUPPORT.parent
 ROOT = TESTS.parent
 CASES = TESTS / "cases"
-SCENES = SUPPORT / "scenes"  # datasets and methods of tests, named by file: f"{SCENES}/painted.py:Painted"
+SCENES = SUPPORT / "scenes"  # test datasets and methods, referenced by file: f"{SCENES}/painted.py:Painted"

@@ -1,7 +1,7 @@
-"""The shape of the code base: its folders, the layers they stand on, and who imports whom.
+"""The structure of the code base: its folders, their layers, and the imports between them.
 
-``python tools/docs/architecture.py`` writes what of docs/architecture.md is drawn from the code; ``--check`` says whether
-it still holds.
+``python tools/docs/architecture.py`` writes the generated parts of docs/architecture.md; ``--check`` checks that they
+are up to date.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")  # root folders, reached through links in the package
-USERS = ("benchmarks", ".ci")  # folders beside the package that import it
+USERS = ("benchmarks", ".ci")  # folders outside the package that import it
 PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
@@ -45,7 +45,7 @@ PURPOSE = {
 
 @cache
 def code_files() -> dict[str, Path]:
-    """Every Python file of the package, of benchmarks and of .ci by its module's name, at its real place."""
+    """Every Python file of the package, of benchmarks and of .ci by module name, at its real path."""
     files = {}
     for top in (PACKAGE, *(ROOT / name for name in (*LINKED, *USERS))):
         for path in sorted(top.rglob("*.py")):
@@ -58,7 +58,7 @@ def code_files() -> dict[str, Path]:
 
 
 def folder_of(module: str) -> str:
-    """The folder that a module stands in; the package's own modules stand for themselves."""
+    """The folder of a module; the package's own modules stand for themselves."""
     parts = module.removeprefix(".").split(".")
     if parts[0] != "su3d_bench":
         return ".ci" if module.startswith(".") else parts[0]
@@ -66,7 +66,7 @@ def folder_of(module: str) -> str:
 
 
 def imported(module: str, source: str) -> set[str]:
-    """The modules of the package that ``source`` imports, in functions and for type checkers too."""
+    """The modules of the package imported by ``source``, including in functions and for type checkers."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -83,13 +83,13 @@ def imported(module: str, source: str) -> set[str]:
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """Who imports whom, file by file."""
+    """Imports between files."""
     return {module: imported(module, path.read_text(encoding="utf-8")) for module, path in code_files().items()}
 
 
 @cache
 def folder_imports() -> dict[str, set[str]]:
-    """Who imports whom, folder by folder."""
+    """Imports between folders."""
     graph: dict[str, set[str]] = {}
     for module, others in imports().items():
         folder = folder_of(module)
@@ -98,12 +98,12 @@ def folder_imports() -> dict[str, set[str]]:
 
 
 def layers(graph: Mapping[str, set[str]]) -> list[set[str]]:
-    """The nodes in layers, the lowest first, each as low as what it imports lets it; ``ValueError`` for a cycle."""
+    """The nodes in layers, lowest first, each as low as its imports allow; ``ValueError`` for a cycle."""
     left, found = dict(graph), list[set[str]]()
     while left:
         free = {node for node, others in left.items() if not others & left.keys()}
         if not free:
-            while free := left.keys() - set().union(*left.values()):  # what stands above the cycle
+            while free := left.keys() - set().union(*left.values()):  # nodes above the cycle
                 left = {node: others & left.keys() - free for node, others in left.items() if node not in free}
             raise ValueError(f"a cycle of imports among {', '.join(sorted(left))}")
         found.append(free)
@@ -112,10 +112,10 @@ def layers(graph: Mapping[str, set[str]]) -> list[set[str]]:
 
 
 def drawn() -> dict[str, str]:
-    """The parts of the page that are drawn from the code, by the word in their marks."""
+    """The generated parts of the page, by the name in their markers."""
     graph = folder_imports()
     below = layers(graph)
-    rows, arrows = ["| layer | folder | what it holds |", "|---|---|---|"], ["```text"]
+    rows, arrows = ["| layer | folder | content |", "|---|---|---|"], ["```text"]
     for number, folders in reversed(list(enumerate(below, 1))):
         for folder in sorted(folders & PURPOSE.keys()):
             place = folder if folder in LINKED else f"su3d_bench/{folder}"
@@ -127,7 +127,7 @@ def drawn() -> dict[str, str]:
 
 
 def page_with(parts: dict[str, str], page: str) -> str:
-    """``page`` with each part between its marks."""
+    """``page`` with each generated part between its markers."""
     for word, text in parts.items():
         begin, end = f"<!-- {word}: drawn from the code -->", f"<!-- end of {word} -->"
         page = re.sub(rf"{begin}.*?{end}", lambda _, t=f"{begin}\n{text}\n{end}": t, page, flags=re.DOTALL)  # type: ignore[misc]

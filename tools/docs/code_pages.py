@@ -1,4 +1,4 @@
-"""Pages of the documentation site that are made from the code: each protocol, each method, each public name."""
+"""Pages of the documentation site generated from the code: each protocol, each method, each public name."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from su3d_bench.reports.tables.paper import Figure, figures_of
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"
 API = "reference/api.md"
-REPORTED = "Numbers as papers report them, each in its own set-up; no two need be comparable."
+REPORTED = "Values as reported in papers, each in its own set-up; they need not be comparable."
 
 
 def made_pages() -> dict[str, str]:
-    """Every made page by its place in the site."""
+    """All generated pages by their path in the site."""
     protocols = [load_protocol(name) for name in protocol_names()]
     methods = [summary_of(name) for name in registry.BUILT_IN["method"]]
     return {
@@ -86,40 +86,40 @@ def protocols_page(protocols: Sequence[ProtocolRules]) -> str:
     ]
     return _page(
         "The protocols",
-        "<p>A protocol is the rules by which a map becomes numbers. Each has a page, made from the file that the "
-        "program reads: every rule with its source, whose evaluation it repeats, how far both were held against each "
-        "other, and what its numbers may not be compared with.</p>",
+        "<p>A protocol is the set of rules by which a map is scored. Each has a page, generated from the file that the "
+        "program reads: every rule with its source, the evaluation it reproduces, how both were compared with each "
+        "other, and with what its results may not be compared.</p>",
         table(head, rows, is_stacked=True),
     )
 
 
 def _source(original: Original) -> str:
-    """The repository and commit as a link, or that there is none."""
+    """The repository and commit as a link, or a remark that there is none."""
     if original.place is None:
         return "none"
     return f'<a href="{plain(original.place)}">{plain(original.code)} at {plain(str(original.commit)[:7])}</a>'
 
 
 def _original_of(stated: ResolvedOriginal | None) -> list[str]:
-    """The section that says whose evaluation it is."""
+    """The section on the original evaluation."""
     if stated is None:
         return []
     rows = [
         (plain(name), _source(stated.original) if name == "original" and stated.original.place else prose(text))
         for name, text in stated.facts.items()
     ]
-    return ["## Its original", table((), rows, is_stacked=True)]
+    return ["## Original", table((), rows, is_stacked=True)]
 
 
 def protocol_page(rules: ProtocolRules, files: Sequence[Path], stated: ResolvedOriginal | None = None) -> str:
-    """What ``su3d-bench protocols show NAME`` prints, as a page."""
+    """The output of ``su3d-bench protocols show NAME``, as a page."""
     remarks = remarks_of(files)
     sources = " ".join(remarks.pop(HEADING, [])).replace(" extends ", "\nextends ").split("\n")
     figures = figures_of(protocol=rules.name)
     glance = [
         ("kind", f"{_code(rules.kind)}: {prose(_first_line(RULES_OF_KIND[rules.kind]))}"),
         ("headline", plain(", ".join(rules.headline))),
-        ("datasets", plain(", ".join(rules.datasets) or "any") + ("" if rules.by_default else "; where it is named")),
+        ("datasets", plain(", ".join(rules.datasets) or "any") + ("" if rules.by_default else "; if requested")),
         ("version", plain(rules.version)),
         ("not comparable with", _linked(not_comparable_with(rules))),
         ("digest", _code(rules.digest)),
@@ -133,7 +133,7 @@ def protocol_page(rules: ProtocolRules, files: Sequence[Path], stated: ResolvedO
         table((), glance, is_stacked=True),
         *_original_of(stated),
         "## Every rule",
-        table(("rule", "value", "source, or that it is ours"), rows, is_stacked=True),
+        table(("rule", "value", "source (or ours)"), rows, is_stacked=True),
         f"<p>Not set: {_codes(absent)}.</p>" if absent else "",
         *(f"<p>{prose(remark)}</p>" for remark in _left(remarks)),
         *_classes_of(rules, classes),
@@ -148,7 +148,7 @@ def _first_line(thing: object) -> str:
 
 
 def _rules_of(rules: ProtocolRules, remarks: dict[str, list[str]]) -> tuple[list[tuple[str, str, str]], list[str]]:
-    """A row for each rule that is set or spoken of, whose remarks are taken out; and the names of the others."""
+    """One row per rule that is set or documented, with remarks removed; and the names of the others."""
     rows, absent = [], []
     for path, value in flatten(rules.model_dump(mode="json", exclude={"classes", "not_comparable_with", "summary"})):
         key = ".".join(path)
@@ -184,7 +184,7 @@ def _classes_of(rules: ProtocolRules, remarks: Sequence[str]) -> list[str]:
 
 
 def _reported(figures: Sequence[Figure], who: str) -> list[str]:
-    """The section of published numbers; ``who`` is what the first column names: method or protocol."""
+    """The section of published values; ``who`` is the heading of the first column: method or protocol."""
     if not figures:
         return []
     rows = [
@@ -202,7 +202,7 @@ def _reported(figures: Sequence[Figure], who: str) -> list[str]:
 
 
 def summary_of(name: str) -> dict[str, Any]:
-    """What ``su3d-bench methods show NAME --json`` answers."""
+    """The output of ``su3d-bench methods show NAME --json``."""
     with redirect_stdout(io.StringIO()) as answer:
         main(["methods", "show", name, "--json"])
     told: dict[str, Any] = json.loads(answer.getvalue())
@@ -213,18 +213,18 @@ def methods_page(methods: Sequence[Mapping[str, Any]]) -> str:
     rows = [(_linked([row["name"]]), prose(row["summary"]), plain("; ".join(row["needs"]))) for row in methods]
     return _page(
         "The methods",
-        "<p>A method turns the frames of a scene into a map of instances. Each has a page, made from its class: where "
-        "it comes from, what has been shown of it, every setting with its default, presets, what papers report.</p>",
+        "<p>A method turns the frames of a scene into a map of instances. Each has a page generated from its class: "
+        "its source, how it was verified, every setting with its default, presets, and values reported in papers.</p>",
         table(("method", "what it does", "needs"), rows, is_stacked=True),
     )
 
 
 def method_page(told: Mapping[str, Any]) -> str:
-    """What ``su3d-bench methods show NAME`` prints, as a page."""
+    """The output of ``su3d-bench methods show NAME``, as a page."""
     name = told["name"]
     origin = [(field, prose(told[field])) for field in ("paper", "source", "licence") if told[field]]
     origin += [("needs", plain("; ".join(told["needs"])))] if told["needs"] else []
-    origin += [("shown so far", prose(told["status"]))] if told["status"] else []
+    origin += [("verification", prose(told["status"]))] if told["status"] else []
     schema = registry.load("method", name).Config.model_json_schema()
     settings = [
         (_code(".".join(path)), _takes(schema, path), "not set" if value is None else _code(toml_value(value)))
@@ -234,15 +234,15 @@ def method_page(told: Mapping[str, Any]) -> str:
         (_code(f"{name}@{preset}"), _codes(f"{key} = {json.dumps(value)}" for key, value in own.items()))
         for preset, own in told["presets"].items()
     ]
-    given = f"Given as <code>--set {plain(name)}.KEY=VALUE</code>, or in a file for <code>--config</code>."
+    given = f"Set with <code>--set {plain(name)}.KEY=VALUE</code>, or in a file for <code>--config</code>."
     return _page(
         name,
         f"<p>{prose(told['summary'])}</p>",
         table((), origin, is_stacked=True) if origin else "",
         "## Settings",
-        f"<p>{given if settings else 'It has none.'}</p>",
+        f"<p>{given if settings else 'None.'}</p>",
         table(("setting", "takes", "default"), settings, is_stacked=True) if settings else "",
-        *(["## Presets", "<p>Each is a method of its own name.</p>"] if presets else []),
+        *(["## Presets", "<p>Each is a method with its own name.</p>"] if presets else []),
         table(("method", "settings"), presets, is_stacked=True) if presets else "",
         *_reported(figures_of(method=name), "protocol"),
         "## On the command line",
@@ -251,7 +251,7 @@ def method_page(told: Mapping[str, Any]) -> str:
 
 
 def _takes(schema: Mapping[str, Any], path: Sequence[str]) -> str:
-    """What values a setting takes, of the JSON schema of all."""
+    """The allowed values of a setting, from the JSON schema."""
     field: Mapping[str, Any] = schema
     for part in path:
         field = _resolved(schema, field).get("properties", {}).get(part, {})
@@ -283,7 +283,7 @@ def _said(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
 
 
 def api_page() -> str:
-    """A section for each public name, which mkdocstrings fills in from its docstring and signature."""
+    """One section per public name, which mkdocstrings fills in from its docstring and signature."""
     public = [(name, getattr(su3d_bench, name)) for name in sorted(su3d_bench.__all__, key=str.lower)]
     sections = {
         "Functions": [name for name, thing in public if inspect.isroutine(thing)],
@@ -297,6 +297,6 @@ def api_page() -> str:
     return _page(
         "Every public name",
         "```python\nimport su3d_bench as su3d\n```",
-        "<p>What <code>su3d_bench</code> names is imported at its first use; nothing else is promised to stay.</p>",
+        "<p>The names of <code>su3d_bench</code> are imported at first use; all other names may change.</p>",
         *parts,
     )

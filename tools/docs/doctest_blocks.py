@@ -1,4 +1,4 @@
-"""An extension of Griffe, which reads the code for mkdocstrings: examples in docstrings are blocks of code."""
+"""A Griffe extension (Griffe reads the code for mkdocstrings) that turns docstring examples into code blocks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from site_text import with_examples
 
 
 class DoctestBlocks(griffe.Extension):  # type: ignore[misc]
-    """Each docstring as the site wants it."""
+    """Each docstring in the form used by the site."""
 
     def on_instance(self, *, obj: Any, **rest: Any) -> None:
         if obj.docstring is not None:

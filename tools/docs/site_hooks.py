@@ -1,4 +1,4 @@
-"""What mkdocs calls while it builds the site: the pages that are made, their order, and links out of docs/."""
+"""mkdocs hooks for building the site: generated pages, their order, and links out of docs/."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from site_text import DOCS, ROOT, ROOT_PAGES, for_site
 
 from su3d_bench.metrics.protocols.loading import protocol_names
 
-_made: dict[str, str] = {}  # the pages of this build that are no files of docs/
+_made: dict[str, str] = {}  # generated pages of this build, not in docs/
 
 
 def on_config(config: Any) -> Any:
-    """Make the pages, and put each page into its place of the navigation."""
+    """Generate the pages, and add each page to the navigation."""
     roots = {place: (ROOT / name).read_text() for name, place in ROOT_PAGES.items()}
     _made.update(made_pages() | roots)
     on_disk = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
@@ -45,21 +45,21 @@ def on_page_markdown(markdown: str, page: Any, **rest: Any) -> str:
 
 
 def on_post_template(output: str, template_name: str, **rest: Any) -> str:
-    """No page for addresses that are not there: a server's affair, whose links are no paths on a disk."""
+    """No 404 page: it needs a server, and its links are not paths on a disk."""
     return "" if template_name == "404.html" else output
 
 
 def repository_of(project: Path) -> str | None:
-    """The address on a code host that the project's metadata has; None where it has none."""
+    """The address on a code host that the project's metadata has; None if it has none."""
     urls = tomllib.loads(project.read_text())["project"].get("urls", {})
     found = next((str(url) for name, url in urls.items() if name.lower() in ("repository", "source")), None)
     return found and found.rstrip("/")
 
 
 def filled(nav: list[Any], pages: set[str]) -> list[Any]:
-    """``nav`` with patterns replaced by the pages that they take, in order, and without what takes none.
+    """``nav`` with patterns replaced by the matching pages, in order, and without empty entries.
 
-    A page that an entry names outright is no other's, and of two patterns the first takes it.
+    A page listed explicitly is not matched by patterns; of two patterns the first takes it.
 
     >>> filled([{"Start": "index.md"}, {"More": ["gone.md", "*.md"]}, {"Empty": "none/*.md"}], {"index.md", "a.md"})
     [{'Start': 'index.md'}, {'More': ['a.md']}]
@@ -85,7 +85,7 @@ def _filled(nav: list[Any], pages: set[str], left: set[str]) -> list[Any]:
         elif value in pages:
             entries.append(entry)
         else:
-            # a pattern speaks of one folder
+            # a pattern covers one folder
             taken = sorted(one for one in left if fnmatch(one, value) and one.count("/") == value.count("/"))
             left -= set(taken)
             # an index first: it is the page of its section

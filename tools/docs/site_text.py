@@ -1,4 +1,4 @@
-"""Texts on their way into the documentation site: made safe for a page, and links as they must be there."""
+"""Texts for the documentation site: escaped for a page, and with adapted links."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from su3d_bench.core.safe_output import escaped
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-# Files of the repository's root that are pages of the site; README.md is its first where docs/ has no index.md.
+# Files of the repository's root that are pages of the site; README.md is its first if docs/ has no index.md.
 _README = "readme.md" if (DOCS / "index.md").is_file() else "index.md"
 ROOT_PAGES = {"README.md": _README, "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 _FENCE = re.compile(r"^ *(```+|~~~+)")
 _SPAN = r"(?P<ticks>`+)(?!`)(?:(?!(?P=ticks)).|\n)*?(?P=ticks)(?!`)"
 _CODE = re.compile(_SPAN)
-# A heading or code, or a link, whose words may hold code and pictures.
+# A heading or code, or a link, whose text may contain code and pictures.
 _CODE_OR_LINK = re.compile(
     rf"(?P<heading>^#.*$)|(?P<code>{_SPAN})|"
     r"(?P<mark>!?)\[(?P<words>(?:`[^`]*`|\[[^\[\]]*\]|[^\[\]`])*)\]\((?P<target>[^()\s]+)\)",
@@ -31,7 +31,7 @@ _QUOTED = re.compile(r"``(.+?)``|`(.+?)`", re.DOTALL)
 
 
 def plain(text: object) -> str:
-    """``text`` in one line, such that a page shows its characters and none of them acts.
+    """``text`` in one line, escaped so that a page shows its characters literally.
 
     >>> plain("a  <b>\\n& c")
     'a &lt;b&gt; &amp; c'
@@ -40,7 +40,7 @@ def plain(text: object) -> str:
 
 
 def heading(text: object) -> str:
-    """``text`` as ``plain`` has it, for Markdown to leave as it is.
+    """``text`` as in ``plain``, escaped for Markdown.
 
     >>> heading("a_b <i> *c*")
     'a\\\\_b &lt;i&gt; \\\\*c\\\\*'
@@ -49,7 +49,7 @@ def heading(text: object) -> str:
 
 
 def prose(text: object) -> str:
-    """``text`` as ``plain`` has it, with addresses as links and what stands in backquotes as code.
+    """``text`` as in ``plain``, with addresses as links and quoted parts as code.
 
     >>> prose("``a<b``: https://example.org/x, read")
     '<code>a&lt;b</code>: <a href="https://example.org/x">https://example.org/x</a>, read'
@@ -59,11 +59,11 @@ def prose(text: object) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, is_stacked: bool = False) -> str:
-    """A table of cells that are safe already; without a head where ``head`` is empty.
+    """A table of escaped cells; without a header if ``head`` is empty.
 
-    ``is_stacked``: on a phone, its cells stand one below another.
+    ``is_stacked``: on a phone, its cells are stacked.
     """
-    # a line a cell: the search would take the words of two cells for one
+    # one line per cell: otherwise the search would join the words of two cells
     heads = ["<thead><tr>", *(f"<th>{cell}</th>" for cell in head), "</tr></thead>"] if head else []
     lines = [line for row in rows for line in ("<tr>", *(f"<td>{cell}</td>" for cell in row), "</tr>")]
     whole = "\n".join(["<table>", *heads, "<tbody>", *lines, "</tbody></table>"])
@@ -77,12 +77,12 @@ def for_site(
     repository: str | None,
     names: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """The Markdown of a page, whose path in the repository is ``page``, as the site wants it.
+    """The Markdown of a page, whose path in the repository is ``page``, adapted to the site.
 
-    A link to a page of the root (README.md) leads to its page of the site; one to any other file outside docs/ leads to
-    the ``repository`` on its code host, and where the project has none yet, it is the file's path as code. What leads
-    nowhere stays as it is, and the build says so. Of ``names``, whose pages of the site are made and hence unknown to
-    the code host, the first one in code leads to its page.
+    A link to a page in the root (README.md) leads to its page of the site; one to any other file outside docs/ leads to
+    the ``repository`` on its code host or, if the project has none yet, becomes the file's path as code. Broken links
+    are kept and reported by the build. For ``names``, whose generated pages are unknown to
+    the code host, the first occurrence in code links to its page.
     """
     here = str(PurePosixPath(place_of(page)).parent)
     unnamed = dict(names)
@@ -108,7 +108,7 @@ def for_site(
 
 
 def place_of(path: str) -> str:
-    """Where in the site a page of the repository stands.
+    """Path in the site of a page of the repository.
 
     >>> place_of("CHANGELOG.md"), place_of("docs/running/gpu.md")
     ('changelog.md', 'running/gpu.md')
@@ -117,13 +117,13 @@ def place_of(path: str) -> str:
 
 
 def _with_bars(text: str) -> str:
-    r"""``text`` with ``|`` in the code of tables as it is: code hosts want ``\|``, the site shows the backslash."""
+    r"""``text`` with ``|`` unescaped in code of tables: code hosts need ``\|``, the site shows the backslash."""
     row = re.compile(r"^\|.*$", re.MULTILINE)
     return row.sub(lambda line: _CODE.sub(lambda code: code[0].replace("\\|", "|"), line[0]), text)
 
 
 def outside_fences(text: str, change: Callable[[str], str]) -> str:
-    r"""``text`` with ``change`` made to each part that is in no fenced block.
+    r"""``text`` with ``change`` applied to each part outside fenced blocks.
 
     >>> print(outside_fences("a\n```sh\na\n```\na", str.upper))
     A
@@ -149,7 +149,7 @@ def outside_fences(text: str, change: Callable[[str], str]) -> str:
 
 
 def with_examples(docstring: str) -> str:
-    """A docstring with each of its examples in a fenced block; Markdown would take ``>>>`` for three quotations."""
+    """A docstring with each example in a fenced block; Markdown would read ``>>>`` as three quotations."""
     lines: list[str] = []
     is_example = False
     for line in inspect.cleandoc(docstring).splitlines():

@@ -1,6 +1,6 @@
-"""The table of what reads files of others: tests and ``python benchmarks fuzz`` damage every row.
+"""The table of readers of external files: tests and ``python benchmarks fuzz`` damage every row.
 
-A row has a name, what writes a valid sample into a folder and returns the call that reads it, and which files are hurt.
+A row has a name, a function that writes a valid sample into a folder and returns the reading call, and files to damage.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from places import CASES, SCENES
 
 
 def _prediction(name: str, *, has_points: bool) -> Make:
-    """A scene in the format of that name, with points of its own or over the vertices of a mesh."""
+    """A scene in the format of that name, with its own points or over the vertices of a mesh."""
 
     def make(folder: Path) -> Read:
         from prediction_files import write_small, written_in
@@ -181,7 +181,7 @@ def _rules_text() -> bytes:
 
 
 def _whole_dataset(name: str, folder: Path, scene: str) -> Read:
-    """All that is asked of a dataset, each question whatever became of the one before."""
+    """All calls to a dataset, each made even if previous ones failed."""
     from su3d_bench.core.registry import load
 
     def asked() -> Iterator[Read]:
@@ -245,12 +245,12 @@ def _rgbd(folder: Path) -> Read:
     return _whole_dataset("rgbd", folder, "desk")
 
 
-# ---- runs, sheets, what was fetched
+# ---- runs, sheets, fetched files
 
 
 @functools.cache
 def _made_run() -> Path:
-    """A folder with a finished run of two painted scenes; made once a process."""
+    """A folder with a finished run of two painted scenes; created once per process."""
     import pytest
     from painted import colour_perception
 
@@ -274,7 +274,7 @@ def copied_run(folder: Path) -> Path:
 
 
 def _run(folder: Path) -> Read:
-    """What is read of a finished run."""
+    """Everything that is read of a finished run."""
     from su3d_bench.analysis.tables import measured_results
     from su3d_bench.runs.finished import read_run, read_update_times
 
@@ -291,7 +291,7 @@ def _run(folder: Path) -> Read:
 
 
 def _verbs(folder: Path) -> Read:
-    """Verbs that read a run folder, in turn."""
+    """Verbs that read a run folder, one after another."""
     run = copied_run(folder)
     words = (["report", "tables", str(run), "--json"], ["report", "timing", str(run)])
     pair = ["compare", f"{run}:collector", f"{run}:collector@drop=1"]

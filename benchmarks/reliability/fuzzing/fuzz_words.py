@@ -1,4 +1,4 @@
-"""Words behind the verbs of the command line: right ones, odd ones, and any."""
+"""Random arguments for the verbs of the command line: valid, odd, and arbitrary ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mutations import NUMBERS, TEXTS
 from su3d_bench.cli.main import build_parser
 
 ODD = (*NUMBERS, *TEXTS, "-", "--", "--x", "a=b", "=", "a.b.c=1", "@", "a@b@c", "x" * 300, "a/" * 2000)
-# What is the right word of some place, or nearly so; nothing that would start long work.
+# Words that are valid or nearly valid somewhere; nothing that would start long work.
 KNOWN = (
     *(
         "opensu3d",
@@ -53,7 +53,7 @@ def verbs() -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
 
 
 def drawn_words(parser: argparse.ArgumentParser, rng: random.Random) -> list[str]:
-    """Some flags of a verb and some words in their places; never ``--debug``, which shows tracebacks."""
+    """Some flags of a verb and some positional words; never ``--debug``, which shows tracebacks."""
     words: list[str] = []
     flags = [one for one in parser._actions if one.dest not in ("help", "version", "debug")]
     for action in rng.sample(flags, min(len(flags), rng.randrange(4))):

@@ -1,4 +1,4 @@
-"""A reader of others' files meets damaged samples: each is read or refused in one line, soon and in little memory."""
+"""Runs a file reader on damaged samples: each is read or rejected in one line, quickly and in little memory."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from mutations import mutated
 from su3d_bench.core.errors import GroundTruthMissing, Su3dError
 
 MAX_SECONDS = 20.0  # one read of a small file; generous, for a busy machine
-MAX_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may stand above what was there before the read
+MAX_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may rise during a read
 MAX_ADDRESSES_BYTES = 2 << 30  # how much address space a read may reserve
-MAX_CHARACTERS = 1000  # of a message, the names of files in it
-ENDLESS = {"pipe": "a pipe", "device": "a device"}  # what is waited for, and what has no end
-SHAPES = ("missing", "folder", "loop", *ENDLESS)  # a file that is not there, or is none
+MAX_CHARACTERS = 1000  # of a message including file names
+ENDLESS = {"pipe": "a pipe", "device": "a device"}  # one blocks, one is endless
+SHAPES = ("missing", "folder", "loop", *ENDLESS)  # a missing file, or not a file
 Read = Callable[[], object]
 Make = Callable[[Path], Read]
 
 
 @dataclass(frozen=True)
 class Target:
-    """A reader: ``make`` writes a valid sample into a folder and returns what reads it. ``files``: what is hurt.
+    """A reader: ``make`` writes a valid sample into a folder and returns the reading call. ``files``: those to damage.
 
-    ``weight``: its share of the inputs, less than 1 for what is slow.
+    ``weight``: its share of the inputs, less than 1 for slow readers.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Input:
-    """Damage number ``index`` of a target: ``file`` gets ``content``, or is no file at all, by ``shape``."""
+    """Damage number ``index`` of a target: ``file`` gets ``content``, or becomes something else, by ``shape``."""
 
     index: int
     file: str
@@ -55,7 +55,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Outcome:
-    """``fault`` is None where the input was read (``is_read``) or properly refused."""
+    """``fault`` is None if the input was read (``is_read``) or properly rejected."""
 
     is_read: bool
     fault: str | None
@@ -64,11 +64,11 @@ class Outcome:
 
 
 class TooSlow(BaseException):
-    """Raised by the alarm; no ``Exception``, so that no reader takes it for damage."""
+    """Raised by the alarm; not an ``Exception``, so that no reader mistakes it for damage."""
 
 
 class BadMessage(Exception):
-    """An error of the right type whose message no terminal should be shown."""
+    """An error of the right type whose message is not fit for a terminal."""
 
 
 class Sample:
@@ -80,7 +80,7 @@ class Sample:
         self.read = target.make(folder)
         found = {file for pattern in target.files for file in folder.glob(pattern) if file.is_file()}
         self.whole = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
-        assert self.whole, f"{target.name}: {target.files} match no file"
+        assert self.whole, f"{target.name}: {target.files} match no files"
 
     def input(self, seed: int, index: int) -> Input:
         """The damage of that number: the same on every machine."""
@@ -91,13 +91,13 @@ class Sample:
         return Input(index, file, mutated(self.whole[file], rng), None)
 
     def meet(self, one: Input) -> Outcome:
-        """What the reader does with the damaged sample, which is corrected afterwards."""
+        """The reader's outcome on the damaged sample, which is restored afterwards."""
         path = self.folder / one.file
         self._put(path, one.content, one.shape)
         try:
             outcome = self._watched()
             if outcome.fault is not None and outcome.fault.startswith(("slow", "memory")):
-                outcome = self._watched()  # what was imported first, or a busy machine, does not come again
+                outcome = self._watched()  # first imports or a busy machine do not occur twice
             return outcome
         finally:
             self._put(path, self.whole[one.file], None)
@@ -141,7 +141,7 @@ class Sample:
 
 
 def every_one_of(asked: Iterator[Read]) -> None:
-    """Call all of ``asked``, whatever the ones before raised; the first refusal is raised at the end."""
+    """Call all of ``asked``, even after errors; the first rejection is raised at the end."""
     first: Su3dError | None = None
     for one in asked:
         try:
@@ -149,13 +149,13 @@ def every_one_of(asked: Iterator[Read]) -> None:
         except Su3dError as error:
             if (fault := fault_of_message(str(error))) is not None:
                 raise BadMessage(fault) from error
-            first = first or (None if isinstance(error, GroundTruthMissing) else error)  # no truth is no damage
+            first = first or (None if isinstance(error, GroundTruthMissing) else error)  # no ground truth is no damage
     if first is not None:
         raise first
 
 
 def fault_of_message(message: str) -> str | None:
-    """What is wrong with the form of an error's message, if anything."""
+    """Faults in the form of an error's message, if any."""
     odd = {c for c in message if unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp")}
     if odd:
         return f"message: holds {sorted(map(ascii, odd))}: {message!r:.300}"
@@ -166,7 +166,7 @@ def fault_of_message(message: str) -> str | None:
 
 @contextmanager
 def alarm(seconds: float) -> Iterator[None]:
-    """``TooSlow`` once ``seconds`` are over, as soon as Python code runs."""
+    """Raise ``TooSlow`` after ``seconds``, as soon as Python code runs."""
 
     def ring(number: int, frame: FrameType | None) -> None:
         raise TooSlow

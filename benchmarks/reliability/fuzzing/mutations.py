@@ -1,4 +1,4 @@
-"""Damaged copies of a file that know a little of its format, so that damage gets past checksums and outer layers."""
+"""Damaged copies of a file that respect parts of its format, so that damage gets past checksums and outer layers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from decompression_bombs import MIB, Member, deflated, gzip_of, whole_member, zi
 from su3d_bench.core.files.atomic import DAMAGE
 
 MAX_BYTES = 4 << 20  # of a copy
-MAX_INSIDE = 64 << 20  # bytes of a packed sample that are unpacked to be damaged
-BOMBS = (1, 40, 2500)  # mebibytes that few bytes unpack to: what may be, and what may not
+MAX_INSIDE = 64 << 20  # bytes of a packed sample to unpack for damaging
+BOMBS = (1, 40, 2500)  # mebibytes that few bytes unpack to: allowed and excessive
 NUMBERS = (
     *("0", "-0", "1", "-1", "2", "0.5", "1e-320", "1e308", "1e999", "nan", "NaN", "-inf", "Infinity", "127", "256"),
     *("65536", "2147483648", "-2147483649", "4294967296", "9223372036854775808", "18446744073709551616", "1" * 5000),
@@ -37,7 +37,7 @@ SNIPPETS = (  # of pickles
 
 
 def mutated(content: bytes, rng: random.Random) -> bytes:
-    """A damaged copy of ``content``, at most ``MAX_BYTES`` long where ``content`` is."""
+    """A damaged copy of ``content``, at most ``MAX_BYTES`` long if ``content`` is."""
     damaged = content
     if rng.random() < 0.04:
         damaged = rng.choice((b"", b"\xef\xbb\xbf" + content, bytes(1000), b"1" * 1_000_000, rng.randbytes(500)))
@@ -60,7 +60,7 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
     damaged = bytearray(content)
     at = rng.randrange(len(damaged)) if damaged else 0
     if rng.random() < 0.3:
-        at = min(at, rng.randrange(256))  # headers stand in front
+        at = min(at, rng.randrange(256))  # headers are at the beginning
     end = min(len(damaged), at + rng.choice((1, 1, 2, 4, 8, 64)))
     kind = rng.randrange(7)
     if kind == 0:
@@ -84,7 +84,7 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def _text(content: bytes, rng: random.Random) -> bytes:
-    """A text, or the text at the beginning of a binary file, with words and lines changed."""
+    """A text, or text at the beginning of a binary file, with changed words and lines."""
     end = len(content) if b"\0" not in content[:4096] else content.find(b"\n") + 1
     try:
         text = content[:end].decode()
@@ -133,7 +133,7 @@ def _zip(content: bytes, rng: random.Random) -> bytes:
                 return _bytes(content, rng)  # a bomb already
             members = [(info.filename, archive.read(info), info.compress_type) for info in archive.filelist]
         at = rng.randrange(len(members))
-    except DAMAGE:  # it was damaged already
+    except DAMAGE:  # it is already damaged
         return _bytes(content, rng)
     name, inside, method = members[at]
     kind = rng.randrange(10)
@@ -153,7 +153,7 @@ def _zip(content: bytes, rng: random.Random) -> bytes:
         members[at] = (rng.choice((f"../{name}", f"/{name}", name.upper(), f"{name}\x1b", "x" * 300)), inside, method)
     out = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(out, "w") as archive:
-        warnings.simplefilter("ignore")  # two members of one name are meant
+        warnings.simplefilter("ignore")  # duplicate member names are intended
         for name, inside, method in members:
             archive.writestr(zipfile.ZipInfo(name), inside, method, 1)
     return out.getvalue()

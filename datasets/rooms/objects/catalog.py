@@ -28,7 +28,7 @@ def make(
     colour: str | None = None,
     avoid: frozenset[str] = frozenset(),
 ) -> Item:
-    """A new instance of a class; ``model`` names one of its builders (``coffee_table``), else any of them."""
+    """A new instance of a class; ``model`` selects one of its builders (``coffee_table``), by default any of them."""
     assembly = begin(class_name, rng, colour, avoid)
     builders = BUILDERS[class_name]
     if model is None:

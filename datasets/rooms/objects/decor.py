@@ -1,4 +1,4 @@
-"""Builders of what decorates: lamps, plants, vases, pictures, clocks, candles, sculptures; textiles."""
+"""Builders of decoration: lamps, plants, vases, pictures, clocks, candles, sculptures; textiles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Builders of what is fitted to a room: doors, windows, kitchen and bathroom fixtures, devices."""
+"""Builders of fixtures: doors, windows, kitchen and bathroom fixtures, devices."""
 
 from __future__ import annotations
 
@@ -227,7 +227,7 @@ def towel_rail(build: Assembly) -> None:
 
 
 def _handle(x: float, near: float, far: float, heights: Sequence[float], radius: float) -> Shape:
-    """An upright bar before a front: from ``near`` to ``far`` and back again, at four heights."""
+    """An upright bar in front of a surface: from ``near`` to ``far`` and back, at four heights."""
     return tube([(x, y, z) for y, z in zip((near, far, far, near), heights, strict=True)], radius)
 
 

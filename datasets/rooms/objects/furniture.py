@@ -1,4 +1,4 @@
-"""Builders of furniture: what stands on the floor and carries other things."""
+"""Builders of furniture: it stands on the floor and carries other objects."""
 
 from __future__ import annotations
 

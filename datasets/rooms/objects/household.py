@@ -1,4 +1,4 @@
-"""Builders of what lies and stands about: books, boxes, baskets, bins, balls; dishes and bottles."""
+"""Builders of household objects: books, boxes, baskets, bins, balls; dishes and bottles."""
 
 from __future__ import annotations
 

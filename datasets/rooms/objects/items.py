@@ -1,4 +1,4 @@
-"""What an object of a room is made of, before it has a place: parts, spots that hold other objects, size; and how it
+"""An object of a room before it is placed (parts, spots that hold other objects, size), and how it
 is built.
 """
 
@@ -17,11 +17,11 @@ from su3d_bench.datasets.rooms.objects.shapes import Shape, bounds
 
 USUAL_VOLUME_L: Mapping[str, float] = {model: litres for known in CLASSES for model, litres in known.models.items()}
 FOOT_HEIGHT_M = 0.025
-SMALL_BELOW, LARGE_ABOVE = 0.78, 1.28  # of the usual volume: about the outer quarters of the models that vary
+SMALL_BELOW, LARGE_ABOVE = 0.78, 1.28  # of the typical volume: roughly the outer quartiles of models that vary
 
 
 def size_word(model: str, size: Float64Array) -> str:
-    """small, medium or large, for a box of sides ``size`` metres."""
+    """small, medium or large, for a box with sides ``size`` in metres."""
     share = 1000.0 * float(np.prod(size)) / USUAL_VOLUME_L[model]
     return "small" if share < SMALL_BELOW else "large" if share > LARGE_ABOVE else "medium"
 
@@ -59,11 +59,11 @@ class Item:
     parts: tuple[Part, ...]
     spots: tuple[Spot, ...]
     size: Float64Array
-    model: str = ""  # which of the class's models was built; empty for parts of the room itself
+    model: str = ""  # the class's model that was built; empty for parts of the room itself
 
     @cached_property
     def foot(self) -> Float64Array:
-        """Corners (2, 2) of the rectangle on which the item stands: what it touches, without its overhang."""
+        """Corners (2, 2) of the rectangle on which the item stands: its contact area, without overhang."""
         corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in self.parts])
         low = corners[corners[:, 2] < FOOT_HEIGHT_M]
         return np.stack([low[:, :2].min(axis=0), low[:, :2].max(axis=0)])
@@ -71,7 +71,7 @@ class Item:
 
 @dataclass
 class Assembly:
-    """An instance while it is built: the choices that set it apart within its class, and its parts and spots so far."""
+    """An instance being built: the choices that distinguish it within its class, its parts and spots so far."""
 
     class_name: str
     colour: str
@@ -83,11 +83,11 @@ class Assembly:
     spots: list[Spot] = field(default_factory=list)
 
     def main(self, axis: int = 0) -> Material:
-        """The object's own material in its own colour; ``axis`` is the direction of a wood grain."""
+        """The object's material in its colour; ``axis`` is the direction of a wood grain."""
         return self.of(self.material, axis=axis)
 
     def of(self, kind: str, rgb: Rgb | str | None = None, axis: int = 0) -> Material:
-        """A material in a colour, which may be given by its name; in the object's own where none is given."""
+        """A material in a colour, possibly given by name; by default in the object's colour."""
         colour = tone(rgb) if isinstance(rgb, str) else self.rgb if rgb is None else rgb
         return of_kind(kind, colour, self.rng, axis)
 
@@ -96,14 +96,14 @@ class Assembly:
         return tone(str(self.rng.choice(colours)) if len(colours) > 1 else colours[0], self.rng)
 
     def size(self, low: float, high: float) -> float:
-        """A length in metres that grows with the instance's size."""
+        """A length in metres, scaled with the instance's size."""
         return float(self.rng.uniform(low, high) * self.scale)
 
     def chance(self, probability: float) -> bool:
         return bool(self.rng.random() < probability)
 
     def add(self, material: Material | str, *shapes: Shape) -> None:
-        """Parts of one material, or of a kind of material in the object's own colour."""
+        """Parts of one material, or of a kind of material in the object's colour."""
         made_of = self.of(material) if isinstance(material, str) else material
         self.parts.extend(Part(shape, made_of) for shape in shapes)
 
@@ -112,7 +112,7 @@ class Assembly:
         self.spots.append(Spot(*x, *y, z, clearance, role))
 
     def item(self, model: str) -> Item:
-        """What was built, as an instance of a ``model``."""
+        """The finished instance, as a ``model``."""
         low, high = bounds([part.shape for part in self.parts])
         shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
         parts = tuple(Part(part.shape.moved(*shift), part.material) for part in self.parts)
@@ -127,7 +127,7 @@ Builder = Callable[[Assembly], None]
 def begin(
     class_name: str, rng: np.random.Generator, colour: str | None = None, avoid: frozenset[str] = frozenset()
 ) -> Assembly:
-    """An instance of a random look; colours in ``avoid`` are taken only where nothing else is allowed."""
+    """An instance with a random look; colours in ``avoid`` are used only if no other is allowed."""
     known = CLASS_BY_NAME[class_name]
     material = str(rng.choice(list(known.materials)))
     free = [c for c in known.colours if c not in avoid] or list(known.colours)

@@ -1,4 +1,4 @@
-"""Materials: a procedural texture with its colours, evaluated in object space, so that every view agrees."""
+"""Materials: a procedural texture with its colours, evaluated in object space so that all views agree."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from su3d_bench.datasets.rooms.classes import COLOUR_RGB, LOOKS
 Rgb = tuple[float, float, float]  # linear light, 0..1
 
 
-# What ``pattern_kernels`` knows how to paint.
+# The textures that ``pattern_kernels`` can paint.
 Texture = IntEnum(
     "Texture",
     "PLAIN WOOD WEAVE TILES SPECKLE STRIPES CHECKS DOTS BRUSHED PICTURE KEYS SCREEN PLANKS WICKER LEAF CARPET SKY "
@@ -24,10 +24,10 @@ Texture = IntEnum(
 
 @dataclass(frozen=True)
 class Material:
-    """How a part looks: ``texture`` paints with colours ``a`` and ``b`` at ``scale`` metres along ``axis``.
+    """The look of a part: ``texture`` paints with colours ``a`` and ``b`` at ``scale`` metres along ``axis``.
 
     ``extent`` (u0, u1, v0, v1) bounds textures that fill a face (pictures, screens, rugs); ``gloss`` 0..1 is the
-    strength of the highlight, ``glow`` the light it sends out itself.
+    strength of the highlight, ``glow`` the light it emits.
     """
 
     texture: Texture
@@ -65,7 +65,7 @@ def mix(first: Rgb, second: Rgb, share: float) -> Rgb:
 
 
 def tone(name: str, rng: np.random.Generator | None = None) -> Rgb:
-    """Linear light of a colour name; with ``rng``, a departure in brightness and hue that keeps the name right."""
+    """Linear light of a named colour; ``rng`` varies brightness and hue within what the name allows."""
     base = COLOUR_RGB[name]
     if rng is None:
         return linear(base)
@@ -81,7 +81,7 @@ def _seed(rng: np.random.Generator) -> int:
 
 
 def of_kind(kind: str, rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:
-    """The usual look of a kind of material: of ``LOOKS``, or fabric, which may be plain or large in its pattern.
+    """The typical look of a kind of material: from ``LOOKS``, or fabric, plain or with a large pattern.
 
     ``axis`` is the direction of a wood grain.
     """
@@ -109,5 +109,5 @@ def _fabric(kind: str, rgb: Rgb, rng: np.random.Generator) -> Material:
 
 
 def light(rgb: tuple[float, float, float], glow: float = 1.0) -> Material:
-    """What sends out light of a colour (sRGB 0..255) itself."""
+    """A material that emits light of a colour (sRGB 0..255)."""
     return Material(Texture.PLAIN, linear(rgb), linear(rgb), glow=glow)

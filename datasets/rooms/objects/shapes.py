@@ -1,7 +1,7 @@
-"""Solid shapes out of quadrilaterals: boxes, turned profiles, tubes, sheets; metres, outward normals.
+"""Solid shapes made of quadrilaterals: boxes, surfaces of revolution, tubes, sheets; metres, outward normals.
 
-A quad's corners run around it; a quad with two equal corners is a triangle. Every shape is closed or two-sided,
-so that a surface seen from behind is never drawn.
+The corners of a quad are in order around it; a quad with two equal corners is a triangle. Every shape is closed or
+two-sided, so back faces are never drawn.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 
-CREASE = np.cos(np.deg2rad(38.0))  # profile bends sharper than this are edges, softer ones are smooth
+CREASE = np.cos(np.deg2rad(38.0))  # profile bends sharper than this are edges, others are smooth
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,12 @@ def block(width: float, depth: float, height: float, x: float = 0.0, y: float = 
 
 
 def both(x: float) -> tuple[float, float]:
-    """Where a thing stands that there is on either side."""
+    """Positions of a part that exists on either side."""
     return -x, x
 
 
 def corners(x: float, y: float) -> list[tuple[float, float]]:
-    """Where a thing stands that there is in every corner."""
+    """Positions of a part that exists in every corner."""
     return [(sx * x, sy * y) for sx in (-1, 1) for sy in (-1, 1)]
 
 
@@ -129,7 +129,7 @@ def _grid_normals(points: Float64Array) -> Float64Array:
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int | None = None) -> Shape:
-    """The profile (radius, height) turned about z; it runs from the axis at the bottom, outside up, inside down."""
+    """The profile (radius, height) rotated about z; it runs from the axis at the bottom up the outside, down inside."""
     points = np.array(profile, np.float64)
     largest = points[:, 0].max()
     n = segments or int(np.clip(2 * round(np.pi * largest / 0.022), 10, 28))

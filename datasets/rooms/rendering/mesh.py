@@ -21,7 +21,7 @@ OCCLUSION_REACH_M = 0.8
 
 @dataclass(frozen=True)
 class Placed:
-    """An item at its place: turned by ``yaw`` degrees about z, then moved to ``position``; ``id`` from 1."""
+    """A placed item: rotated by ``yaw`` degrees about z, then moved to ``position``; ``id`` from 1."""
 
     id: int
     item: Item
@@ -34,7 +34,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Light:
-    """A soft light: ``position`` m, ``colour`` linear RGB times power, ``radius`` m of its extent."""
+    """A soft light: ``position`` m, ``colour`` linear RGB times power, ``radius`` m."""
 
     position: tuple[float, float, float]
     colour: tuple[float, float, float]
@@ -55,7 +55,7 @@ class Patches:
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """What is ray cast and shaded; all per vertex but the three arrays of triangles."""
+    """Input of ray casting and shading; all per vertex except the three arrays of triangles."""
 
     vertices: Float32Array
     normals: Float32Array
@@ -69,7 +69,7 @@ class RoomMesh:
 
 
 def gather_patches(placed: Sequence[Placed]) -> Patches:
-    """All parts in world coordinates; the texture stays in each object's own frame."""
+    """All parts in world coordinates; textures stay in object coordinates."""
     corners, normals, texture, ids, rows = [], [], [], [], []
     materials: list[Material] = []
     for piece in placed:
@@ -103,7 +103,7 @@ def _wound(shape: Shape) -> Shape:
 
 @dataclass(frozen=True)
 class Grid:
-    """Patches cut into cells: ``rows`` (V, 3) of quad, u, v; ``faces`` (F, 4) of vertex indices; owner quad a face."""
+    """Patches cut into cells: ``rows`` (V, 3) of quad, u, v; ``faces`` (F, 4) of vertex indices; owner of each face."""
 
     rows: Float64Array
     faces: Int32Array
@@ -111,7 +111,7 @@ class Grid:
 
 
 def cut(patches: Patches, longest_m: float) -> Grid:
-    """Each quad as a grid of cells whose edges are no longer than ``longest_m``."""
+    """Each quad as a grid of cells with edges no longer than ``longest_m``."""
     n_u = _n_cells(patches.corners, ((0, 1), (3, 2)), longest_m)
     n_v = _n_cells(patches.corners, ((0, 3), (1, 2)), longest_m)
     n_points, n_faces = (n_u + 1) * (n_v + 1), n_u * n_v
@@ -125,20 +125,20 @@ def cut(patches: Patches, longest_m: float) -> Grid:
 
 
 def _n_cells(quads: Float64Array, edges: Sequence[tuple[int, int]], longest_m: float) -> NDArray[np.int64]:
-    """How many cells (Q,) lie along the longer of two opposite edges, given by their corners."""
+    """Number of cells (Q,) along the longer of two opposite edges, given by their corners."""
     steps = [(quads[:, start] - quads[:, end]) ** 2 for start, end in edges]
     longest = np.max([step[:, 0] + step[:, 1] + step[:, 2] for step in steps], axis=0)
     return np.asarray(np.maximum(1, np.ceil(np.sqrt(longest) / longest_m - 1e-6)), np.int64)
 
 
 def _places(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The group of each of the things that groups have ``counts`` of, and its place in the group."""
+    """The group of each element, for groups of ``counts`` elements, and its position in the group."""
     group = np.repeat(np.arange(len(counts)), counts)
     return group, np.arange(len(group)) - (np.cumsum(counts) - counts)[group]
 
 
 def at_rows(values: Float64Array, rows: Float64Array) -> Float64Array:
-    """Values at (quad, u, v) rows from the values at the quads' four corners."""
+    """Values at (quad, u, v) rows, interpolated from the quads' four corners."""
     quad, u, v = rows[:, 0].astype(np.int64), rows[:, 1:2], rows[:, 2:]
     near = values[quad, 0] * (1 - u) + values[quad, 1] * u
     far = values[quad, 3] * (1 - u) + values[quad, 2] * u
@@ -156,7 +156,7 @@ def merge_equal(keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.i
 
 
 def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> RoomMesh:
-    """The render mesh, its light computed by ray casting against itself."""
+    """The render mesh, with light computed by ray casting against itself."""
     grid = cut(patches, LIGHT_SPACING_M)
     points = at_rows(patches.corners, grid.rows)
     normals = at_rows(patches.normals, grid.rows)
@@ -199,7 +199,7 @@ def _bake(
     scene = caster(points.astype(np.float32), triangles)
     inward = patches.corners[quad[first]].mean(axis=1) - where
     far = np.linalg.norm(inward, axis=1, keepdims=True)
-    start = where + facing * 0.004 + inward * np.minimum(0.1, 0.015 / np.maximum(far, 1e-9))  # off the edges
+    start = where + facing * 0.004 + inward * np.minimum(0.1, 0.015 / np.maximum(far, 1e-9))  # away from the edges
     total = np.zeros((len(first), 3))
     for source in lights:
         total += _direct(scene, start, facing, source)[:, None] * np.array(source.colour)
@@ -212,7 +212,7 @@ def _bake(
 
 
 def _fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDArray[np.intp]) -> Float64Array:
-    """Light of vertices that lie inside another solid, from their neighbours, so that no darkness bleeds out."""
+    """Light of vertices inside another solid, taken from their neighbours, so that darkness does not bleed out."""
     turned = triangles[:, [1, 2, 0]]
     tail, head = np.concatenate([triangles, turned]).ravel(), np.concatenate([turned, triangles]).ravel()
     filled, unknown = light.copy(), buried.copy()
@@ -247,7 +247,7 @@ def _direct(scene: object, start: Float64Array, facing: Float64Array, light: Lig
 
 
 def _open_sky(scene: object, start: Float64Array, facing: Float64Array) -> Float64Array:
-    """Share of a few fixed directions around the normal that are free nearby."""
+    """Share of a few fixed directions around the normal that are unobstructed nearby."""
     helper = np.where(np.abs(facing[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
     side = np.cross(facing, helper)
     side /= np.linalg.norm(side, axis=1, keepdims=True)

@@ -1,6 +1,6 @@
-"""Compiled procedural textures: the colour of a surface before any light falls on it, one pixel at a time.
+"""Compiled procedural textures: the colour of a surface before lighting, one pixel at a time.
 
-The numbers of the textures are those of ``materials.Texture``, the columns of a material row those of
+Texture numbers are those of ``materials.Texture``, the columns of a material row those of
 ``Material.row``.
 """
 
@@ -18,7 +18,7 @@ inlined: Any = njit(cache=True, inline="never")
 
 @inlined
 def _hash(ix, iy, iz):  # type: ignore[no-untyped-def]
-    """A number in 0..1 of an integer cell."""
+    """A pseudo-random number in 0..1 for an integer cell."""
     h = np.uint32(ix * 374761393 + iy * 668265263 + iz * 2147483647 + 1274126177)
     h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(1274126177))
     h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(2246822519))
@@ -56,7 +56,7 @@ def _wood(x, y, z, scale, axis, seed):  # type: ignore[no-untyped-def]
 
 @inlined
 def _pattern(kind, u, v, scale, axis, seed):  # type: ignore[no-untyped-def]
-    """Share of the second colour for the patterns in the plane of a face."""
+    """Share of the second colour, for patterns in the plane of a face."""
     if kind == 5:  # stripes
         s = (u if axis == 0 else v) / scale
         return 1.0 if s - math.floor(s) < 0.42 else 0.0
@@ -188,7 +188,7 @@ def _picture(u, v, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def
 
 @inlined
 def _screen(u, v, lively, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def]
-    """A desktop with windows and lines of text where ``lively``, else a dark screen with a reflection."""
+    """A desktop with windows and lines of text if ``lively``, otherwise a dark screen with a reflection."""
     if lively < 0.5:
         m = 1.0 if abs(u - 0.35 - 0.4 * v) < 0.13 else 0.25 * v
         return ar + (br - ar) * m, ag + (bg - ag) * m, ab + (bb - ab) * m
@@ -213,7 +213,7 @@ def _screen(u, v, lively, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-unty
 
 @inlined
 def _keys(u, v, scale):  # type: ignore[no-untyped-def]
-    """1 between the keys; the lowest row holds a long space bar."""
+    """1 between the keys; the lowest row has a long space bar."""
     a, b = u / scale, v / scale
     row = math.floor(b)
     a += 0.27 * row
@@ -261,7 +261,7 @@ def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
 
 @inlined
 def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore[no-untyped-def]
-    """Red, green and blue (0..1, linear) at a point, ``u`` and ``v`` its place in the plane of the face."""
+    """Red, green and blue (0..1, linear) at a point; ``u`` and ``v`` are its position in the plane of the face."""
     ar, ag, ab, br, bg, bb = row[1], row[2], row[3], row[4], row[5], row[6]
     tone = 1.0
     if kind == 0:

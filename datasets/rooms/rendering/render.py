@@ -1,4 +1,4 @@
-"""Colour, depth and instance images of a room by ray casting, and the noise of a sensor on them."""
+"""Colour, depth and instance images of a room by ray casting, with simulated sensor noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 where a ray misses."""
+    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 if a ray misses."""
 
     rgb: UInt8Array
     depth_m: Float32Array
@@ -29,7 +29,7 @@ def camera_intrinsics(width: int, height: int) -> Float64Array:
 
 
 class Renderer:
-    """Renders one room at one image size; ``like`` is another renderer of the same mesh, whose tree it shares."""
+    """Renders a room at one image size; ``like`` is another renderer of the same mesh, whose tree is shared."""
 
     def __init__(self, mesh: RoomMesh, width: int, height: int, like: Renderer | None = None) -> None:
         self.width, self.height = width, height
@@ -54,7 +54,7 @@ class Renderer:
         return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
 
     def depth_and_instance(self, camera_to_world: Float64Array, pixels: Int64Array) -> tuple[Float32Array, Int32Array]:
-        """Depth in metres (N,), 0 for a miss, and object ids (N,) at ``pixels`` (N,), counted along the rows."""
+        """Depth in metres (N,), 0 for a miss, and object ids (N,) at ``pixels`` (N,), in row-major order."""
         _, t_hit, primitive, _ = self._cast(camera_to_world, self._directions[pixels])
         hit = np.isfinite(t_hit)
         ids = self._mesh.instance_of_triangle[np.where(hit, primitive, 0)]
@@ -76,7 +76,7 @@ class Renderer:
 @dataclass(frozen=True)
 class SensorNoise:
     """``depth_per_m2``: standard deviation of depth at 1 m, growing with its square (Khoshelham and Elberink 2012,
-    for structured light); ``step_per_m2``: quantisation likewise; ``edge_px``: how far holes reach from a jump of
+    for structured light); ``step_per_m2``: quantisation likewise; ``edge_px``: how far holes extend from a jump in
     depth; ``colour``: standard deviation of a channel in 0..255."""
 
     depth_per_m2: float
@@ -90,13 +90,13 @@ LEVELS = (
     SensorNoise(0.0010, 0.0010, 1, 2.0),
     SensorNoise(0.0025, 0.0028, 2, 5.0),
 )
-JUMP_M = 0.04  # second difference between pixels, so that a slanted plane is no edge
+JUMP_M = 0.04  # second difference between pixels, so that a slanted plane is not an edge
 
 
 def add_noise(
     rgb: UInt8Array, depth_m: Float32Array, level: int, rng: np.random.Generator
 ) -> tuple[UInt8Array, Float32Array]:
-    """The images as a sensor of noise ``level`` gives them; level 0 changes nothing."""
+    """The images with sensor noise of ``level``; level 0 changes nothing."""
     noise = LEVELS[level]
     if level == 0:
         return rgb, depth_m

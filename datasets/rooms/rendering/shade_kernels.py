@@ -1,4 +1,4 @@
-"""Compiled shading: baked light and highlights on textures, one pixel at a time; and which faces an image shows.
+"""Compiled shading: baked light and highlights on textures, pixel by pixel; and which faces are visible in an image.
 
 Imported lazily: numba takes a second to load. The columns of a material row are those of ``Material.row``.
 """
@@ -20,7 +20,7 @@ inlined: Any = njit(cache=True, inline="never")
 @compiled
 def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light,  # type: ignore[no-untyped-def]
           instance_of_triangle, material_of_triangle, materials, lights, rgb, depth, instance):  # fmt: skip
-    """Fills ``rgb``, ``depth`` and ``instance`` of every pixel from the ray caster's answer."""
+    """Fills ``rgb``, ``depth`` and ``instance`` of every pixel from the ray caster's result."""
     for i in range(t_hit.shape[0]):
         t = t_hit[i]
         if not t < 1e9:
@@ -59,7 +59,7 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
 
 @inlined
 def _between(values, i0, i1, i2, b0, b1, b2):  # type: ignore[no-untyped-def]
-    """The three numbers at a point of a triangle from those at its vertices."""
+    """The three values at a point of a triangle, from those at its vertices."""
     x = b0 * values[i0, 0] + b1 * values[i1, 0] + b2 * values[i2, 0]
     y = b0 * values[i0, 1] + b1 * values[i1, 1] + b2 * values[i2, 1]
     return x, y, b0 * values[i0, 2] + b1 * values[i1, 2] + b2 * values[i2, 2]
@@ -72,7 +72,7 @@ def _difference(values, i, j):  # type: ignore[no-untyped-def]
 
 @inlined
 def _encode(value):  # type: ignore[no-untyped-def]
-    """Linear light to sRGB 0..255 with a soft shoulder, so that nothing clips hard."""
+    """Linear light to sRGB 0..255 with a soft shoulder, to avoid hard clipping."""
     if value > 0.75:
         value = 0.75 + 0.25 * (1 - math.exp(-(value - 0.75) * 4))
     return np.uint8(255.0 * max(0.0, value) ** 0.4545 + 0.5)
@@ -87,7 +87,7 @@ def _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, glos
     dx, dy, dz = dx / length, dy / length, dz / length
     facing = dx * nx + dy * ny + dz * nz
     rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
-    total = gloss * 0.10 * max(0.0, rz + 0.2)  # the bright upper half of a room, mirrored
+    total = gloss * 0.10 * max(0.0, rz + 0.2)  # reflection of the bright upper half of a room
     for k in range(lights.shape[0]):
         lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
         distance = math.sqrt(lx * lx + ly * ly + lz * lz) + 1e-6
@@ -108,7 +108,7 @@ def aim(directions, pose, rays):  # type: ignore[no-untyped-def]
             )
 
 
-NEAREST_M, GRAZING = 0.15, 0.08  # closer, or flatter than this cosine, a depth camera sees nothing
+NEAREST_M, GRAZING = 0.15, 0.08  # a depth camera sees nothing closer, or below this cosine
 LOOSE_M, LOOSE_SHARE = 0.012, 0.012  # depth may differ by this much, and by this share of the distance over the cosine
 
 
@@ -137,10 +137,10 @@ def aim_at_faces(  # type: ignore[no-untyped-def]
 
 @compiled
 def drop_seen(active, n_active, pixel, centres, normals, owner, seen, pose, depth, instance):  # type: ignore[no-untyped-def]
-    """Marks in ``seen`` the active faces that the image shows; answers how many stay active.
+    """Marks in ``seen`` the active faces visible in the image; returns the number that stay active.
 
-    ``active`` is compacted in place: what is seen once leaves it. A face is shown where the pixel nearest to its
-    centre holds its own object at its depth.
+    ``active`` is compacted in place: seen faces are removed. A face is visible if the pixel nearest to its
+    centre shows its object at its depth.
     """
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     left = 0

@@ -1,4 +1,4 @@
-"""ConceptGraphs' map of objects: what joins what, when it is cleaned up, what it tells, how it differs from others."""
+"""ConceptGraphs' map of objects: association, clean-ups, reported values, differences from other methods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEFT, RIGHT = Plate((-0.5, 0.0)), Plate((0.0, 0.5))
 BARE = QUIET.model_copy(update={"obj_min_detections": 0})
 
 
-def test_in_the_first_frame_every_region_becomes_an_object_however_alike_they_are() -> None:
+def test_in_the_first_frame_every_region_becomes_an_object() -> None:
     method = mapped(ConceptGraphs(BARE), [[LEFT, LEFT]])
     assert method.n_instances == 2
 
@@ -34,7 +34,7 @@ def test_in_the_next_frame_several_regions_may_join_one_object() -> None:
     assert found.views.tolist() == [[0, 0], [1, 0], [1, 1]]
 
 
-def test_the_feature_is_the_average_weighted_by_detections() -> None:
+def test_feature_is_the_average_weighted_by_detections() -> None:
     views = [
         [replace(LEFT, feature=axis(0))],
         [replace(LEFT, feature=axis(0))],
@@ -51,7 +51,7 @@ def stages(method: ConceptGraphs, plates: list[Plate], index: int) -> set[str]:
     return set(timer.take())
 
 
-def test_every_twentieth_frame_objects_are_denoised_and_overlapping_ones_merged() -> None:
+def test_objects_are_denoised_and_merged_every_twentieth_frame() -> None:
     method = ConceptGraphs(QUIET)
     method.start(SCENE)
     told = [stages(method, [LEFT], index) for index in range(40)]
@@ -73,10 +73,10 @@ def test_finish_midway_changes_nothing() -> None:
     assert len(straight.finish()) > 0
 
 
-# What it does unlike others
+# Differences from other methods
 
 
-def test_a_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     see_painted(monkeypatch)
     painted = f"{SCENES}/painted.py:Painted/a"
     settings = ["conceptgraphs.stride=1", "conceptgraphs.max_bbox_area_ratio=1.0", "conceptgraphs.denoise_interval=2"]

@@ -41,14 +41,14 @@ def an_object(
     feature: tuple[float, ...] = axis(0),
     text: tuple[float, ...] = axis(0),
 ) -> MapObject:
-    """An object of ``n`` detections."""
+    """An object with ``n`` detections."""
     seen = tuple(Sighting(k, 0, "item", "", 1.0) for k in range(n))
     cloud = np.asarray(points, np.float64)
     return MapObject(number, cloud, bounding_box(cloud, oriented=True), np.array(feature), np.array(text), seen)
 
 
 def box(centre: tuple[float, float, float], sizes: tuple[float, float, float] = (1, 1, 1), turn: float = 0.0):  # type: ignore[no-untyped-def]
-    """A box turned about the z axis."""
+    """A box rotated about the z axis."""
     c, s = np.cos(turn), np.sin(turn)
     return OrientedBox(np.array(centre, float), np.array(sizes, float), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]))
 
@@ -62,14 +62,14 @@ def iou(a: OrientedBox, b: OrientedBox) -> float:
 # Boxes
 
 
-def test_boxes_half_a_side_apart_share_a_third() -> None:
+def test_boxes_shifted_by_half_a_side_have_iou_one_third() -> None:
     assert iou(box((0, 0, 0)), box((0.5, 0, 0))) == pytest.approx(1 / 3)
     assert iou(box((0, 0, 0)), box((0, 0, 0))) == pytest.approx(1)
     assert iou(box((0, 0, 0)), box((0.1, 0, 0.2), (0.5, 0.5, 0.5))) == pytest.approx(1 / 8)
     assert iou(box((3, 4, 5), turn=0.3), box((3, 4, 5), turn=0.3 + np.pi / 2)) == pytest.approx(1)
 
 
-def test_a_cube_turned_by_45_degrees_shares_an_octagon() -> None:
+def test_cube_rotated_by_45_degrees_intersects_in_an_octagon() -> None:
     octagon = 2 * (np.sqrt(2) - 1)
     assert iou(box((0, 0, 0)), box((0, 0, 0), turn=np.pi / 4)) == pytest.approx(octagon / (2 - octagon))
 
@@ -79,7 +79,7 @@ def half_spaces(one: OrientedBox) -> np.ndarray:
     return np.column_stack([normals, -normals @ one.centre - np.tile(one.sizes / 2, 2)])
 
 
-def test_any_two_boxes_share_what_their_half_spaces_share() -> None:
+def test_box_intersections_match_half_space_intersections() -> None:
     rng = np.random.default_rng(5)
     n_compared = 0
     for _ in range(40):
@@ -87,7 +87,7 @@ def test_any_two_boxes_share_what_their_half_spaces_share() -> None:
             OrientedBox(rng.normal(0, 0.3, 3), rng.uniform(0.2, 1.5, 3), np.linalg.qr(rng.normal(size=(3, 3)))[0])
             for _ in range(2)
         )
-        inside = (one.centre + other.centre) / 2  # a point of both, or the pair is left out
+        inside = (one.centre + other.centre) / 2  # a point of both, or the pair is skipped
         if max(one.distance_outside(inside[None])[0], other.distance_outside(inside[None])[0]) > 0:
             continue
         meets = HalfspaceIntersection(np.concatenate([half_spaces(one), half_spaces(other)]), inside)
@@ -98,7 +98,7 @@ def test_any_two_boxes_share_what_their_half_spaces_share() -> None:
     assert n_compared > 20
 
 
-def test_sides_below_2_cm_grow_to_2_cm() -> None:
+def test_sides_below_2_cm_are_extended_to_2_cm() -> None:
     (thin,) = grown([box((1, 2, 3), (0.5, 0.001, 0.02))], 0.02)
     assert thin.sizes.tolist() == [0.5, 0.02, 0.02]
     assert thin.centre.tolist() == [1, 2, 3]
@@ -107,8 +107,8 @@ def test_sides_below_2_cm_grow_to_2_cm() -> None:
 # Similarities
 
 
-def test_overlap_is_the_share_of_the_detections_points_nearer_than_the_voxel() -> None:
-    # distances 0, 0.125, exactly 0.25, and far: the voxel's own side is not near enough
+def test_overlap_is_the_share_of_detection_points_nearer_than_the_voxel() -> None:
+    # distances 0, 0.125, exactly 0.25, and far: a distance of one voxel is not near enough
     base = block((0, 0, 0), (1, 1, 1), 0.25)
     model = an_object(base)
     points = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 0.875], [0.5, 0.5, 1.0], [0.5, 0.5, 2.0]])
@@ -124,7 +124,7 @@ def two_at(cosine: float) -> tuple[MapObject, MapObject]:
 
 
 @pytest.mark.parametrize("cosine", [-0.5, 0.0, 0.6, 1.0])
-def test_the_code_takes_the_cosine_and_the_paper_maps_it_to_0_and_1(cosine: float) -> None:
+def test_code_uses_the_cosine_and_the_paper_maps_it_to_0_1(cosine: float) -> None:
     one, other = two_at(cosine)
     assert semantic_similarity([one], [other], QUIET)[0, 0] == pytest.approx(cosine)
     assert semantic_similarity([one], [other], PAPER)[0, 0] == pytest.approx(cosine / 2 + 0.5)
@@ -138,7 +138,7 @@ def test_both_rules_sum_and_each_has_its_threshold() -> None:
     assert QUIET.model_copy(update={"sim_threshold": 0.9}).association_threshold == 0.9
 
 
-def test_a_detection_joins_the_most_similar_object_at_12_or_above() -> None:
+def test_detection_joins_the_most_similar_object_at_or_above_the_threshold() -> None:
     similarity = np.array([[1.2, 1.0], [1.19, 1.1], [1.3, 1.9], [1.5, 1.5], [1.4, 1.0]])
     assert assign(similarity, 1.2).tolist() == [0, NEW_OBJECT, 1, 0, 0]
 
@@ -146,7 +146,7 @@ def test_a_detection_joins_the_most_similar_object_at_12_or_above() -> None:
 # Merges
 
 
-def test_a_merge_weighs_features_by_the_detections_before_it() -> None:
+def test_merge_weights_features_by_previous_detections() -> None:
     one = an_object(block((0, 0, 0)), 5, n=3, feature=axis(0), text=axis(2))
     other = an_object(block((0, 0, 0)), 9, n=1, feature=axis(1), text=axis(3))
     result = merged(one, other, QUIET, with_dbscan=False)
@@ -155,7 +155,7 @@ def test_a_merge_weighs_features_by_the_detections_before_it() -> None:
     assert (result.number, result.n_detections) == (5, 4)
 
 
-def test_a_merge_averages_both_clouds_by_voxel_and_makes_a_new_box() -> None:
+def test_merge_averages_clouds_by_voxel_and_makes_a_new_box() -> None:
     one, other = an_object(block((0, 0, 0))), an_object(block((0.5, 0, 0)))
     result = merged(one, other, QUIET, with_dbscan=False)
     both = np.concatenate([one.points, other.points])
@@ -163,7 +163,7 @@ def test_a_merge_averages_both_clouds_by_voxel_and_makes_a_new_box() -> None:
     assert result.box.sizes.max() > 0.7
 
 
-def test_denoising_keeps_the_largest_cluster_and_an_object_of_too_few_points_as_it_was() -> None:
+def test_denoising_keeps_the_largest_cluster_but_not_in_tiny_objects() -> None:
     one = an_object(np.concatenate([block((0, 0, 0)), block((2, 0, 0), (0.1, 0.1, 0.1))]))
     clean = denoised(one, QUIET)
     assert len(clean.points) == len(block((0, 0, 0)))
@@ -173,11 +173,11 @@ def test_denoising_keeps_the_largest_cluster_and_an_object_of_too_few_points_as_
 
 
 def part(low_z: float, number: int, **more) -> MapObject:  # type: ignore[no-untyped-def]
-    """A block of six layers 5 cm apart from ``low_z`` on."""
+    """A block of six layers 5 cm apart starting at ``low_z``."""
     return an_object(block((0, 0, low_z)), number, **more)
 
 
-def test_a_wall_and_the_things_along_it_have_the_ratios_of_all_pairs_of_points() -> None:
+def test_ratios_of_a_wall_and_objects_along_it_match_brute_force() -> None:
     rng = np.random.default_rng(0)
     wall = an_object(rng.uniform((0, 0, 0), (5, 0.1, 1), (1500, 3)))
     things = [an_object(rng.uniform((x, 0, 0), (x + 0.6, 0.4, 0.5), (200, 3))) for x in np.arange(0, 5, 0.5)]
@@ -188,7 +188,7 @@ def test_a_wall_and_the_things_along_it_have_the_ratios_of_all_pairs_of_points()
         assert ratios[k, 0] == is_near.any(axis=0).mean() > 0
 
 
-def test_a_contained_object_goes_into_the_one_that_holds_it() -> None:
+def test_contained_object_is_merged_into_its_container() -> None:
     whole, piece = an_object(block((0, 0, 0), (0.3, 0.3, 0.6)), 1, n=2), part(0.25, 2, n=3)
     (result,) = merge_overlapping([whole, piece], QUIET)
     assert (result.number, result.n_detections) == (1, 5)

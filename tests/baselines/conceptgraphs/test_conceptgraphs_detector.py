@@ -1,4 +1,4 @@
-"""ConceptGraphs-Detect: background of one object a class, names that keep objects apart, its own parameters."""
+"""ConceptGraphs-Detect: one object per background class, names that keep objects apart, its own parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WALL = Plate((-0.9, -0.6), name="wall", feature=axis(2))
 OTHER_WALL = Plate((0.6, 0.9), name="wall", feature=axis(3))
 
 
-def test_all_regions_of_a_background_class_are_one_object_however_apart_and_unlike() -> None:
+def test_all_regions_of_a_background_class_are_one_object() -> None:
     method = mapped(ConceptGraphsDetector(QUIET), [[WALL], [OTHER_WALL]])
     assert method.n_instances == 1
     found = method.finish()
@@ -26,19 +26,19 @@ def test_all_regions_of_a_background_class_are_one_object_however_apart_and_unli
     assert np.asarray(found.features)[0] == pytest.approx(np.array([0, 0, 1, 1]) / np.sqrt(2))
 
 
-def test_the_feature_decides_the_class_of_what_is_no_background() -> None:
+def test_feature_decides_the_class_of_foreground_objects() -> None:
     found = mapped(ConceptGraphsDetector(QUIET), [[LEFT]] * 3).finish()
     assert found.labels is None
     assert found.names == ("desk",)
 
 
 def in_parts(cosine: float) -> list[list[Plate]]:
-    """The larger part of a plate, the rest under a name of that ``cosine`` to its own, then the whole."""
+    """The larger part of a plate, the rest with a name of that ``cosine`` to the first name, then the whole plate."""
     return [[replace(LEFT, x=(-0.5, 0.1))], [replace(LEFT, x=(0.1, 0.5), text=at_cosine(cosine))], [WHOLE]]
 
 
 @pytest.mark.parametrize(("cosine", "n_left"), [(0.69, 2), (0.71, 1)])
-def test_the_overlap_merge_needs_names_that_are_alike(cosine: float, n_left: int) -> None:
+def test_overlap_merge_needs_similar_names(cosine: float, n_left: int) -> None:
     method = mapped(ConceptGraphsDetector(ALL_STAY), in_parts(cosine))
     assert method.n_instances == 2
     assert len(method.finish()) == n_left

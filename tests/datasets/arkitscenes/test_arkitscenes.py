@@ -1,4 +1,4 @@
-"""ARKitScenes and the OpenSUN3D challenge's files: frames by their times, the query and its truth, one line a fault."""
+"""ARKitScenes and the OpenSUN3D challenge's files: frames by time, the query and its ground truth, each fault once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def opened(root: Path, **options: Any) -> ArkitScenes:
 
 
 @pytest.mark.parametrize("is_3dod", [False, True])
-def test_frames_have_the_pose_the_depth_and_the_camera_of_their_time(is_3dod: bool, tmp_path: Path) -> None:
+def test_frames_have_pose_depth_and_camera_of_their_time(is_3dod: bool, tmp_path: Path) -> None:
     ark.write_scene(tmp_path, is_3dod=is_3dod)
     dataset = opened(tmp_path)
     assert dataset.scenes() == (ark.SCENE,)
@@ -35,34 +35,34 @@ def test_frames_have_the_pose_the_depth_and_the_camera_of_their_time(is_3dod: bo
     assert [frame.index for frame in dataset.frames(ark.SCENE, 2)] == [0, 2]
 
 
-def test_the_nearest_pose_is_nearer_than_three_tenths_of_a_second_and_the_later_of_equals() -> None:
+def test_nearest_pose_is_within_300_ms_and_ties_go_to_the_later() -> None:
     found = Trajectory(np.array([1.0, 2.0, 2.5]), np.tile(np.eye(4), (3, 1, 1)))
     times = np.array([0.69, 0.71, 1.25, 1.29, 1.5, 2.25, 2.79, 2.81])
     assert found.nearest(times).tolist() == [-1, 0, 0, 0, -1, 2, 2, -1]
 
 
-def test_a_camera_file_may_be_a_millisecond_off_and_images_without_one_are_left_out(tmp_path: Path) -> None:
+def test_camera_file_may_be_1_ms_off_and_images_without_one_are_excluded(tmp_path: Path) -> None:
     cameras = ark.write_scene(tmp_path) / "lowres_wide_intrinsics"
     (cameras / f"{ark.SCENE}_{ark.TIMES[0]}.pincam").rename(cameras / f"{ark.SCENE}_99.999.pincam")
     (cameras / f"{ark.SCENE}_{ark.TIMES[2]}.pincam").rename(cameras / f"{ark.SCENE}_100.205.pincam")
     dataset = opened(tmp_path)
     assert [frame.timestamp_s for frame in dataset.frames(ark.SCENE, 1)] == [100.0, 100.1]
     (line,) = dataset.problems(ark.SCENE)
-    what = f"1 images lack another image or a camera file of their time (the first: {ark.SCENE}_100.200)"
-    assert line == f"{ark.WHERE}: {what}; left out, 2 frames are used"
+    what = f"1 images have no matching image or camera file (the first: {ark.SCENE}_100.200)"
+    assert line == f"{ark.WHERE}: {what}; excluded, 2 frames are used"
 
 
-def test_depth_of_less_confidence_is_left_out_where_it_is_asked(tmp_path: Path) -> None:
+def test_depth_of_low_confidence_is_dropped_on_request(tmp_path: Path) -> None:
     folder = ark.write_scene(tmp_path)
     sure, all_of_it = (opened(tmp_path, min_confidence=least).frames(ark.SCENE, 1)[0].depth_m for least in (2, 1))
     assert not sure[:, :4].any() and (sure[:, 4:] == all_of_it[:, 4:]).all() and all_of_it[1:, :4].all()
     for path in (folder / "confidence").iterdir():
         path.unlink()
-    with pytest.raises(DataError, match="confidence/ is missing, which option min_confidence needs"):
+    with pytest.raises(DataError, match="option min_confidence needs confidence/, which is missing"):
         opened(tmp_path, min_confidence=1).frames(ark.SCENE, 1)
 
 
-def test_the_wide_camera_takes_the_scanners_depth_or_the_phones_and_is_made_smaller(tmp_path: Path) -> None:
+def test_wide_camera_uses_scanner_or_phone_depth_and_is_downsized(tmp_path: Path) -> None:
     folder = ark.write_scene(tmp_path)
     ark.write_images(folder, "wide", "highres_depth", (128, 96))
     (folder / "highres_depth" / f"{ark.SCENE}_{ark.TIMES[1]}.png").unlink()
@@ -72,21 +72,21 @@ def test_the_wide_camera_takes_the_scanners_depth_or_the_phones_and_is_made_smal
     assert len(frames) == 3 and all(frame.depth_m.max() == np.float32(HEIGHT_M) for frame in frames)
 
 
-def test_the_query_and_its_objects_are_those_of_the_challenges_files(tmp_path: Path) -> None:
+def test_query_and_its_objects_come_from_the_challenge_files(tmp_path: Path) -> None:
     ark.write_scene(tmp_path)
     dataset = opened(tmp_path)
     assert dataset.asked_text(ark.SCENE) == ark.QUERY
     (query,) = dataset.queries(ark.SCENE)
     assert (query.text, query.answers) == (ark.QUERY, (1, 2))
     truth = dataset.ground_truth(ark.SCENE, "query-vertices")
-    assert truth.instance.tolist() == [0, 0, 0, 0, 1, 1, 2, 0]  # 2000 is no object, 1002 is number 2
+    assert truth.instance.tolist() == [0, 0, 0, 0, 1, 1, 2, 0]  # 2000 is not an object, 1002 is number 2
     np.testing.assert_array_equal(truth.points, dataset.surface(ark.SCENE).vertices)
     assert dataset.groups()["opensun3d-development"] == (ark.SCENE,)
-    (tmp_path / ark.TRUTH).write_text("1000\n" * 3 + "1\n" * 5)  # 1000 is one to the challenge's script
+    (tmp_path / ark.TRUTH).write_text("1000\n" * 3 + "1\n" * 5)  # 1000 is an object in the challenge's script
     assert opened(tmp_path).ground_truth(ark.SCENE, "query-vertices").instance.tolist() == [1] * 3 + [2] * 5
 
 
-def test_the_challenge_may_lie_elsewhere_and_its_scenes_are_known_without_it(tmp_path: Path) -> None:
+def test_challenge_may_be_elsewhere_and_its_scenes_are_known_without_it(tmp_path: Path) -> None:
     ark.write_scene(tmp_path / "data")
     (tmp_path / "data/challenge_track_1").rename(tmp_path / "challenge_track_1")
     dataset = opened(tmp_path / "data")
@@ -102,7 +102,7 @@ def test_the_challenge_may_lie_elsewhere_and_its_scenes_are_known_without_it(tmp
         opened(tmp_path, challenge=tmp_path / "data").groups()
 
 
-def test_a_scene_without_images_says_so(tmp_path: Path) -> None:
+def test_scene_without_images_is_reported(tmp_path: Path) -> None:
     write_files(tmp_path / "raw/Training" / ark.SCENE, {"lowres_wide.traj": ""})
-    with pytest.raises(FramesMissing, match=r"has no images in .*lowres_wide and none in lowres_depth"):
+    with pytest.raises(FramesMissing, match=r"no images in .*lowres_wide and none in lowres_depth"):
         opened(tmp_path).info(ark.SCENE, 1)

@@ -1,4 +1,4 @@
-"""Walks through HM3DSem: frames and truth as HOV-SG's tools write them, and one line for what is damaged."""
+"""HM3DSem walks: frames and ground truth as written by HOV-SG's tools, and one line per damaged file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ def walk(tmp_path: Path) -> Path:
     return write_walk(tmp_path)
 
 
-def test_frames_have_habitats_poses_in_opencvs_axes_millimetres_and_a_camera_of_90_degrees(
-    walk: Path, tmp_path: Path
-) -> None:
+def test_frames_have_opencv_poses_millimetres_and_a_90_degree_camera(walk: Path, tmp_path: Path) -> None:
     first, second = Hm3dSem(tmp_path).frames(SCENE, 1)
     assert first.camera_to_world.tolist() == np.diag([1.0, -1, -1, 1]).tolist()
     np.testing.assert_array_equal(second.camera_to_world, POSES[1] @ np.diag([1.0, -1, -1, 1]))
@@ -34,9 +32,7 @@ def test_frames_have_habitats_poses_in_opencvs_axes_millimetres_and_a_camera_of_
     assert (first.index, second.index, len(Hm3dSem(tmp_path).frames(SCENE, 2))) == (0, 1, 1)
 
 
-def test_the_truth_holds_objects_in_the_order_of_the_file_with_floors_rooms_and_boxes(
-    walk: Path, tmp_path: Path
-) -> None:
+def test_ground_truth_has_objects_in_file_order_with_floors_rooms_and_boxes(walk: Path, tmp_path: Path) -> None:
     truth = Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects")
     np.testing.assert_allclose(truth.points, np.concatenate([CHAIR, WALL]), rtol=1e-6)
     assert truth.instance.tolist() == [1] * 6 + [2] * 6
@@ -48,7 +44,7 @@ def test_the_truth_holds_objects_in_the_order_of_the_file_with_floors_rooms_and_
     np.testing.assert_allclose(truth.places.object_boxes[1][1], np.ptp(CHAIR, axis=0) + 0.02)
 
 
-def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
+def test_scenes_groups_and_status(walk: Path, tmp_path: Path) -> None:
     dataset = Hm3dSem(tmp_path)
     assert (dataset.scenes(), dataset.status(SCENE)) == ((SCENE,), "2 frames, ground truth")
     assert {name: len(scenes) for name, scenes in dataset.groups().items()} == {"hovsg": 8, "walks": 10}
@@ -56,7 +52,7 @@ def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
     assert dataset.up(SCENE).axis == "y" and list(dataset.problems(SCENE)) == []
 
 
-def test_a_walk_without_truth_has_frames_and_says_so(walk: Path, tmp_path: Path) -> None:
+def test_walk_without_ground_truth_has_frames_and_reports_it(walk: Path, tmp_path: Path) -> None:
     before = Hm3dSem(tmp_path).digest(SCENE)
     (walk / "scene_info.json").unlink()
     dataset = Hm3dSem(tmp_path)
@@ -67,7 +63,7 @@ def test_a_walk_without_truth_has_frames_and_says_so(walk: Path, tmp_path: Path)
             ask()
 
 
-def test_a_scene_graph_is_read_with_floors_rooms_features_and_the_names_as_captions(tmp_path: Path) -> None:
+def test_scene_graph_is_read_with_floors_rooms_features_and_names_as_captions(tmp_path: Path) -> None:
     write_graph(tmp_path / "runs" / SCENE / "graph")
     reader = recognise(tmp_path / "runs")
     assert reader.name == "hovsg-graph" and list(reader.scenes(tmp_path / "runs")) == [SCENE]
@@ -80,7 +76,7 @@ def test_a_scene_graph_is_read_with_floors_rooms_features_and_the_names_as_capti
     assert (room.lowest_m, room.highest_m, room.middle_m, room.category) == (0.0, 2.4, 1.2, "office")
 
 
-def test_objects_come_in_the_order_of_their_files_names_as_the_original_loads_them(tmp_path: Path) -> None:
+def test_objects_are_sorted_by_file_name_as_in_the_original(tmp_path: Path) -> None:
     graph = write_graph(tmp_path / "graph")
     for ending in ("ply", "json"):
         (graph / f"objects/0_0_1.{ending}").rename(graph / f"objects/0_0_10.{ending}")
@@ -97,7 +93,7 @@ def test_objects_come_in_the_order_of_their_files_names_as_the_original_loads_th
         ("objects/0_0_0.json", None, "has no .json beside it"),
     ],
 )
-def test_a_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:
+def test_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:
     graph = write_graph(tmp_path / "graph")
     (graph / name).unlink() if content is None else (graph / name).write_text(content)
     with pytest.raises(PredictionError) as error:
@@ -105,7 +101,7 @@ def test_a_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: s
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_scene_graph_is_evaluated_under_both_protocols_from_files(
+def test_scene_graph_files_are_evaluated_under_both_protocols(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))

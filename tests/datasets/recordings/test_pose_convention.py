@@ -1,4 +1,4 @@
-"""The check of poses against depth: every wrong reading of a room's walk is named, a right one never refused."""
+"""The check of poses against depth: wrong conventions are named, right ones are never rejected."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def walk(scene: str, noise: int) -> tuple[Frame, ...]:
 
 
 def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0) -> list[Frame]:
-    """The frames as they come out where poses and depth are misread."""
+    """The frames that result if poses and depth are misread."""
     return [
         replace(f, camera_to_world=reading(f.camera_to_world), depth_m=f.depth_m * np.float32(depth_factor))
         for f in frames
@@ -38,7 +38,7 @@ def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0
 
 
 @pytest.mark.parametrize(("scene", "noise"), [("living0", 0), ("bathroom0", 2)])
-def test_a_right_reading_is_never_refused(scene: str, noise: int) -> None:
+def test_right_convention_is_never_rejected(scene: str, noise: int) -> None:
     frames = walk(scene, noise)
     for stride in (1, 4, 15):
         assert judge_convention(frames[::stride]) is None
@@ -54,7 +54,7 @@ def test_a_right_reading_is_never_refused(scene: str, noise: int) -> None:
     ],
     ids=["inverse", "axes", "both"],
 )
-def test_a_wrong_reading_of_the_poses_is_named(scene: str, noise: int, reading: Reading, motion: str) -> None:
+def test_wrong_pose_convention_is_named(scene: str, noise: int, reading: Reading, motion: str) -> None:
     finding = judge_convention(read_as(walk(scene, noise), reading))
     assert finding is not None
     assert (finding.motion, finding.depth_factor) == (motion, 1.0)
@@ -62,23 +62,23 @@ def test_a_wrong_reading_of_the_poses_is_named(scene: str, noise: int, reading: 
 
 
 @pytest.mark.parametrize("factor", [0.001, 0.125, 8.0, 1000.0])
-def test_a_wrong_unit_of_depth_is_named(factor: float) -> None:
+def test_wrong_depth_unit_is_named(factor: float) -> None:
     finding = judge_convention(read_as(walk("living0", 2), lambda pose: pose, factor))
     assert finding is not None and finding.motion == "as read"
-    if factor < 1:  # too large a depth makes every motion small, and more than one smaller unit agrees
+    if factor < 1:  # too large depths make every motion small, so several smaller units agree
         assert finding.depth_factor == pytest.approx(1 / factor)
     else:
         assert finding.depth_factor < 1
 
 
 @pytest.mark.parametrize("reading", [lambda pose: pose, inverse, lambda pose: pose @ FLIP])
-def test_a_camera_that_does_not_move_tells_nothing(reading: Reading) -> None:
+def test_static_camera_decides_nothing(reading: Reading) -> None:
     frame = walk("living0", 2)[0]
     still = [replace(frame, index=index) for index in range(10)]
     assert judge_convention(read_as(still, reading)) is None
 
 
-def test_frames_that_share_no_view_tell_nothing() -> None:
+def test_frames_without_overlap_decide_nothing() -> None:
     frames = walk("living0", 0)
     turned = replace(frames[1], camera_to_world=frames[1].camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0]))
     assert judge_convention([frames[0], turned]) is None

@@ -1,4 +1,4 @@
-"""Colour and depth of two cameras on one grid: worked by hand, and against the exact picture of a slanted wall."""
+"""Registration of colour and depth cameras: worked by hand, and against the exact picture of a slanted wall."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def intrinsics(focal: float, size: tuple[int, int]) -> Float64Array:
 
 
 def motion(angle: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float64Array:
-    """A turn about the vertical axis and a step, both in camera axes."""
+    """A rotation about the vertical axis and a translation, both in camera axes."""
     matrix = np.eye(4)
     matrix[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
     matrix[:3, 3] = x, y, z
@@ -51,34 +51,34 @@ def columns(size: tuple[int, int], step: int = 20) -> UInt8Array:
     return np.stack([u * step, v * step, np.full_like(u, 7)], axis=-1).astype(np.uint8)
 
 
-def test_two_sizes_of_one_view_by_hand() -> None:
-    """Colour has twice the pixels: a depth pixel lies in the middle of four colour pixels."""
+def test_two_image_sizes_of_one_view_by_hand() -> None:
+    """Colour has twice the pixels: a depth pixel is centred on four colour pixels."""
     camera = pair()
     depth_m = np.full((3, 4), 2, np.float32)
     colour, depth = register(camera).images(columns((8, 6)), depth_m)
     assert depth is depth_m
     assert colour[1].tolist() == [[20 * u, 50, 7] for u in (0.5, 2.5, 4.5, 6.5)]
-    # the other way a depth pixel falls on the corner of four and, by rounding to even, lands on one of them
+    # conversely a depth pixel falls on the corner of four and, by rounding to even, on one of them
     colour_8, spread = register(camera, "colour").images(columns((8, 6)), depth_m)
     assert colour_8.shape == (6, 8, 3)
     assert np.count_nonzero(spread) == 12 and spread.max() == 2
     assert spread[0].tolist() == [2, 0, 2, 0, 2, 0, 2, 0]
 
 
-def test_a_step_between_the_cameras_moves_near_pixels_further_by_hand() -> None:
+def test_baseline_shifts_near_pixels_further_by_hand() -> None:
     """Colour camera 1 m to the left: its points are 1 m further right; focal length 4 px: 4 px / depth."""
     camera = pair((8, 3), (8, 3), motion(x=1.0), colour_focal=4.0)
     depth_m = np.full((3, 8), 4, np.float32)
-    depth_m[:, 2:4] = 2  # two pixels on
+    depth_m[:, 2:4] = 2  # two pixels at 2 m
     colour, _ = register(camera).images(columns((8, 3)), depth_m)
-    assert (colour[0, :, 0] / 20).tolist() == [1, 2, 4, 5, 5, 6, 7, 7]  # the last is beside the image: its border
+    assert (colour[0, :, 0] / 20).tolist() == [1, 2, 4, 5, 5, 6, 7, 7]  # the last is outside the image: border colour
     seen, depth = register(camera, "colour").images(columns((8, 3)), depth_m)
     np.testing.assert_array_equal(seen, columns((8, 3)))
     # 2 and 3 land on 4 and 5, before 4, which lands on 5 too; nothing lands on 0 and 3
     assert depth[0].tolist() == [0, 4, 4, 0, 2, 2, 4, 4]
 
 
-def test_points_behind_the_colour_camera_have_no_place_in_it() -> None:
+def test_points_behind_the_colour_camera_are_dropped() -> None:
     camera = pair((4, 3), (4, 3), motion(z=-3.0), colour_focal=4.0)
     depth_m = np.full((3, 4), 2, np.float32)
     _, depth = register(camera, "colour").images(columns((4, 3)), depth_m)
@@ -88,7 +88,7 @@ def test_points_behind_the_colour_camera_have_no_place_in_it() -> None:
 
 
 @pytest.mark.parametrize("grid", ["depth", "colour"])
-def test_poses_put_a_pixel_of_either_grid_onto_the_same_point(grid: Grid) -> None:
+def test_poses_of_both_grids_map_a_pixel_to_the_same_point(grid: Grid) -> None:
     extrinsic = motion(0.2, 0.1, -0.05, 0.02)
     registration = register(pair(extrinsic=extrinsic), grid)
     pose = motion(1.0, 3, 4, 5)
@@ -97,26 +97,26 @@ def test_poses_put_a_pixel_of_either_grid_onto_the_same_point(grid: Grid) -> Non
     np.testing.assert_allclose(registration.camera_to_world(pose) @ in_grid, pose @ point, atol=1e-12)
 
 
-def test_a_colour_extrinsic_leads_into_the_same_frame_as_that_of_depth() -> None:
+def test_colour_extrinsic_maps_to_the_same_frame_as_depth_extrinsic() -> None:
     both = motion(0.3, 1, 2, 3)
     camera = pair((4, 3), (4, 3), both, both, colour_focal=4.0)
     assert register(camera).is_identity
 
 
-def test_equal_sizes_with_other_focal_lengths_are_not_taken_as_they_are() -> None:
+def test_equal_sizes_with_different_focal_lengths_are_registered() -> None:
     assert not register(pair((640, 480), (640, 480), colour_focal=577.9, depth_focal=577.8)).is_identity
     assert register(pair((640, 480), (640, 480), colour_focal=577.870605, depth_focal=577.8706054688)).is_identity
     assert not register(pair((4, 3), (4, 3), motion(x=1e-4), colour_focal=4.0)).is_identity
 
 
-# A wall that stands slanted before the depth camera: points X with normal . X = 2, coloured by place.
+# A slanted wall in front of the depth camera: points X with normal . X = 2, coloured by position.
 NORMAL = np.array([0.3, -0.2, 1.0])
 DISTANCE_M = 2.0
 COLOUR_SIZE, DEPTH_SIZE = (324, 242), (160, 120)
 
 
 def wall_colour(points: Float64Array) -> Float64Array:
-    """A smooth pattern on the wall (..., 3), 0 to 255; it changes by at most 6 grey levels a colour pixel."""
+    """A smooth pattern on the wall (..., 3), 0 to 255; it changes by at most 6 grey levels per colour pixel."""
     x, y = points[..., 0], points[..., 1]
     return np.stack([127 + 120 * np.sin(2 * x), 127 + 120 * np.cos(2 * y), 127 + 120 * np.sin(x + y)], axis=-1)
 
@@ -167,7 +167,7 @@ def test_depth_on_the_colour_grid_is_that_of_the_wall(wall: tuple[SensorPair, UI
     true_m = (points @ extrinsic[:3, :3].T + extrinsic[:3, 3])[..., 2]
     is_hit = depth > 0
     assert 0.2 < is_hit.mean() < 0.3  # a quarter: colour has four times the pixels
-    # half a pixel of rounding on a wall that recedes by less than 4 mm a pixel
+    # half a pixel of rounding on a wall that recedes by less than 4 mm per pixel
     assert np.abs(depth - true_m)[is_hit].max() < 0.004
     # each depth pixel that the colour camera sees is somewhere
     assert is_hit.sum() > 0.9 * depth_m.size
@@ -180,6 +180,6 @@ def test_depth_on_the_colour_grid_is_that_of_the_wall(wall: tuple[SensorPair, UI
         (pair(colour_focal=1e30), "the colour intrinsics are no camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1"),
     ],
 )
-def test_what_is_no_pair_of_cameras_is_one_line(camera: SensorPair, message: str) -> None:
+def test_invalid_camera_pair_is_one_line(camera: SensorPair, message: str) -> None:
     with pytest.raises(DataError, match=f"^scannet/x: {message}"):
         register(camera)

@@ -1,4 +1,4 @@
-"""Which axis of a recording points up: guessed from cameras and level surfaces, said in rgbd.toml, rotated to z."""
+"""Which axis of a recording points up: guessed from cameras and level surfaces, set in rgbd.toml, rotated to z."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def walk() -> tuple[Frame, ...]:
 
 
 def with_up(pose: Float64Array, axis: UpAxis) -> Float64Array:
-    """A pose in the z-up world as a file has it whose world has another axis up."""
+    """A pose in the z-up world as stored in a file whose world has another axis up."""
     stored = pose.copy()
     stored[:3] = turn_to_z(axis).T @ pose[:3]
     return stored
@@ -53,14 +53,14 @@ def write_recording(root: Path, axis: UpAxis, **keys: str) -> Path:
 
 
 @pytest.mark.parametrize("axis", UP_AXES)
-def test_the_axis_is_guessed_from_cameras_that_are_held_upright(axis: UpAxis) -> None:
+def test_up_axis_is_guessed_from_upright_cameras(axis: UpAxis) -> None:
     poses = np.array([with_up(frame.camera_to_world, axis) for frame in walk()])
     guess = guess_up(poses, ())
-    assert (guess.axis, guess.reason, guess.is_turned) == (axis, "the cameras were held so", False)
+    assert (guess.axis, guess.reason, guess.is_turned) == (axis, "by camera orientation", False)
 
 
-def test_cameras_that_look_down_from_one_side_leave_it_to_level_surfaces() -> None:
-    """A floor seen aslant: up in the images is nearer to a horizontal axis than to the world's up."""
+def test_cameras_looking_down_from_one_side_need_level_surfaces() -> None:
+    """A floor seen at an angle: the image's up is nearer to a horizontal axis than to the world's up."""
     rows, columns = np.mgrid[:72, :96]
     intrinsics = np.array([[80.0, 0, 47.5], [0, 80, 35.5], [0, 0, 1]])
     rays = np.stack([(columns - 47.5) / 80, (rows - 35.5) / 80, np.ones((72, 96))], axis=-1)
@@ -75,7 +75,7 @@ def test_cameras_that_look_down_from_one_side_leave_it_to_level_surfaces() -> No
 
 
 @pytest.mark.parametrize("axis", UP_AXES)
-def test_a_described_axis_turns_the_world_until_z_points_up(tmp_path: Path, axis: UpAxis) -> None:
+def test_described_up_axis_is_rotated_to_z(tmp_path: Path, axis: UpAxis) -> None:
     write_recording(tmp_path, axis, up=axis)
     rgbd = Rgbd(tmp_path)
     for frame, made in zip(rgbd.frames("walk", 1), walk(), strict=True):
@@ -83,7 +83,7 @@ def test_a_described_axis_turns_the_world_until_z_points_up(tmp_path: Path, axis
     assert rgbd.up("walk").is_turned and judge_scene(rgbd, "walk") is None
 
 
-def test_the_mesh_is_turned_with_the_poses(tmp_path: Path) -> None:
+def test_mesh_is_rotated_with_the_poses(tmp_path: Path) -> None:
     folder = write_recording(tmp_path, "-y", up="-y", mesh="mesh.ply")
     header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -91,15 +91,15 @@ def test_the_mesh_is_turned_with_the_poses(tmp_path: Path) -> None:
     assert Rgbd(tmp_path).surface("walk").vertices.tolist() == [[0, 0, 2], [1, 0, 0], [0, 1, 0]]
 
 
-def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
+def test_without_up_the_world_is_unchanged_and_the_guess_is_reported_and_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_recording(tmp_path, "y")
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
-    said = 'z is assumed to be up, but y seems to be (the cameras were held so); set up = "y" in rgbd.toml, or up = "z"'
+    said = 'z is assumed to be up, but y seems to be (by camera orientation); set up = "y" in rgbd.toml, or up = "z"'
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
-    assert "  up            assumed z, but probably y: the cameras were held so" in out and said in out
+    assert "  up            assumed z, but probably y: by camera orientation" in out and said in out
     assert main(["datasets", "show", "rgbd/walk", "--quiet", "--out", str(tmp_path / "walk.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["up"]["axis"] == "y"
     look = look_at(Rgbd(tmp_path), "walk")
@@ -110,4 +110,4 @@ def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
     write_recording(tmp_path, "y", up="y")
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
-    assert "  up            y, rgbd.toml says so; rotated to z" in out and "seems to be" not in out
+    assert "  up            y, set in rgbd.toml; rotated to z" in out and "seems to be" not in out

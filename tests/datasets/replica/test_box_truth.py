@@ -1,4 +1,4 @@
-"""Replica's boxes as a ground truth of their own: scenes without mesh, without frames, or without both."""
+"""Replica's boxes as ground truth: scenes without mesh, without frames, or without both."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
 
 INFO = "replica_v1/room_0/habitat/info_semantic.json"
 THICK_M = 0.1
-THINGS = {7: "chair", 8: "lamp"}  # which the frames do not show
+THINGS = {7: "chair", 8: "lamp"}  # not visible in the frames
 
 
 def side_box(side: int) -> dict[str, object]:
-    """The flat box of one of the room's six sides, the middle of its thickness on the wall."""
+    """The flat box of one of the room's six sides, centred on the wall."""
     axis, is_high = divmod(side - 1, 2)
     centre, sizes = SIZE / 2, SIZE.copy()
     centre[axis], sizes[axis] = is_high * SIZE[axis], THICK_M
@@ -32,7 +32,7 @@ def side_box(side: int) -> dict[str, object]:
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scene with frames and boxes, without its mesh."""
+    """A scene with frames and boxes but no mesh."""
     write_box_room(tmp_path)
     info = tmp_path / INFO
     table = json.loads(info.read_text())
@@ -49,7 +49,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_boxes_are_a_truth_whose_points_lie_on_their_sides_and_whose_objects_have_classes(root: Path) -> None:
+def test_boxes_are_ground_truth_with_points_on_their_sides_and_classes(root: Path) -> None:
     truth = Replica(root).ground_truth("room0", "boxes")
     assert truth.boxes is not None and sorted(truth.boxes.boxes) == sorted(set(truth.instance)) == list(range(2, 10))
     names = {int(i): truth.labels.name_of(int(c)) for i, c in zip(truth.instance, truth.semantic, strict=True)}
@@ -61,7 +61,7 @@ def test_boxes_are_a_truth_whose_points_lie_on_their_sides_and_whose_objects_hav
         assert to_side.max() < 1e-6
 
 
-def test_the_smallest_box_that_holds_a_point_has_it() -> None:
+def test_smallest_box_containing_a_point_gets_it() -> None:
     boxes = {
         7: OrientedBox(np.zeros(3), np.full(3, 4.0), np.eye(3)),
         3: OrientedBox(np.zeros(3), np.ones(3), np.eye(3)),
@@ -85,7 +85,7 @@ def test_boxes_give_perfect_masks(root: Path) -> None:
     assert main(words.split()) == 0
 
 
-def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_without_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "--scenes", "replica/room0", "--methods", "oracle", "--no-pictures", "--jobs", "1"]
     assert main([*words, "--out", "by-default"]) == 0
     told = capsys.readouterr()
@@ -102,7 +102,7 @@ def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pyt
     assert main([*table, "--per-class"]) == 0
     scored = json.loads(Path("a.json").read_text())["protocols"]["replica-boxes"]
     assert scored["metrics"] == {name.lower(): 1.0 for name in result["result"]["metrics"]} == scored["ceiling"]
-    # a lamp of half a metre whose true box stands a quarter aside: an IoU of a third
+    # a lamp of half a metre whose true box is shifted by a quarter: an IoU of a third
     info = Path(INFO)
     told_otherwise = json.loads(info.read_text())
     straight = next(row for row in told_otherwise["objects"] if row["id"] == 8)["oriented_bbox"]["orientation"]
@@ -117,7 +117,7 @@ def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pyt
     assert "| oracle | 100.0 | 100.0 | 100.0    | 100.0 |" in capsys.readouterr().out
 
 
-def test_a_table_without_boxes_is_no_truth_and_one_of_too_many_is_refused(
+def test_table_without_boxes_is_missing_ground_truth_and_too_many_are_rejected(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     info = root / INFO
@@ -129,5 +129,5 @@ def test_a_table_without_boxes_is_no_truth_and_one_of_too_many_is_refused(
     for row in table["objects"]:
         del row["oriented_bbox"]
     info.write_text(json.dumps(table))
-    with pytest.raises(GroundTruthMissing, match="no object of a class has a box"):
+    with pytest.raises(GroundTruthMissing, match="no object with a class has a box"):
         Replica(root).ground_truth("room0", "boxes")

@@ -1,4 +1,4 @@
-"""The Replica adapter on small scenes in the exact layout: frames, truth on hand-worked meshes, each fault once."""
+"""The Replica dataset on small scenes in the exact layout: frames, ground truth on hand-worked meshes, each fault."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from su3d_bench.datasets.replica.truth import object_of_vertex
 from su3d_bench.formats.ply import ListColumn
 
 
-def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+def test_frames_match_the_files(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     frames = Replica(tmp_path).frames("room0", 2)
     assert len(frames) == 2
@@ -45,11 +45,11 @@ def test_official_scenes_come_first_and_others_in_natural_order(tmp_path: Path) 
     ("scene", "name"),
     [("room0", "room_0"), ("office4", "office_4"), ("living12", "living_12"), ("frl_apartment_0", "frl_apartment_0")],
 )
-def test_scene_names_of_the_two_trees_pair_up(scene: str, name: str) -> None:
+def test_scene_names_of_the_two_trees_match(scene: str, name: str) -> None:
     assert original_name(scene) == name
 
 
-def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ties(tmp_path: Path) -> None:
+def test_vertices_take_the_majority_object_of_their_faces_and_the_lowest_id_on_ties(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     rep.write_original(tmp_path, rep.QUADS, [0, 5, 5, 5], rep.TWO_OBJECTS)
     truth = Replica(tmp_path).ground_truth("room0", "mesh-vertices")
@@ -61,14 +61,14 @@ def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ti
     assert truth.points[5].tolist() == [2, 1, 0]
 
 
-def test_a_vertex_without_faces_is_void_and_a_face_that_names_a_vertex_twice_counts_once() -> None:
+def test_vertex_without_faces_is_void_and_a_face_counts_a_repeated_vertex_once() -> None:
     corners = ListColumn(np.array([0, 4, 7, 10]), np.array([0, 0, 0, 1, 0, 1, 2, 0, 2, 1]))
     face = object_of_vertex(4, corners, np.array([3, 9, 9]))
     assert np.array([3, 9, 9])[face[:3]].tolist() == [9, 9, 9]
     assert face[3] == -1
 
 
-def test_face_corners_repeat_each_vertex_in_the_order_of_the_faces(tmp_path: Path) -> None:
+def test_face_corners_repeat_vertices_in_face_order(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     rep.write_original(tmp_path, [[0, 1, 4, 3], [1, 2, 4]], [5, 0], rep.TWO_OBJECTS)
     truth = Replica(tmp_path).ground_truth("room0", "face-corners")
@@ -77,7 +77,7 @@ def test_face_corners_repeat_each_vertex_in_the_order_of_the_faces(tmp_path: Pat
     assert truth.instance.tolist() == [6] * 4 + [1] * 3
 
 
-def test_polygons_become_fans_of_triangles(tmp_path: Path) -> None:
+def test_polygons_become_triangle_fans(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     rep.write_original(tmp_path, [[0, 1, 4, 3], [1, 2, 4], [4, 5, 8, 7, 6]], [5, 0, 5], rep.TWO_OBJECTS)
     mesh = Replica(tmp_path).instance_mesh("room0")
@@ -86,7 +86,7 @@ def test_polygons_become_fans_of_triangles(tmp_path: Path) -> None:
     assert mesh.class_of_instance == {1: rep.CHAIR, 6: rep.TABLE}
 
 
-def test_objects_without_entry_are_void_counted_and_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_objects_without_entry_are_void_and_counted_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     rep.write_render(tmp_path)
     rep.write_original(tmp_path, rep.QUADS, [0, 7, 7, 300], rep.TWO_OBJECTS)
     replica = Replica(tmp_path)
@@ -100,7 +100,7 @@ def test_objects_without_entry_are_void_counted_and_said_once(tmp_path: Path, ca
     ]
 
 
-def test_a_scene_without_original_has_frames_and_no_truth(tmp_path: Path) -> None:
+def test_scene_without_original_release_has_frames_but_no_ground_truth(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     replica = Replica(tmp_path)
     assert len(replica.frames("room0", 1)) == 3
@@ -111,7 +111,7 @@ def test_a_scene_without_original_has_frames_and_no_truth(tmp_path: Path) -> Non
         Replica(tmp_path).ground_truth("room0", "mesh-vertices")
 
 
-def test_scenes_of_the_marker_are_rendered_rooms_and_others_camera_images(tmp_path: Path) -> None:
+def test_marker_scenes_are_rendered_rooms_and_others_camera_images(tmp_path: Path) -> None:
     rep.write_render(tmp_path, "living0")
     rep.write_render(tmp_path, "room0")
     (tmp_path / "Replica" / "rooms.json").write_text(json.dumps({"scenes": {"living0": "key"}}))
@@ -119,5 +119,5 @@ def test_scenes_of_the_marker_are_rendered_rooms_and_others_camera_images(tmp_pa
     assert replica.info("living0", 1).image_domain == "rendered-rooms"
     assert replica.info("room0", 1).image_domain == "camera"
     (tmp_path / "Replica" / "rooms.json").write_text("{}")
-    with pytest.raises(DataError, match=r"rooms\.json: not the marker"):
+    with pytest.raises(DataError, match=r"rooms\.json: not a marker"):
         replica.info("room0", 1)

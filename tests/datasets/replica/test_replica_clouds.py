@@ -22,7 +22,7 @@ from su3d_bench.metrics.scoring import combine, score_scene
 RUG, FLOOR, DOOR, PICTURE = 98, 40, 37, 59
 
 
-def test_the_labelled_cloud_is_moved_by_the_first_pose_and_the_reference_cloud_is_not(tmp_path: Path) -> None:
+def test_labelled_cloud_is_moved_by_the_first_pose_but_reference_cloud_is_not(tmp_path: Path) -> None:
     write_render(tmp_path)
     points = np.random.default_rng(0).random((5, 3))
     reference = np.array([[1.0, 2, 3], [4, 5, 6]])
@@ -39,7 +39,7 @@ def test_the_labelled_cloud_is_moved_by_the_first_pose_and_the_reference_cloud_i
     assert "room0/rgb_cloud/pointclouds/pc_points.h5" in truth.source
 
 
-def test_labels_are_the_first_maximum_and_a_row_of_zeros_is_other(tmp_path: Path) -> None:
+def test_labels_are_the_first_maximum_and_a_zero_row_is_other(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
     table = np.zeros((3, N_EMBEDDING), np.float32)
@@ -51,27 +51,27 @@ def test_labels_are_the_first_maximum_and_a_row_of_zeros_is_other(tmp_path: Path
 
 @dataclass
 class TextDirections:
-    """An encoder that gives each text a direction of its own, the same in every process."""
+    """An encoder that gives each text a distinct direction, the same in every process."""
 
     name: str = "directions"
     digest: str = "directions"
     dim: int = 24
 
     def encode_images(self, images: Any) -> Float32Array:
-        raise AssertionError("scoring looks at no image")
+        raise AssertionError("scoring uses no image")
 
     def encode_texts(self, texts: Any) -> Float32Array:
         rows = [np.random.default_rng(list(text.encode())).normal(size=self.dim) for text in texts]
         return np.stack([row / np.linalg.norm(row) for row in rows]).astype(np.float32)
 
 
-# Classes in the labelled cloud of each scene: 'other', classes that every exclusion drops, and classes that stay.
+# Classes in the labelled cloud of each scene: 'other', classes dropped by every exclusion, and classes that remain.
 SCENE_CLASSES = {"room0": [0, WALL, FLOOR, DOOR, CHAIR, TABLE, RUG], "office1": [0, WALL, 97, TABLE, 47, 95]}
 
 
 @dataclass
 class CloudScene:
-    """What one scene's evaluation takes: the labelled cloud in its camera, the reference cloud, and a map."""
+    """Inputs of one scene's evaluation: the labelled cloud in its camera, the reference cloud, and a map."""
 
     points: Float32Array
     labels: np.ndarray
@@ -82,7 +82,7 @@ class CloudScene:
 def cloud_scene(scene: str) -> CloudScene:
     rng = np.random.default_rng(list(scene.encode()))
     labels = rng.choice(SCENE_CLASSES[scene], 90)
-    labels[-1] = PICTURE  # in a far corner, where no reference point is nearest: a class of the clouds without points
+    labels[-1] = PICTURE  # in a far corner, nearest to no reference point: a class of the clouds without points
     world = rng.random((90, 3)) * 2
     world[-1] = 30
     pose = first_pose()
@@ -99,7 +99,7 @@ def nearest_brute(candidates: np.ndarray, query: np.ndarray) -> int:
 
 
 def brute_confusion(scene: CloudScene, names: dict[int, str], excluded: set[str]) -> np.ndarray:
-    """Steps 2 to 9 of the original evaluation, one reference point after another; rows are truth, by native id."""
+    """Steps 2 to 9 of the original evaluation, point by point; rows are ground truth, by native id."""
     pose = first_pose().astype(np.float32)
     truth_points = scene.points @ pose[:3, :3].T + pose[:3, 3]
     vocabulary = [one for one in names if one in scene.labels and names[one] not in excluded]
@@ -118,7 +118,7 @@ def brute_confusion(scene: CloudScene, names: dict[int, str], excluded: set[str]
 
 
 def brute_metrics(confusion: np.ndarray) -> dict[str, float]:
-    """The row `all`: classes with a reference point, rows and columns cut together."""
+    """The row `all`: classes with a reference point, with rows and columns reduced together."""
     keep = np.flatnonzero(confusion.sum(axis=1))
     cut = confusion[np.ix_(keep, keep)].astype(float)
     hits, rows, columns = np.diag(cut), cut.sum(axis=1), cut.sum(axis=0)
@@ -131,7 +131,7 @@ def brute_metrics(confusion: np.ndarray) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("n_exclude", [1, 4, 6])
-def test_scores_from_files_are_those_of_the_original_steps_done_by_brute_force(tmp_path: Path, n_exclude: int) -> None:
+def test_scores_match_a_brute_force_version_of_the_original_steps(tmp_path: Path, n_exclude: int) -> None:
     rules = load_protocol(f"replica-conceptgraphs-ex{n_exclude}")
     excluded = set(["other", "floor", "wall", "ceiling", "door", "window"][:n_exclude])
     names = {entry.id: entry.name for entry in rules.classes}

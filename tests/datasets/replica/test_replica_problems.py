@@ -1,4 +1,4 @@
-"""The boxes of Replica's objects, and everything that is wrong with a scene, line by line."""
+"""The boxes of Replica's objects, and every fault of a scene, one line each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_boxes(root: Path, boxes: dict[int, Any], *, mesh: bool = True) -> Path
     return habitat
 
 
-def test_a_box_is_turned_and_then_shifted_without_the_mesh(tmp_path: Path) -> None:
+def test_box_is_rotated_then_translated_without_the_mesh(tmp_path: Path) -> None:
     write_render(tmp_path)
     half = 0.5**0.5  # a quarter turn about z: x becomes y
     write_boxes(tmp_path, {5: box((1, 2, 3), (4, 2, 1), (0, 0, half, half), (10, 20, 30))}, mesh=False)
@@ -42,13 +42,13 @@ def test_a_box_is_turned_and_then_shifted_without_the_mesh(tmp_path: Path) -> No
     assert replica.status("room0").startswith("3 frames, 1 boxes of objects, no mesh (")
 
 
-# --- what is wrong with a scene
+# --- faults of a scene
 
 
 FITTING = {0: box((0.5, 1, 0), (1, 2, 0)), 5: box((1.5, 1, 0), (1, 2, 0))}
 
 
-def test_face_centres_within_5_cm_of_a_box_are_inside_and_others_are_named(tmp_path: Path) -> None:
+def test_face_centres_over_5_cm_outside_a_box_are_named(tmp_path: Path) -> None:
     write_render(tmp_path)
     # face centres of object 0 are at y = 0.5 and 1.5; the box ends at 1.46 and at 1.44
     write_boxes(tmp_path, FITTING | {0: box((0.5, 0.96, 0), (1, 1, 0))})
@@ -57,11 +57,11 @@ def test_face_centres_within_5_cm_of_a_box_are_inside_and_others_are_named(tmp_p
     info.write_text(info.read_text().replace("0.96", "0.44"))
     assert list(Replica(tmp_path).problems("room0")) == [
         "replica/room0: habitat/info_semantic.json: object 0 has faces 0.51 m beyond its box and the slack of 0.05 m; "
-        "the boxes are of another mesh"
+        "the boxes belong to another mesh"
     ]
 
 
-def test_each_problem_of_a_scene_is_a_line_and_none_hides_another(tmp_path: Path) -> None:
+def test_each_problem_of_a_scene_is_one_line(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_boxes(tmp_path, FITTING)
     path = tmp_path / "Replica/room0/traj.txt"

@@ -1,4 +1,4 @@
-"""Replica's ground truth as released label files."""
+"""Replica's ground truth from released label files."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def write_labels(root: Path, name: str, values: list[int]) -> Path:
     return path
 
 
-def test_instances_of_the_file_stand_on_the_vertices_of_the_renders_mesh(tmp_path: Path) -> None:
+def test_instances_of_the_file_apply_to_the_render_mesh(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7, at=100)
     rep.write_original(tmp_path, rep.QUADS, [0, 0, 5, 5], rep.TWO_OBJECTS)
     write_labels(tmp_path, "Replica/ground_truth/room0.txt", [20066, 80066, 30, 256003, 20000, 0, 20066])
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
     assert truth.semantic.tolist() == [rep.CHAIR, rep.TABLE, 0, 0, rep.CHAIR, 0, rep.CHAIR]
-    assert truth.instance.tolist() == [2, 3, 0, 0, 1, 0, 2]  # in the order of the values
+    assert truth.instance.tolist() == [2, 3, 0, 0, 1, 0, 2]  # in ascending order of the values
     assert truth.points[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106]
     assert truth.source == "ground_truth/room0.txt, class id * 1000 + instance of each vertex of room0_mesh.ply"
 
 
-def test_labels_of_the_original_mesh_are_recognised_by_their_number(tmp_path: Path) -> None:
+def test_labels_of_the_original_mesh_are_recognized_by_their_count(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7)
     rep.write_original(tmp_path, rep.QUADS, [0, 0, 5, 5], rep.TWO_OBJECTS)
@@ -50,7 +50,7 @@ def test_labels_of_the_original_mesh_are_recognised_by_their_number(tmp_path: Pa
     assert truth.source.endswith("vertex of habitat/mesh_semantic.ply")
 
 
-def test_classes_of_the_file_are_replicas_own_ids_and_undefined_ones_are_void(tmp_path: Path) -> None:
+def test_class_file_uses_replica_ids_and_undefined_ones_are_void(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 6)
     write_labels(tmp_path, "Replica/semantic_gt/room0.txt", [20, -1, 93, -2, 256, 3])
@@ -60,7 +60,7 @@ def test_classes_of_the_file_are_replicas_own_ids_and_undefined_ones_are_void(tm
     assert truth.source == "semantic_gt/room0.txt, the class of each vertex of room0_mesh.ply"
 
 
-def test_the_51_classes_are_those_of_the_conceptgraphs_list_without_other() -> None:
+def test_51_classes_are_the_conceptgraphs_list_without_other() -> None:
     listed = {entry.id for entry in load_protocol("replica-conceptgraphs-ex6").classes}
     assert set(OVO_CLASSES) == listed - {0}
     assert len(OVO_CLASSES) == 51
@@ -69,7 +69,7 @@ def test_the_51_classes_are_those_of_the_conceptgraphs_list_without_other() -> N
 INSTANCES, CLASSES = "Replica/ground_truth/room0.txt", "Replica/semantic_gt/room0.txt"
 
 
-def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path) -> None:
+def test_released_instances_as_prediction_score_exactly_one(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 360)
     write_labels(tmp_path, INSTANCES, [20001] * 120 + [80001] * 120 + [30] * 120)
@@ -81,7 +81,7 @@ def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path
     assert [metrics[name] for name in ("AP", "AP50", "AP25")] == [1.0, 1.0, 1.0]
 
 
-def test_files_and_status_cover_every_released_truth(tmp_path: Path) -> None:
+def test_files_and_status_cover_all_released_ground_truth(tmp_path: Path) -> None:
     rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 2)
     rep.write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))

@@ -1,4 +1,4 @@
-"""The adapter of described folders: what rgbd.toml says is what comes out."""
+"""The dataset of described folders: frames match what rgbd.toml describes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from su3d_bench.datasets.rgbd.files import direction_in
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 
-def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+def test_frames_match_the_files(tmp_path: Path) -> None:
     write_scene(tmp_path)
     rgbd = Rgbd(tmp_path)
     assert rgbd.scenes() == ("desk",) and rgbd.info("desk", 2).n_frames == 2
@@ -37,7 +37,7 @@ def write_depth(folder: Path, index: int, values: np.ndarray) -> None:
     cv2.imwrite(str(folder / f"data/depth/frame-{index}.png"), values.astype(np.uint16))
 
 
-def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_once(
+def test_isolated_largest_value_is_no_depth_and_is_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = write_scene(tmp_path)
@@ -55,11 +55,11 @@ def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_on
     assert (again[near > 2000] == 0).all() and again.max() < 2.01
     (said,) = (record.getMessage() for record in caplog.records)
     assert said == (
-        "rgbd/desk: depth 65535 (65.54 m) counts as no depth where it stands apart from all other depths of its image"
+        "rgbd/desk: depth 65535 (65.54 m) counts as no depth if it is far from all other depths of its image"
     )
 
 
-def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
+def test_unscored_run_needs_no_ground_truth_and_qualifies_its_labels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_scene(tmp_path)
@@ -88,7 +88,7 @@ def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
     ],
     ids=lambda changes: next(reversed(changes)),
 )
-def test_every_way_to_name_the_same_files_gives_the_same_frames(tmp_path: Path, changes: dict[str, Any]) -> None:
+def test_all_ways_to_name_the_same_files_give_the_same_frames(tmp_path: Path, changes: dict[str, Any]) -> None:
     folder = write_scene(tmp_path / "plain")
     expected = open_scene(tmp_path / "plain")
     folder = write_scene(tmp_path, **changes)
@@ -108,7 +108,7 @@ def test_every_way_to_name_the_same_files_gives_the_same_frames(tmp_path: Path, 
         np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
 
 
-def test_rotated_bits_are_turned_back_and_invalid_values_have_no_depth(tmp_path: Path) -> None:
+def test_rotated_bits_are_restored_and_invalid_values_have_no_depth(tmp_path: Path) -> None:
     folder = write_scene(tmp_path, depth_rotated_bits=3, depth_unit_m=1e-4, depth_invalid=[1, 8191])
     stored = np.arange(WIDTH * HEIGHT, dtype=np.uint32).reshape(HEIGHT, WIDTH) * 680
     stored[0, 0] = 8 * 8191
@@ -131,7 +131,7 @@ def test_direction_and_axes_are_undone(tmp_path: Path, direction: str, axes: str
         np.testing.assert_allclose(frame.camera_to_world, pose(index), atol=1e-12)
 
 
-def test_frames_that_lack_a_part_are_said_once_and_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_incomplete_frames_are_reported_once_and_excluded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = write_scene(tmp_path, n_frames=5)
     (folder / "data/colour/frame-1.png").unlink()
     (folder / "data/frame-1.pose.txt").unlink()
@@ -142,13 +142,13 @@ def test_frames_that_lack_a_part_are_said_once_and_left_out(tmp_path: Path, capl
         assert [frame.index for frame in rgbd.frames("desk", 1)] == [0, 2]
         assert rgbd.info("desk", 1).n_frames == 2
     assert [record.getMessage() for record in caplog.records] == [
-        "rgbd/desk: 3 frames lack an image or a usable pose (the first: frame 1, no colour and no pose); left out, "
+        "rgbd/desk: 3 frames lack an image or a usable pose (the first: frame 1, no colour and no pose); excluded, "
         "2 frames are used"
     ]
     assert list(rgbd.problems("desk")) == [record.getMessage() for record in caplog.records]
 
 
-def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -> None:
+def test_trajectory_counts_or_skips_missing_images(tmp_path: Path) -> None:
     folder = write_scene(tmp_path, n_frames=4, pose=None, trajectory="trajectory.log")
     for name in ("colour", "depth"):
         (folder / f"data/{name}/frame-1.png").unlink()
@@ -156,7 +156,7 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
     (folder / "data/trajectory.log").write_text(log_of(range(3)))
     assert [(frame.index, frame.camera_to_world[0, 3]) for frame in open_scene(tmp_path)] == [(0, 0), (2, 1), (3, 2)]
     (folder / "data/trajectory.log").write_text(log_of(range(5)))
-    with pytest.raises(DataError, match=r"trajectory\.log has 5 poses; expected 3, one an image, or 4, one a number"):
+    with pytest.raises(DataError, match=r"\.log has 5 poses; expected 3, one per image, or 4, one per number"):
         open_scene(tmp_path)
 
 
@@ -169,7 +169,7 @@ TRUE_AND_DESCRIBED = [
 
 
 @pytest.mark.parametrize(("true", "described", "message"), TRUE_AND_DESCRIBED)
-def test_a_description_that_the_depth_contradicts_is_refused_and_corrected(
+def test_description_contradicted_by_depth_is_rejected_and_corrected(
     tmp_path: Path, true: tuple[str, str], described: tuple[str, str], message: str | None
 ) -> None:
     folder = write_room(tmp_path, *true)
@@ -190,7 +190,7 @@ def contradiction(root: Path) -> str:
     return verdict.line
 
 
-def test_a_wrong_unit_of_depth_is_refused_and_corrected(tmp_path: Path) -> None:
+def test_wrong_depth_unit_is_rejected_and_corrected(tmp_path: Path) -> None:
     folder = write_room(tmp_path, "camera_to_world", "opencv")
     describe(folder, {**NUMBERED, "intrinsics": None, "intrinsics_file": "intrinsics.txt", "depth_unit_m": 1e-4})
     assert "% with depth_unit_m = 0.001; set that in rgbd.toml, or check_convention = false" in contradiction(tmp_path)
@@ -202,7 +202,7 @@ def test_a_wrong_unit_of_depth_is_refused_and_corrected(tmp_path: Path) -> None:
 
 
 def write_room(root: Path, direction: str, axes: str) -> Path:
-    """Eight frames of a room as files, poses stored in the given way."""
+    """Eight frames of a room as files, with poses stored in the given convention."""
     folder = write_scene(root)
     frames = Rooms(root, RoomOptions(width=64, height=48, n_frames=400)).frames("living0", 5)
     for index in range(8):
@@ -220,7 +220,7 @@ def write_room(root: Path, direction: str, axes: str) -> Path:
     ("header", "said"),
     [("World2CamPose", "world_to_camera"), ("# camera-to-world", "camera_to_world"), ("pose", None)],
 )
-def test_a_header_before_a_pose_is_no_number_and_one_that_says_otherwise_is_named(
+def test_pose_header_is_skipped_and_a_contradicting_one_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str, said: str | None
 ) -> None:
     folder = write_scene(tmp_path)
@@ -232,8 +232,8 @@ def test_a_header_before_a_pose_is_no_number_and_one_that_says_otherwise_is_name
     for frame, before in zip(open_scene(tmp_path), plain, strict=True):
         np.testing.assert_array_equal(frame.camera_to_world, before.camera_to_world)
     warning = (
-        "rgbd/desk: rgbd.toml: the poses are read as camera_to_world, and 3 of their files say otherwise (the first: "
-        f"frame-0.pose.txt begins with {header!r}); what they are is told by the depth alone"
+        "rgbd/desk: rgbd.toml: the poses are read as camera_to_world, but 3 of their files have another header "
+        f"(the first: frame-0.pose.txt begins with {header!r}); only the depth images can decide"
     )
     assert (warning in caplog.text) == (said == "world_to_camera")
     assert direction_in(header) == said

@@ -35,7 +35,7 @@ def _same(first: RoomScan, second: RoomScan) -> bool:
     )
 
 
-def test_the_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> None:
+def test_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> None:
     again = Rooms(tmp_path, SMALL)
     assert again.truth(SCENE) == rooms.truth(SCENE)
     assert again.trajectory(SCENE).tobytes() == rooms.trajectory(SCENE).tobytes()
@@ -47,12 +47,12 @@ def test_the_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["kitchn0", "living", "living00"])
-def test_a_name_that_is_no_scene_is_refused(rooms: Rooms, name: str) -> None:
+def test_invalid_scene_name_is_rejected(rooms: Rooms, name: str) -> None:
     with pytest.raises(DataError, match="no scene"):
         rooms.frames(name, 40)
 
 
-def test_depth_lands_on_the_scan(rooms: Rooms) -> None:
+def test_depth_matches_the_scan(rooms: Rooms) -> None:
     tree = cKDTree(rooms.scan(SCENE).vertices)
     for frame in (rooms.frames(SCENE, 1)[k] for k in (0, 17, 60)):
         points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, frame.depth_m > 0)
@@ -61,7 +61,7 @@ def test_depth_lands_on_the_scan(rooms: Rooms) -> None:
         assert np.percentile(distance, 98) < 0.02 + 0.71 * SMALL.mesh_spacing_m
 
 
-def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
+def test_instance_images_match_the_instance_mesh(rooms: Rooms) -> None:
     import open3d as o3d
 
     mesh, image = rooms.instance_mesh(SCENE), rooms.render(SCENE, 25)
@@ -69,7 +69,7 @@ def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
     scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
     world_to_camera = np.linalg.inv(rooms.trajectory(SCENE)[25])
     rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-        # Open3D shoots through pixel centres at +0.5
+        # Open3D casts rays through pixel centres at +0.5
         rooms.intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),
         world_to_camera,
         SMALL.width,
@@ -82,14 +82,14 @@ def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
 
 
 @pytest.mark.proof
-def test_every_object_is_seen_and_counts_on_the_default_scan_density(tmp_path: Path) -> None:
+def test_every_object_is_visible_and_counts_at_default_scan_density(tmp_path: Path) -> None:
     dense = Rooms(tmp_path, Rooms.Options(n_frames=400))
     seen = np.bincount(dense.scan(SCENE).object_of_vertex(), minlength=len(dense.objects(SCENE)) + 1)[1:]
     assert seen.min() > 0
     assert np.mean(seen >= 100) >= 0.95
 
 
-def test_the_scan_leaves_out_what_the_walk_cannot_see(rooms: Rooms) -> None:
+def test_scan_excludes_what_the_trajectory_cannot_see(rooms: Rooms) -> None:
     scan, mesh = rooms.scan(SCENE), rooms.instance_mesh(SCENE)
     cabinet = next(one for one in rooms.objects(SCENE) if one.class_name == "cabinet")
     underside = mesh.vertices[mesh.triangles[mesh.instance_of_triangle == cabinet.id]].reshape(-1, 3)[:, 2].min()
@@ -114,7 +114,7 @@ def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
     assert (wound > 0).mean() > 0.99
 
 
-def test_a_damaged_cache_file_is_made_anew(rooms: Rooms) -> None:
+def test_damaged_cache_file_is_recomputed(rooms: Rooms) -> None:
     good = rooms.scan(SCENE)
     (path,) = rooms.root.glob(f"rooms/*/{SCENE}.npz")
     content = path.read_bytes()
@@ -125,22 +125,22 @@ def test_a_damaged_cache_file_is_made_anew(rooms: Rooms) -> None:
     assert not list(path.parent.glob(".*"))
 
 
-def test_a_mesh_and_a_walk_that_were_kept_are_those_made_anew(tmp_path: Path) -> None:
+def test_cached_mesh_and_trajectory_equal_recomputed_ones(tmp_path: Path) -> None:
     first, second = Rooms(tmp_path, SMALL), Rooms(tmp_path, SMALL)
     nowhere = Rooms(tmp_path / "no-folder", SMALL)
     for rooms in (first, second, nowhere):
         rooms.frame(SCENE, 0)
     made, read, again = (one._room(SCENE) for one in (first, second, nowhere))
-    assert "patches" not in read.__dict__, "the second room was furnished and baked although both files were there"
+    assert "patches" not in read.__dict__, "the second room was furnished and baked although both files existed"
     for other in (read, again):
         for field in fields(RoomMesh):
             one, two = getattr(made.mesh, field.name), getattr(other.mesh, field.name)
             assert one.dtype == two.dtype and one.tobytes() == two.tobytes(), field.name
         assert made.trajectory.tobytes() == other.trajectory.tobytes()
-    assert not (tmp_path / "no-folder").exists(), "a dataset that is only looked at makes no data root"
+    assert not (tmp_path / "no-folder").exists(), "reading a dataset creates no data root"
 
 
-def test_image_size_and_noise_do_not_move_the_scan(rooms: Rooms) -> None:
+def test_image_size_and_noise_do_not_change_the_scan(rooms: Rooms) -> None:
     noisy = Rooms(rooms.root, SMALL.model_copy(update={"width": 64, "height": 48, "noise": 2}))
     rooms.scan(SCENE)
     before = sorted(rooms.root.rglob("*.npz"))
@@ -148,7 +148,7 @@ def test_image_size_and_noise_do_not_move_the_scan(rooms: Rooms) -> None:
     assert sorted(rooms.root.rglob("*.npz")) == before
 
 
-def test_noise_quantises_depth_and_makes_holes_at_edges(rooms: Rooms) -> None:
+def test_noise_quantizes_depth_and_makes_holes_at_edges(rooms: Rooms) -> None:
     noisy = Rooms(rooms.root, SMALL.model_copy(update={"noise": 2}))
     clean, dirty = rooms.frame(SCENE, 10), noisy.frame(SCENE, 10)
     assert np.array_equal(dirty.depth_m, noisy.frame(SCENE, 10).depth_m)
@@ -165,7 +165,7 @@ def test_noise_quantises_depth_and_makes_holes_at_edges(rooms: Rooms) -> None:
     assert holes[same_object].mean() < 0.5 * holes[~same_object].mean()
 
 
-def test_the_walk_is_smooth_and_stays_clear(tmp_path: Path) -> None:
+def test_trajectory_is_smooth_and_keeps_clear(tmp_path: Path) -> None:
     full = Rooms(tmp_path, Rooms.Options(width=64, height=48))
     poses = full.trajectory("living3")
     rotations = poses[:, :3, :3]
@@ -180,7 +180,7 @@ def test_the_walk_is_smooth_and_stays_clear(tmp_path: Path) -> None:
     assert nearest > 0.15
 
 
-def test_a_room_is_scored_by_an_aspect_and_what_has_no_attribute_is_void(rooms: Rooms) -> None:
+def test_room_is_scored_by_an_aspect_and_objects_without_attribute_are_void(rooms: Rooms) -> None:
     truth = rooms.ground_truth(SCENE, "openscan-type")
     of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type")
     assert np.array_equal(truth.semantic, of_object[truth.instance])

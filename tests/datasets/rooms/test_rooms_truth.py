@@ -1,4 +1,4 @@
-"""What the rooms say of themselves: classes, sizes, relations that hold in space, what people call things."""
+"""Ground truth of the rooms: classes, sizes, spatial relations, everyday names."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def truths(tmp_path_factory: pytest.TempPathFactory) -> list[RoomTruth]:
     return [rooms.truth(scene) for scene in SCENES]
 
 
-def test_class_ids_are_those_of_replica() -> None:
+def test_class_ids_match_replica() -> None:
     # info_semantic.json of the Replica release
     known = {"backpack": 1, "basket": 3, "bed": 7, "chair": 20, "ceiling": 31, "sofa": 76, "wall": 93, "rug": 98}
     assert {name: CLASS_ID[name] for name in known} == known
@@ -32,7 +32,7 @@ def test_class_ids_are_those_of_replica() -> None:
     assert all(1 <= one.id <= 101 for one in CLASSES)
 
 
-def test_every_class_but_the_bare_room_has_a_builder() -> None:
+def test_every_class_except_the_bare_room_has_a_builder() -> None:
     assert set(CLASS_ID) - set(BUILDERS) == {"wall", "floor", "ceiling"}
     assert set(BUILDERS) <= set(CLASS_ID)
     for one in CLASSES:
@@ -40,7 +40,7 @@ def test_every_class_but_the_bare_room_has_a_builder() -> None:
         assert set(one.colours) <= set(COLOURS)
 
 
-def test_the_kinds_together_show_most_classes(truths: list[RoomTruth]) -> None:
+def test_all_kinds_together_show_most_classes(truths: list[RoomTruth]) -> None:
     seen = Counter(one.class_name for truth in truths for one in truth.objects)
     assert len(seen) >= 55
     assert {truth.kind for truth in truths} == set(KINDS)
@@ -51,7 +51,7 @@ def test_the_kinds_together_show_most_classes(truths: list[RoomTruth]) -> None:
     assert np.mean(differ) > 0.8
 
 
-def test_usual_volumes_are_the_medians_they_claim() -> None:
+def test_typical_volumes_are_the_stated_medians() -> None:
     class_name, model = "lamp", "table_lamp"
     sizes = [make(class_name, np.random.default_rng([7, seed]), model).size for seed in range(200)]
     assert 1000 * np.median([np.prod(size) for size in sizes]) == pytest.approx(USUAL_VOLUME_L[model], rel=0.01)
@@ -60,7 +60,7 @@ def test_usual_volumes_are_the_medians_they_claim() -> None:
 
 
 @pytest.mark.parametrize("class_name", sorted(BUILDERS))
-def test_shapes_are_sound(class_name: str) -> None:
+def test_shapes_are_valid(class_name: str) -> None:
     for builder in BUILDERS[class_name]:
         item = make(class_name, np.random.default_rng(3), builder.__name__)
         for part in item.parts:
@@ -109,7 +109,7 @@ def test_standing_furniture_does_not_collide(truths: list[RoomTruth]) -> None:
                 assert not (overlap > 1e-6).all(), (truth.scene, a.class_name, b.class_name)
 
 
-def test_everything_stays_inside_the_room(truths: list[RoomTruth]) -> None:
+def test_everything_is_inside_the_room(truths: list[RoomTruth]) -> None:
     for truth in truths:
         floor, ceiling = truth.by_id(1), truth.by_id(2)
         for one in truth.objects:
@@ -118,7 +118,7 @@ def test_everything_stays_inside_the_room(truths: list[RoomTruth]) -> None:
             assert one.box_min[2] >= -1e-9 and one.box_max[2] <= ceiling.box_max[2] + 1e-9
 
 
-def test_a_material_is_told_where_a_picture_shows_it(truths: list[RoomTruth]) -> None:
+def test_material_is_stated_if_a_picture_shows_it(truths: list[RoomTruth]) -> None:
     shown = {(known.class_name, known.material) for t in truths for known in t.objects if known.shows_material}
     assert {("table", "wooden"), ("basket", "wicker")} <= shown
     assert {material for _, material in shown} == {"wooden", "wicker"}

@@ -1,4 +1,4 @@
-"""The ScanNet adapter on small scans as they circulate: places, splits, frames, options, and a run that is scored."""
+"""The ScanNet dataset on small scans in common layouts: places, splits, frames, options, and a scored run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 
 @pytest.mark.parametrize("place", [".", "scannet/scans", "ScanNet/scans_test", "scans/val"])
-def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
+def test_scans_are_found_in_every_common_layout(tmp_path: Path, place: str) -> None:
     write_scan(tmp_path, place=place)
     found = ScanNet(tmp_path)
     assert list(found.scenes()) == [SCAN]
@@ -35,7 +35,7 @@ def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: 
     assert "scannet200-vertices" in found.ground_truth(SCAN, "scannet200-vertices").variant
 
 
-def test_recording_and_truth_may_lie_in_two_places(tmp_path: Path) -> None:
+def test_recording_and_ground_truth_may_be_in_two_places(tmp_path: Path) -> None:
     folder = write_scan(tmp_path)
     (tmp_path / "scannet" / SCAN).mkdir(parents=True)
     (folder / f"{SCAN}.sens").rename(tmp_path / "scannet" / SCAN / f"{SCAN}.sens")
@@ -45,7 +45,7 @@ def test_recording_and_truth_may_lie_in_two_places(tmp_path: Path) -> None:
     assert scannet.status(SCAN) == "5 frames, ground truth"
 
 
-def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) -> None:
+def test_frames_match_the_recording_on_the_depth_grid(tmp_path: Path) -> None:
     write_scan(tmp_path)
     frames = ScanNet(tmp_path).frames(SCAN, 2)
     assert [frames[i].index for i in range(len(frames))] == [0, 2, 4]
@@ -62,7 +62,7 @@ def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) 
         frames[3]
 
 
-def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
+def test_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
     write_scan(tmp_path)
     frame = made.dataset(tmp_path, grid="colour").frames(SCAN, 1)[0]
     np.testing.assert_array_equal(frame.rgb, floor_image(made.COLOUR_SIZE, 1.0))
@@ -70,7 +70,7 @@ def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
     assert frame.intrinsics.tolist() == [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]]
 
 
-def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
+def test_axis_align_transforms_poses_and_mesh_alike(tmp_path: Path) -> None:
     folder = write_scan(tmp_path)
     plain, turned = made.dataset(tmp_path), made.dataset(tmp_path, axis_align=True)
     motion = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
@@ -82,11 +82,11 @@ def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
     assert plain.digest(SCAN) != turned.digest(SCAN)
     (folder / f"{SCAN}.txt").unlink()
     assert len(made.dataset(tmp_path).frames(SCAN, 1)) == 5
-    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; what lies along the walls needs it"):
+    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; it is needed for wall alignment"):
         made.dataset(tmp_path, axis_align=True).frames(SCAN, 1)
 
 
-def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) -> None:
+def test_source_option_selects_recording_or_export(tmp_path: Path) -> None:
     write_python_export(write_scan(tmp_path))
     depths = {
         kind: made.dataset(tmp_path, source=kind).frames(SCAN, 1)[0].depth_m.max()
@@ -101,7 +101,7 @@ def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) ->
 
 
 def poses_alone(poses: Sequence[np.ndarray], step: int = 1) -> Any:
-    """A recording of poses alone."""
+    """A recording of poses only."""
     return SimpleNamespace(where=WHERE, poses=lambda: np.array(poses), numbers=np.arange(len(poses)) * step)
 
 
@@ -119,7 +119,7 @@ def test_which_poses_are_lost() -> None:
     assert walk.is_usable.tolist() == [True, False, False, False, False, True]
 
 
-def test_the_stride_counts_at_full_rate_whatever_an_export_left_out() -> None:
+def test_stride_counts_at_full_rate_even_if_an_export_skips_frames() -> None:
     every_second = read_walk(poses_alone([turned(0.01 * i) for i in range(40)], step=2))
     assert every_second.numbers[every_second.every(10)].tolist() == [0, 10, 20, 30, 40, 50, 60, 70]
     every_fourth = read_walk(poses_alone([turned(0.01 * i) for i in range(10)], step=4))
@@ -127,14 +127,14 @@ def test_the_stride_counts_at_full_rate_whatever_an_export_left_out() -> None:
     assert every_fourth.every(1).tolist() == list(range(10))
 
 
-def test_the_official_splits_are_whole_and_apart() -> None:
+def test_official_splits_are_complete_and_disjoint() -> None:
     lists = {split: split_scenes(split) for split in ("train", "val", "test")}
     assert [len(scans) for scans in lists.values()] == [1201, 312, 100]
     assert len({scan for scans in lists.values() for scan in scans}) == 1613
     assert set(PAPER_SCENES) <= {*lists["train"], *lists["val"]}
 
 
-def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
+def test_scan_without_ground_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
     for scan in (SCAN, "scene0707_00"):
         made.write_recording(tmp_path / scan / f"{scan}.sens")
     scannet = ScanNet(tmp_path)
@@ -143,7 +143,7 @@ def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
         == f"5 frames, no ground truth, {SCAN}_vh_clean_2.ply is missing; expected in {tmp_path / SCAN}"
     )
     with pytest.raises(
-        GroundTruthMissing, match=r"scene0707_00_vh_clean_2\.ply is missing; the benchmark keeps that of"
+        GroundTruthMissing, match=r"scene0707_00_vh_clean_2\.ply is missing; it is not published for test scans"
     ):
         scannet.instance_mesh("scene0707_00")
     made.write_floor_truth(tmp_path / SCAN)
@@ -157,10 +157,10 @@ def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])
-def test_a_run_on_a_scan_is_scored_under_the_benchmarks_protocols(
+def test_run_on_a_scan_is_scored_under_the_benchmark_protocols(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: str
 ) -> None:
-    """A chair and a couch of 2 x 2 m, seen from above: with true masks the map holds exactly these two."""
+    """A chair and a couch of 2 x 2 m, seen from above: with true masks the map has exactly these two."""
     folder = write_scan(tmp_path / "data")
     made.write_recording(folder / f"{SCAN}.sens", 9, (4,), made.header((256, 192), (128, 96)))
     monkeypatch.chdir(tmp_path)
@@ -180,10 +180,10 @@ def test_a_run_on_a_scan_is_scored_under_the_benchmarks_protocols(
         assert rows["scannet-instance"]["result"]["metrics"]["AP25"] == 1
         assert rows["scannet200-instance"]["result"]["metrics"]["AP25"] == 1
     log = Path(f"out/scenes/scannet.{SCAN}/opensu3d/log.txt").read_text()
-    assert f"{WHERE}: frames without a pose, left out: 1 of 9 (the first: 4)" in log
+    assert f"{WHERE}: frames without a pose, excluded: 1 of 9 (the first: 4)" in log
 
 
-def test_every_fault_of_a_scan_is_named_at_once(tmp_path: Path) -> None:
+def test_all_faults_of_a_scan_are_named_at_once(tmp_path: Path) -> None:
     folder = write_scan(tmp_path, lost=(1,))
     assert list(ScanNet(tmp_path).problems(SCAN)) == []
     content = (folder / f"{SCAN}.sens").read_bytes()

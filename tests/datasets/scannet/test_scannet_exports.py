@@ -1,4 +1,4 @@
-"""Exports of ScanNet recordings: each layout gives what the recording holds, and each gap and fault is named."""
+"""Exports of ScanNet recordings: each layout matches the recording, and each gap and fault is named."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from su3d_bench.formats.images import png_bytes
 
 
 def assert_is_the_toy(source: RgbdSource, digits: float) -> None:
-    """The source gives what the toy recording gives; poses and cameras to ``digits``, images exactly."""
+    """The source matches the toy recording; poses and cameras to ``digits``, images exactly."""
     toy = SensFile(TOY, WHERE)
     assert (len(source), source.where) == (N_FRAMES, WHERE)
     np.testing.assert_allclose(source.poses(), toy.poses(), rtol=digits, atol=digits)
@@ -32,11 +32,11 @@ def assert_is_the_toy(source: RgbdSource, digits: float) -> None:
         np.testing.assert_allclose(getattr(source.camera, name), getattr(toy.camera, name), rtol=digits, atol=digits)
 
 
-# ---------------------------------------------------------------- what lies there is read
+# ---------------------------------------------------------------- available exports are read
 
 
 @pytest.mark.parametrize("cameras", ["intrinsic", "intrinsics"])
-def test_the_export_of_the_python_reader_is_the_recording(tmp_path: Path, cameras: str) -> None:
+def test_python_reader_export_matches_the_recording(tmp_path: Path, cameras: str) -> None:
     source = open_python_export(write_python_export(tmp_path, cameras=cameras), WHERE)
     assert_is_the_toy(source, 1e-6)  # six decimals
     files = [file.relative_to(tmp_path).as_posix() for file in source.files()]
@@ -44,13 +44,13 @@ def test_the_export_of_the_python_reader_is_the_recording(tmp_path: Path, camera
     assert source.timestamp_s(3) == pytest.approx(0.1)
 
 
-def test_the_export_of_the_cpp_reader_is_the_recording(tmp_path: Path) -> None:
+def test_cpp_reader_export_matches_the_recording(tmp_path: Path) -> None:
     source = open_cpp_export(write_cpp_export(tmp_path), WHERE)
     assert_is_the_toy(source, 1e-5)  # six significant digits
     assert sorted(file.name for file in source.files()) == RECORDED["files_cpp"]
 
 
-def test_the_cameras_of_the_cpp_export_are_those_in_its_text(tmp_path: Path) -> None:
+def test_cpp_export_cameras_come_from_its_text(tmp_path: Path) -> None:
     (tmp_path / "_info.txt").write_text(RECORDED["info_cpp"])
     camera, n_frames = read_info(tmp_path / "_info.txt", WHERE)
     assert (n_frames, camera.colour_size, camera.depth_size, camera.depth_shift) == (4, (64, 48), (32, 24), 1000.0)
@@ -59,14 +59,14 @@ def test_the_cameras_of_the_cpp_export_are_those_in_its_text(tmp_path: Path) -> 
     assert camera.depth_extrinsic[:, 3].tolist() == [0.0125, 0, 0, 1]
 
 
-def test_openmask3d_layouts_are_the_recording(tmp_path: Path) -> None:
+def test_openmask3d_layouts_match_the_recording(tmp_path: Path) -> None:
     whole = write_python_export(tmp_path / "all", images="data_compressed/", rest="data/")
     assert_is_the_toy(open_python_export(whole, WHERE), 1e-6)
     assert_is_the_toy(find_source(whole, SCAN, WHERE), 1e-6)
 
 
 def equal_sizes(folder: Path, size: tuple[int, int], matrix: np.ndarray) -> ExportedFrames:
-    """OpenMask3D's single scene: images of one size, and of the cameras intrinsic_color.txt alone."""
+    """OpenMask3D's single scene: images of one size, with intrinsic_color.txt as the only camera file."""
     write_python_export(folder)
     for i in range(N_FRAMES):
         rgb = np.full((size[1], size[0], 3), i, np.uint8)
@@ -79,7 +79,7 @@ def equal_sizes(folder: Path, size: tuple[int, int], matrix: np.ndarray) -> Expo
 
 
 @pytest.mark.parametrize("n", [3, 4])
-def test_colour_intrinsics_serve_both_images_where_they_have_one_size(tmp_path: Path, n: int) -> None:
+def test_colour_intrinsics_apply_to_both_images_of_one_size(tmp_path: Path, n: int) -> None:
     matrix = np.eye(4)[:n, :n]
     matrix[:2, :3] = [[60.0, 0.5, 31.5], [0, 61.0, 23.5]]
     source = equal_sizes(tmp_path, (64, 48), matrix)
@@ -89,7 +89,7 @@ def test_colour_intrinsics_serve_both_images_where_they_have_one_size(tmp_path: 
     assert (source.depth(3) == 4).all()
 
 
-def test_intrinsics_of_the_full_images_are_scaled_to_images_made_smaller(tmp_path: Path) -> None:
+def test_intrinsics_are_scaled_to_resized_images(tmp_path: Path) -> None:
     # A point at the corner of the full image stays at the corner of the small one.
     matrix = np.array([[1170.0, 0, 647.75, 0], [0, 1171.0, 483.75, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     camera = equal_sizes(tmp_path, (648, 242), matrix).camera
@@ -98,20 +98,20 @@ def test_intrinsics_of_the_full_images_are_scaled_to_images_made_smaller(tmp_pat
     np.testing.assert_array_equal(camera.depth_intrinsics, camera.colour_intrinsics)
 
 
-def test_intrinsics_that_fit_no_image_are_refused(tmp_path: Path) -> None:
+def test_intrinsics_that_fit_no_image_are_rejected(tmp_path: Path) -> None:
     matrix = np.array([[1000.0, 0, 2000, 0], [0, 1000.0, 24, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     with pytest.raises(DataError, match=r"intrinsic_color\.txt has its principal point at \(2000, 24\), outside"):
         equal_sizes(tmp_path, (64, 48), matrix)
 
 
-def test_frames_that_were_left_out_keep_the_numbers_of_the_others(tmp_path: Path) -> None:
+def test_skipped_frames_do_not_renumber_the_others(tmp_path: Path) -> None:
     source = open_python_export(write_python_export(tmp_path, frame_skip=20), WHERE)
     assert source.numbers.tolist() == [0, 20, 40, 60]
     assert source.timestamp_s(3) == pytest.approx(2.0)
     assert_is_the_toy(source, 1e-6)
 
 
-def test_names_are_sorted_as_numbers_and_may_be_padded(tmp_path: Path) -> None:
+def test_names_are_sorted_numerically_and_may_be_padded(tmp_path: Path) -> None:
     write_python_export(tmp_path)
     for i in range(N_FRAMES, 12):
         for name in ("color/{}.jpg", "depth/{}.png", "pose/{}.txt"):

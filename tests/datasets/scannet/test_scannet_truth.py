@@ -1,4 +1,4 @@
-"""ScanNet's truth on a hand-worked mesh: both label sets, both releases, each fault once, damaged files."""
+"""ScanNet's ground truth on a hand-worked mesh: both label sets, both releases, each fault once, damaged files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from su3d_bench.metrics.instance.average_precision import encode_ground_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 WHERE = f"scannet/{SCAN}"
-# 24 vertices in four rows of six. Segment 7 holds the first two columns, 12 the next two, 19 the last two;
-# 19 is in two objects, of which the later, the stool, has it; vertex 0 is of segment 3, which is in none.
+# 24 vertices in four rows of six. Segment 7 covers the first two columns, 12 the next two, 19 the last two;
+# 19 is in two objects, the later of which (the stool) gets it; vertex 0 is in segment 3, which is in none.
 SEGMENTS = [7, 7, 12, 12, 19, 19] * 4
 SEGMENTS[0] = 3
 GROUPS = [(0, "chair", [7]), (2, "piano", [12, 19]), (5, "stool", [19])]
@@ -38,7 +38,7 @@ def table(tmp_path: Path, text: str | None = None) -> annotation.LabelTable:
     return annotation.read_label_table(tmp_path / annotation.TABLE_NAME, WHERE)
 
 
-def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_the_segment(tmp_path: Path) -> None:
+def test_nyu40_uses_file_labels_and_the_last_object_with_the_segment(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
     truth = annotation.nyu40_truth(read(tmp_path), [])
     assert truth.semantic.tolist() == NYU40
@@ -49,7 +49,7 @@ def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_th
     assert encode_ground_truth(truth.semantic, truth.instance)[:6].tolist() == [0, 5001, 39003, 39003, 40006, 40006]
 
 
-def test_scannet200_truth_is_the_raw_id_of_the_category(tmp_path: Path) -> None:
+def test_scannet200_uses_the_raw_id_of_the_category(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
     truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
     assert truth.semantic[:6].tolist() == [0, 2, 90, 90, 38, 38]
@@ -57,7 +57,7 @@ def test_scannet200_truth_is_the_raw_id_of_the_category(tmp_path: Path) -> None:
     assert [truth.labels.name_of(one) for one in (2, 38, 90)] == ["chair", "stool", "piano"]
 
 
-def test_the_label_sets_name_every_class_of_the_protocols_as_these_do(tmp_path: Path) -> None:
+def test_label_sets_match_the_class_names_of_the_protocols(tmp_path: Path) -> None:
     sets = {
         "scannet-instance": annotation.nyu40_label_set(),
         "scannet200-instance": annotation.raw_label_set(table(tmp_path)),
@@ -69,13 +69,13 @@ def test_the_label_sets_name_every_class_of_the_protocols_as_these_do(tmp_path: 
     assert annotation.nyu40_label_set().ids == tuple(range(1, 41))
 
 
-def test_a_raw_id_outside_the_200_does_not_bear_the_name_of_one_of_them(tmp_path: Path) -> None:
+def test_raw_id_outside_the_200_does_not_reuse_their_names(tmp_path: Path) -> None:
     labels = annotation.raw_label_set(table(tmp_path, table_text([*TABLE_ROWS, ("book", 1300, 23, "books")])))
     assert labels.name_of(1300) == "book (1300)"
     assert labels.name_of(22) == "book"
 
 
-def test_mixed_line_ends_trailing_blanks_and_repeated_categories_of_the_table(tmp_path: Path) -> None:
+def test_table_with_mixed_line_ends_trailing_blanks_and_repeated_categories(tmp_path: Path) -> None:
     rows = [*TABLE_ROWS, ("object ", 40, 40, "otherprop"), ("object", 1234, 39, "otherfurniture")]
     text = "\ufeff" + table_text(rows).replace("\n", "\r\n", 3).replace("\n", "\r", 2) + "\r\n\t\n"
     (tmp_path / annotation.TABLE_NAME).write_bytes(text.encode())
@@ -84,7 +84,7 @@ def test_mixed_line_ends_trailing_blanks_and_repeated_categories_of_the_table(tm
     assert found.nyu40_of["couch"] == 6
 
 
-def test_a_category_without_row_is_void_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_category_without_row_is_void_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "Stool", [19])], NYU40)
     with caplog.at_level(logging.WARNING):
         truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
@@ -94,7 +94,7 @@ def test_a_category_without_row_is_void_and_counted(tmp_path: Path, caplog: pyte
     ]
 
 
-def test_ids_may_be_text_and_blanks_may_surround_a_category(tmp_path: Path) -> None:
+def test_ids_may_be_text_and_categories_padded(tmp_path: Path) -> None:
     groups = [(str(one), f" {category} ", [str(part) for part in parts]) for one, category, parts in GROUPS]
     write_truth(tmp_path, [str(one) for one in SEGMENTS], groups, NYU40)
     truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
@@ -106,8 +106,8 @@ RAW = [2 if one == 5 else 90 if one == 39 else 38 if one == 40 else 0 for one in
 
 
 @pytest.mark.parametrize("groups", [GROUPS, [(0, "chair", [7]), (2, "couch", [12]), (5, "stool", [19])]])
-def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path, groups: list) -> None:  # type: ignore[type-arg]
-    """The second scan has no id above 40: only its objects tell the releases apart."""
+def test_raw_ids_of_the_first_release_become_nyu40(tmp_path: Path, groups: list) -> None:  # type: ignore[type-arg]
+    """The second scan has no id above 40: only its objects identify the release."""
     raw = [6 if one == 90 else one for one in RAW] if groups is not GROUPS else RAW
     write_truth(tmp_path, SEGMENTS, groups, raw, prefix="")
     truth = annotation.nyu40_truth(read(tmp_path), [table(tmp_path)])
@@ -116,7 +116,7 @@ def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path
     assert "categories" in truth.source
 
 
-def test_a_stray_label_above_40_does_not_make_a_file_one_of_the_first_release(tmp_path: Path) -> None:
+def test_stray_label_above_40_does_not_indicate_the_first_release(tmp_path: Path) -> None:
     """As in scene0270_00 and scene0384_00 of the second release."""
     labels = [149 if k == 8 else one for k, one in enumerate(NYU40)]
     write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "stool with a name of its own", [19])], labels)
@@ -126,7 +126,7 @@ def test_a_stray_label_above_40_does_not_make_a_file_one_of_the_first_release(tm
 
 
 def first_table(tmp_path: Path) -> annotation.LabelTable:
-    """The table of the first release: no ids but the numbers of rows, and a class that is not there."""
+    """The first release's table: row numbers instead of ids, and a missing class."""
     categories = [("wall", "1"), ("stool", "40"), ("storage", ""), *[(f"thing {k}", "40") for k in range(4, 47)]]
     categories += [("piano", "39"), ("chair", "5")]
     rows = [f"{name}\t7\t21\t{nyu40}\t4\t{name}" for name, nyu40 in categories]
@@ -137,12 +137,12 @@ def first_table(tmp_path: Path) -> annotation.LabelTable:
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_labels_of_the_first_release_are_rows_of_its_own_table(tmp_path: Path, beside: bool) -> None:
+def test_first_release_labels_are_rows_of_its_own_table(tmp_path: Path, beside: bool) -> None:
     rows = [48 if one == 5 else 47 if one == 39 else 2 if one == 40 else 0 for one in NYU40]
     write_truth(tmp_path, SEGMENTS, GROUPS, rows, prefix="")
     first = first_table(tmp_path)
     assert (first.raw_id_of["storage"], first.nyu40_of.get("storage")) == (3, None)
-    other = table(tmp_path, table_text([("chair", 2, 6, "sofa")]))  # knows no piano, and the chair as a sofa
+    other = table(tmp_path, table_text([("chair", 2, 6, "sofa")]))  # lacks piano and maps chair to sofa
     truth = annotation.nyu40_truth(read(tmp_path), [other, first] if beside else [first])
     assert truth.semantic.tolist() == NYU40
     assert truth.source.endswith(f"categories in {annotation.FIRST_TABLE_NAME} and the objects of .aggregation.json")
@@ -151,7 +151,7 @@ def test_labels_of_the_first_release_are_rows_of_its_own_table(tmp_path: Path, b
         annotation.read_label_table(tmp_path / annotation.FIRST_TABLE_NAME, WHERE)
 
 
-def test_a_triangle_belongs_to_the_instance_of_most_of_its_vertices(tmp_path: Path) -> None:
+def test_triangle_belongs_to_the_majority_instance_of_its_vertices(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
     mesh = annotation.instance_mesh(read(tmp_path), [])
     # the first cell: vertices 0 (none), 1 and 6 (chair); the second: 1, 7 (chair) and 2, 8 (piano)
@@ -160,7 +160,7 @@ def test_a_triangle_belongs_to_the_instance_of_most_of_its_vertices(tmp_path: Pa
     assert mesh.class_of_instance == {1: 5, 3: 39, 6: 40}
 
 
-def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
+def test_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
     points, triangles = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
     write_truth(tmp_path, [1, 2, 3], [(0, "chair", [1]), (1, "couch", [2]), (2, "x", [3])], [5, 6, 0],
                 mesh=(points, triangles))  # fmt: skip

@@ -1,4 +1,4 @@
-"""``.sens`` recordings: what the original readers found in them, any frame at once, and damage of every kind."""
+"""``.sens`` recordings: results of the original readers, random access, and every kind of damage."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ N_HEADER = 4 + 8 + len("StructureSensor") + 256 + 8 + 16 + 4 + 8
 
 
 def colour_content(rgb: UInt8Array, compression: ColourCompression) -> bytes:
-    """A colour image (H, W, 3) RGB as a ``.sens`` file stores it."""
+    """A colour image (H, W, 3) RGB as stored in a ``.sens`` file."""
     if compression == "raw":
         return rgb.tobytes()
     return jpeg_bytes(rgb) if compression == "jpeg" else png_bytes(rgb)
 
 
 def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
-    """A depth image (H, W) as a ``.sens`` file stores it."""
+    """A depth image (H, W) as stored in a ``.sens`` file."""
     raw = values.astype("<u2").tobytes()
     return zlib.compress(raw) if compression == "zlib" else raw
 
@@ -62,7 +62,7 @@ def recorded() -> dict[str, object]:
 
 
 def opened(path: Path, content: bytes) -> SensFile:
-    path.unlink(missing_ok=True)  # some file systems wait for the disk where a file is overwritten
+    path.unlink(missing_ok=True)  # some file systems wait for the disk when a file is overwritten
     path.write_bytes(content)
     return SensFile(path, WHERE)
 
@@ -92,10 +92,10 @@ def stored_frame(file: SensFile, i: int) -> bytes:
     return SensFrame(np.array(pose), colour_time, depth_time, file.colour_bytes(i), file.depth_bytes(i)).stored
 
 
-# ---------------------------------------------------------------- what the original readers found
+# ---------------------------------------------------------------- results of the original readers
 
 
-def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[str, np.ndarray]) -> None:
+def test_toy_recording_is_read_like_the_original_readers(expected: dict[str, np.ndarray]) -> None:
     file = SensFile(TOY, WHERE)
     assert len(file) == 4
     for i in range(4):
@@ -108,7 +108,7 @@ def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[st
             np.testing.assert_array_equal(getattr(file.header, f"{name}_{ours}"), expected[f"{key}_{theirs}"])
 
 
-def test_the_toy_recording_has_its_time_stamps(recorded: dict[str, list[list[int]]]) -> None:
+def test_toy_recording_has_its_time_stamps(recorded: dict[str, list[list[int]]]) -> None:
     file = SensFile(TOY, WHERE)
     records = file.records()
     assert [[row["colour_timestamp"], row["depth_timestamp"]] for row in records] == recorded["timestamps"]
@@ -116,9 +116,7 @@ def test_the_toy_recording_has_its_time_stamps(recorded: dict[str, list[list[int
 
 
 @pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
-def test_a_recording_written_again_is_the_same_to_the_byte(
-    tmp_path: Path, path: Path, recorded: dict[str, object]
-) -> None:
+def test_rewritten_recording_is_identical_to_the_byte(tmp_path: Path, path: Path, recorded: dict[str, object]) -> None:
     file = SensFile(path, WHERE)
     end = path.read_bytes()[N_HEADER + sum(len(stored_frame(file, i)) for i in range(len(file))) :]
     write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i) for i in range(len(file))), end)
@@ -134,7 +132,7 @@ def test_a_recording_written_again_is_the_same_to_the_byte(
 
 @pytest.mark.parametrize("colour", ["raw", "png", "jpeg"])
 @pytest.mark.parametrize("depth", ["raw", "zlib"])
-def test_every_compression_gives_the_images_back(tmp_path: Path, colour: str, depth: str) -> None:
+def test_every_compression_round_trips(tmp_path: Path, colour: str, depth: str) -> None:
     made = header(colour_compression=colour, depth_compression=depth)
     rng = np.random.default_rng(1)
     rgb = rng.integers(0, 256, (6, 8, 3), np.uint8)
@@ -170,20 +168,20 @@ def behind_name(content: bytes, offset: int, new: bytes) -> bytes:
     return content[:at] + new + content[at + len(new) :]
 
 
-def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> None:
+def test_each_header_fault_is_one_line_with_its_value(tmp_path: Path) -> None:
     toy = TOY.read_bytes()
     faults = {
         b"": "has 0 bytes, too few for a .sens file",
-        struct.pack("<I", 3) + toy[4:]: "not a .sens file of version 4, its version would be 3",
+        struct.pack("<I", 3) + toy[4:]: "not a .sens file of version 4 (version field: 3)",
         toy[:4] + struct.pack("<Q", 10**15) + toy[12:]: "byte 4: the header with a sensor name of 1000000000000000",
         toy[: N_HEADER - 1]: "byte 4: the header with a sensor name of 15 bytes does not fit into the file",
         behind_name(toy, 256, struct.pack("<i", -1)): "colour compression -1; known: 0 (raw), 1 (png), 2 (jpeg)",
         behind_name(toy, 260, struct.pack("<i", 9)): "depth compression 9; known: 0 (raw), 1 (zlib)",
         behind_name(toy, 264, struct.pack("<2I", 2**32 - 1, 2**32 - 1)): "colour images of 4294967295x4294967295",
         behind_name(toy, 280, struct.pack("<f", float("nan"))): "the depth shift is nan",
-        behind_name(toy, 284, struct.pack("<Q", 10**12)): "promises 1000000000000 frames of 96 or more bytes, but only",
-        behind_name(toy, 284, struct.pack("<Q", 3)): "the file goes on for 2973 bytes behind the last frame",
-        toy + b"\0": "of which 2 records take 264; it is longer than it should be",
+        behind_name(toy, 284, struct.pack("<Q", 10**12)): "states 1000000000000 frames of 96 or more bytes, but only",
+        behind_name(toy, 284, struct.pack("<Q", 3)): "2973 bytes follow the last frame",
+        toy + b"\0": "expected none or 264 bytes of motion data in 2 records; the file is too long",
     }
     for content, message in faults.items():
         with pytest.raises(DataError) as caught:
@@ -193,7 +191,7 @@ def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> No
 
 
 def with_frame(tmp_path: Path, **changes: bytes) -> SensFile:
-    """A recording of three frames of which the second has other images."""
+    """A recording of three frames, the second with other images."""
     first, second, third = frames(header(), 3)
     changed = replace(second, **changes)  # type: ignore[arg-type]
     write_sens(tmp_path / "bad.sens", header(), [first.stored, changed.stored, third.stored])
@@ -208,11 +206,11 @@ def jpeg(width: int, height: int) -> bytes:
     ("colour", "message"),
     [
         (b"\xff\xd8\xff" + bytes(50), "not a JPEG image"),
-        (jpeg(16, 6), "is 16x6; expected 8x6, as the header says"),
+        (jpeg(16, 6), "is 16x6; expected 8x6, as in the header"),
         (jpeg(8, 6)[:-2], "not a readable JPEG image"),
     ],
 )
-def test_a_colour_image_that_is_unfit_is_named_with_frame_and_byte(tmp_path: Path, colour: bytes, message: str) -> None:
+def test_invalid_colour_image_is_named_with_frame_and_byte(tmp_path: Path, colour: bytes, message: str) -> None:
     file = with_frame(tmp_path, colour=colour)
     place = rf"{WHERE}: bad\.sens: frame 1 at byte \d+: colour"
     with pytest.raises(DataError, match=f"{place}.*{message}"):
@@ -223,20 +221,18 @@ def test_a_colour_image_that_is_unfit_is_named_with_frame_and_byte(tmp_path: Pat
 @pytest.mark.parametrize(
     ("depth", "message"),
     [
-        (zlib.compress(bytes(24))[:-1], "unpacks to 24 bytes and breaks off"),
+        (zlib.compress(bytes(24))[:-1], "decompression stops after 24 bytes"),
         (zlib.compress(bytes(23)), "has 23 bytes, expected 24"),
-        (zlib.compress(bytes(20 << 20), 9), "unpacks to more than the 24 bytes of an image"),
+        (zlib.compress(bytes(20 << 20), 9), "decompresses to more than the 24 bytes of an image"),
     ],
 )
-def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
-    tmp_path: Path, depth: bytes, message: str
-) -> None:
+def test_invalid_depth_image_is_named_and_decompression_stops(tmp_path: Path, depth: bytes, message: str) -> None:
     file = with_frame(tmp_path, depth=depth)
     with traced(1 << 20), pytest.raises(DataError, match=rf"{WHERE}: bad\.sens: frame 1 at byte \d+: depth.*{message}"):
         file.depth(1)
 
 
-def test_a_depth_image_of_more_bytes_than_its_size_can_take_is_refused_before_it_is_read(tmp_path: Path) -> None:
+def test_oversized_depth_image_is_rejected_before_it_is_read(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"frame 1 of 3 at byte \d+: images of"):
         with_frame(tmp_path, depth=bytes(2 << 20))
 
@@ -250,14 +246,14 @@ def test_a_depth_image_of_more_bytes_than_its_size_can_take_is_refused_before_it
         (-8, 200),
     ],
 )
-def test_a_promise_of_too_much_allocates_nothing(tmp_path: Path, at: int, number: int) -> None:
+def test_excessive_header_sizes_allocate_nothing(tmp_path: Path, at: int, number: int) -> None:
     toy = bytearray(TOY.read_bytes())
     toy[N_HEADER + at : N_HEADER + at + 8] = struct.pack("<Q", number)
     with traced(1 << 20), pytest.raises(DataError, match=rf"^{WHERE}: bad\.sens: "):
         opened(tmp_path / "bad.sens", bytes(toy))
 
 
-def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> None:
+def test_missing_file_folder_and_pipe_are_data_errors(tmp_path: Path) -> None:
     (tmp_path / "folder.sens").mkdir()
     os.mkfifo(tmp_path / "pipe.sens")
     for name in ("none.sens", "folder.sens", "pipe.sens"):
@@ -266,9 +262,9 @@ def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("path", [TOY, pytest.param(RAW_TOY, marks=pytest.mark.proof)], ids=["jpeg", "raw"])
-def test_a_recording_cut_short_anywhere_is_refused(tmp_path: Path, path: Path) -> None:
+def test_recording_truncated_anywhere_is_rejected(tmp_path: Path, path: Path) -> None:
     content = path.read_bytes()
     n_read, n_refused = outcomes(
         lambda copy: opened(tmp_path / "cut.sens", copy), truncations(content), must_name=f"{WHERE}: cut.sens"
     )
-    assert (n_read, n_refused) == (1, len(content) - 1)  # without the block of motion data it is a whole recording
+    assert (n_read, n_refused) == (1, len(content) - 1)  # without the motion data block the recording is complete

@@ -1,4 +1,4 @@
-"""Scenes of ScanNet++ from raw files: poses of both kinds, images extracted and packed, lists, splits, refusals."""
+"""ScanNet++ scenes from raw files: both kinds of poses, extracted and packed images, lists, splits, rejected input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.scannetpp.dataset import ScanNetPP
 
-# The files count from the corner of the image, frames from the middle of the first pixel.
+# The files count from the corner of the image, frames from the centre of the first pixel.
 CAMERA = np.array([[64.0, 0.0, 31.5], [0.0, 64.0, 23.5], [0.0, 0.0, 1.0]])
 LISTS = "metadata/semantic_benchmark"
 
@@ -26,7 +26,7 @@ def dataset(root: Path, **options: Any) -> ScanNetPP:
 
 
 def packed(values: np.ndarray) -> bytes:
-    """A depth image in metres, a hair above each millimetre, as ``depth.bin`` has it."""
+    """A depth image in metres, slightly above whole millimetres, as in ``depth.bin``."""
     pack = zlib.compressobj(wbits=-15)
     content = pack.compress(((values.astype(np.float32) + 0.01) / 1000).astype("<f4").tobytes()) + pack.flush()
     return len(content).to_bytes(4, "little") + content
@@ -37,7 +37,7 @@ def grey(number: int) -> np.ndarray:
 
 
 def write_packed(root: Path) -> Path:
-    """A scene whose images are packed: ``depth.bin`` and a Matroska video whose greys tell the numbers of frames."""
+    """A scene whose images are packed: ``depth.bin`` and a Matroska video whose grey levels encode frame numbers."""
     import cv2
 
     folder = pp.write_scene(root) / "iphone"
@@ -54,7 +54,7 @@ def write_packed(root: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["colmap", "tracking"])
-def test_poses_of_both_kinds_are_camera_to_world_in_the_world_of_the_mesh(tmp_path: Path, kind: str) -> None:
+def test_both_kinds_of_poses_are_camera_to_world_in_mesh_coordinates(tmp_path: Path, kind: str) -> None:
     pp.write_scene(tmp_path)
     frames = list(dataset(tmp_path, poses=kind).frames(pp.SCENE, 1))
     assert [frame.index for frame in frames] == list(pp.NUMBERS)
@@ -63,7 +63,7 @@ def test_poses_of_both_kinds_are_camera_to_world_in_the_world_of_the_mesh(tmp_pa
         np.testing.assert_allclose(frame.intrinsics, CAMERA)
 
 
-def test_colmap_is_taken_where_both_are_there_and_tracking_where_it_is_not(tmp_path: Path) -> None:
+def test_colmap_is_preferred_and_tracking_is_the_fallback(tmp_path: Path) -> None:
     folder = pp.write_scene(tmp_path)
     entries = pp.tracking(aligned_pose=np.full((4, 4), np.nan).tolist())
     write_files(folder, {"iphone/pose_intrinsic_imu.json": entries})
@@ -72,7 +72,7 @@ def test_colmap_is_taken_where_both_are_there_and_tracking_where_it_is_not(tmp_p
     assert [frame.index for frame in dataset(tmp_path).frames(pp.SCENE, 1)] == list(pp.NUMBERS[1:])
 
 
-def test_packed_files_give_the_frames_of_their_numbers_in_any_order(tmp_path: Path) -> None:
+def test_packed_files_give_frames_by_number_in_any_order(tmp_path: Path) -> None:
     write_packed(tmp_path)
     frames = dataset(tmp_path).frames(pp.SCENE, 1)
     for position in (0, 2, 1, 0):
@@ -82,7 +82,7 @@ def test_packed_files_give_the_frames_of_their_numbers_in_any_order(tmp_path: Pa
         assert frame.depth_m[0, 0] == np.float32((number + 1) / 1000) and frame.depth_m[-1, -1] == 2
 
 
-def test_depth_extracted_and_depth_packed_are_equal_to_the_bit(tmp_path: Path) -> None:
+def test_extracted_and_packed_depth_are_identical(tmp_path: Path) -> None:
     extracted, packed = tmp_path / "a", tmp_path / "b"
     pp.write_scene(extracted)
     write_packed(packed)
@@ -90,7 +90,7 @@ def test_depth_extracted_and_depth_packed_are_equal_to_the_bit(tmp_path: Path) -
         np.testing.assert_array_equal(ours.depth_m, theirs.depth_m)
 
 
-def test_frames_have_at_most_the_columns_asked_for_and_the_same_rays(tmp_path: Path) -> None:
+def test_frames_have_at_most_the_requested_columns_and_the_same_rays(tmp_path: Path) -> None:
     pp.write_scene(tmp_path)
     small = dataset(tmp_path, width=32).frames(pp.SCENE, 1)[0]
     assert small.rgb.shape == (24, 32, 3) and small.depth_m.shape == (24, 32)
@@ -101,7 +101,7 @@ def test_frames_have_at_most_the_columns_asked_for_and_the_same_rays(tmp_path: P
     assert whole.rgb.shape[:2] == pp.COLOUR_SIZE[::-1]
 
 
-def test_the_bend_of_the_lens_is_taken_out_of_colour_and_depth(tmp_path: Path) -> None:
+def test_lens_distortion_is_removed_from_colour_and_depth(tmp_path: Path) -> None:
     import cv2
 
     folder = pp.write_scene(tmp_path)
@@ -116,18 +116,18 @@ def test_the_bend_of_the_lens_is_taken_out_of_colour_and_depth(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("model", "bent"), [("PINHOLE", ""), ("SIMPLE_RADIAL", " 0"), ("RADIAL", " 0 0")])
-def test_other_models_of_colmap_are_read_by_their_own_order(tmp_path: Path, model: str, bent: str) -> None:
+def test_other_colmap_models_use_their_parameter_order(tmp_path: Path, model: str, bent: str) -> None:
     focal = "64 64" if model == "PINHOLE" else "64"
     (pp.write_scene(tmp_path) / "iphone/colmap/cameras.txt").write_text(f"1 {model} 64 48 {focal} 32 24{bent}\n")
     np.testing.assert_allclose(dataset(tmp_path).frames(pp.SCENE, 1)[0].intrinsics, CAMERA)
 
 
-def test_every_way_to_ask_is_answered_and_the_check_finds_nothing(tmp_path: Path) -> None:
+def test_check_of_a_complete_scene_finds_nothing(tmp_path: Path) -> None:
     pp.write_scene(tmp_path)
     data = dataset(tmp_path)
     assert list(data.scenes()) == [pp.SCENE] and data.groups() == {"nvs_sem_val": (pp.SCENE,)}
     assert data.status(pp.SCENE) == "3 frames, ground truth"
-    assert dataset(tmp_path, poses="tracking").status(pp.SCENE) == "frames with the poses of the phone, ground truth"
+    assert dataset(tmp_path, poses="tracking").status(pp.SCENE) == "frames with the phone's poses, ground truth"
     found = inspect(data, pp.SCENE)
     assert [finding for finding in found.findings if finding.severity == "error"] == []
     assert found.truth[0].variant == "scannetpp" and found.truth[0].n_classes == 3
@@ -136,7 +136,7 @@ def test_every_way_to_ask_is_answered_and_the_check_finds_nothing(tmp_path: Path
     assert len(data.files(pp.SCENE)) == len(set(data.files(pp.SCENE))) == 2 + 6 + 4 + 3
 
 
-def test_the_digest_follows_options_and_no_file_that_is_not_read(tmp_path: Path) -> None:
+def test_digest_depends_on_options_and_only_on_files_that_are_read(tmp_path: Path) -> None:
     folder = pp.write_scene(tmp_path)
     first = dataset(tmp_path).digest(pp.SCENE)
     (folder / "iphone/exif.json").write_text("{}")
@@ -146,16 +146,14 @@ def test_the_digest_follows_options_and_no_file_that_is_not_read(tmp_path: Path)
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("data/036bce3393/scans/mesh_aligned_0.05_mask.txt", "vertices would be scored that the benchmark leaves out"),
+        ("data/036bce3393/scans/mesh_aligned_0.05_mask.txt", "vertices excluded by the benchmark would be scored"),
         (
             "metadata/semantic_benchmark/top100.txt",
             "lists top100.txt, top100_instance.txt, map_benchmark.csv are missing",
         ),
     ],
 )
-def test_what_is_missing_for_the_truth_is_named_and_frames_are_there_all_the_same(
-    tmp_path: Path, name: str, line: str
-) -> None:
+def test_missing_ground_truth_file_is_named_and_frames_still_work(tmp_path: Path, name: str, line: str) -> None:
     pp.write_scene(tmp_path)
     (tmp_path / name).unlink()
     data = dataset(tmp_path)
@@ -164,7 +162,7 @@ def test_what_is_missing_for_the_truth_is_named_and_frames_are_there_all_the_sam
     assert len(data.frames(pp.SCENE, 1)) == 3 and list(data.problems(pp.SCENE)) == []
 
 
-def test_both_releases_and_a_link_to_one_are_found_once(tmp_path: Path) -> None:
+def test_both_releases_and_a_link_are_found_once(tmp_path: Path) -> None:
     pp.write_scene(tmp_path / "scannetpp")
     (tmp_path / "data").symlink_to(tmp_path / "scannetpp/data")
     data = dataset(tmp_path)

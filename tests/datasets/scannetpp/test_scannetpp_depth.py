@@ -1,4 +1,4 @@
-"""``depth.bin`` of ScanNet++ in its three forms, and LZ4 blocks as the package of that name makes them."""
+"""The three formats of ScanNet++'s ``depth.bin``, and LZ4 blocks written by the package of that name."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def opened(path: Path, content: bytes, n: int = 4) -> DepthFile:
 
 
 @pytest.mark.parametrize("case", [*CASE["blocks"], CASE["image"]])
-def test_lz4_blocks_are_unpacked_as_the_package_packed_them(case: tuple[str, int, int]) -> None:
+def test_lz4_blocks_of_the_package_are_unpacked(case: tuple[str, int, int]) -> None:
     block, n_bytes, checksum = base64.b64decode(case[0]), case[1], case[2]
     assert zlib.crc32(unpacked_block(block, n_bytes)) == checksum
     for wrong in (n_bytes - 1, n_bytes + 1):
@@ -43,28 +43,28 @@ def test_lz4_blocks_are_unpacked_as_the_package_packed_them(case: tuple[str, int
 
 
 @pytest.mark.parametrize("block", [b"", b"\xf0", b"\x10", b"\x04a\x00\x00", b"\x14a\x02\x00", b"\xff" * 40])
-def test_a_block_that_cannot_be_is_refused(block: bytes) -> None:
+def test_invalid_block_is_rejected(block: bytes) -> None:
     with pytest.raises(NotLz4):
         unpacked_block(block, 100)
 
 
-def test_an_image_of_the_release_is_read(tmp_path: Path) -> None:
+def test_image_of_the_release_is_read(tmp_path: Path) -> None:
     block = base64.b64decode(CASE["image"][0])
     values = opened(tmp_path / "depth.bin", 2 * (len(block).to_bytes(4, "little") + block)).values(1)
     assert values.shape == SHAPE and zlib.crc32(values.astype("<u2").tobytes()) == CASE["image"][2]
 
 
-def test_all_images_in_one_stream_are_read_in_any_order(tmp_path: Path) -> None:
+def test_single_stream_is_read_in_any_order(tmp_path: Path) -> None:
     metres = b"".join((image(k).astype(np.float32) / np.float32(1000)).astype("<f4").tobytes() for k in range(4))
     depth = opened(tmp_path / "depth.bin", raw(metres))
     for number in (0, 3, 1, 2, 0):
         expected = millimetres(image(number).astype(np.float32) / np.float32(1000))
         np.testing.assert_array_equal(depth.values(number), expected)
-    with pytest.raises(DataError, match=r"^here: depth.bin: has fewer images, frame 4 is not among them"):
+    with pytest.raises(DataError, match=r"^here: depth.bin: has fewer images, but not frame 4"):
         depth.values(4)
 
 
 @pytest.mark.parametrize("content", [b"nothing of the kind", raw(b"\0" * 1000), raw(b"\0" * 4 * 49152)[:-3]])
-def test_a_file_of_no_form_is_one_line(tmp_path: Path, content: bytes) -> None:
-    with pytest.raises(DataError, match=r"^here: depth.bin: (is none of the forms|ends within an image)"):
+def test_unknown_format_is_one_line(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(DataError, match=r"^here: depth.bin: (is not in any format|ends within an image)"):
         opened(tmp_path / "depth.bin", content).values(1)

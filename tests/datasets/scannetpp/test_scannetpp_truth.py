@@ -1,4 +1,4 @@
-"""The truth of ScanNet++ against what the official toolkit answered, and what is wrong with the files of a scan."""
+"""ScanNet++'s ground truth compared with results of the official toolkit, and faults in the files of a scan."""
 
 from __future__ import annotations
 
@@ -38,9 +38,7 @@ def row_of_points(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("problem", CASE["problems"])
-def test_the_truth_is_what_the_official_toolkit_makes_of_the_same_files(
-    tmp_path: Path, problem: dict[str, Any]
-) -> None:
+def test_ground_truth_matches_the_official_toolkit(tmp_path: Path, problem: dict[str, Any]) -> None:
     for name, text in (
         ("top100.txt", "\n".join(problem["names"])),
         ("top100_instance.txt", "\n".join(problem["inst"])),
@@ -61,18 +59,18 @@ def test_the_truth_is_what_the_official_toolkit_makes_of_the_same_files(
     assert (truth.semantic[~is_kept] == -1).all() and not truth.instance[~is_kept].any()
 
 
-def test_a_vertex_keeps_three_classes_and_the_smallest_object_stands_for_it(tmp_path: Path) -> None:
+def test_vertex_keeps_three_classes_and_the_smallest_object_counts(tmp_path: Path) -> None:
     groups = [("floor", (1, 2, 3)), ("couch", (1, 2)), ("chair", (1,)), ("rug", (1, 3))]
     truth = written(tmp_path, [1, 2, 2, 3, 9], groups, masked=[2], mesh=row_of_points(5))
     floor, chair, sofa, mat = (NAMES.index(name) + 1 for name in ("floor", "chair", "sofa", "mat"))
     assert truth.every_semantic is not None
-    # The rug finds no room on the first vertex, and so covers one less.
+    # The rug is dropped on the first vertex, and so covers one less.
     assert truth.every_semantic.tolist() == [[floor, sofa, chair], [floor, sofa, 0], [0] * 3, [floor, mat, 0], [0] * 3]
     assert truth.semantic.tolist() == [chair, sofa, -1, mat, 0]
     assert truth.instance.tolist() == [3, 2, 0, 4, 0]
 
 
-def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> None:
+def test_object_surface_has_the_majority_of_corners(tmp_path: Path) -> None:
     points, triangles = grid(3, 2)
     write_lists(tmp_path)
     write_scans(tmp_path, [1, 1, 2, 1, 1, 2], [("floor", (1,)), ("couch", (2,))], mesh=(points, triangles))
@@ -84,8 +82,8 @@ def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> Non
     assert mesh.class_of_instance == {1: 2, 2: 4}
 
 
-def test_more_objects_than_ids_can_tell_apart_are_refused(tmp_path: Path) -> None:
+def test_too_many_objects_for_the_ids_are_rejected(tmp_path: Path) -> None:
     groups = [*[("floor", (1,))] * 999, ("chair", (2,))]
     assert written(tmp_path, [1, 2, 2], groups, mesh=row_of_points(3)).instance.tolist() == [0, 1000, 1000]
-    with pytest.raises(DataError, match="cannot tell more than 1000 apart"):
+    with pytest.raises(DataError, match="allows at most 1000"):
         written(tmp_path, [1, 2, 2], [*groups, ("chair", (2,))], mesh=row_of_points(3))

@@ -185,10 +185,10 @@ def test_scannet_has_axis_alignment_and_classes_of_names(tmp_path: Path) -> None
     assert np.array_equal(turned.axis_alignment(SCAN), np.eye(4))
     assert dataset.nyu40_class("chair") == "chair" and dataset.nyu40_class("nonsense") is None
     (folder / f"{SCAN}.txt").unlink()
-    with pytest.raises(DataError, match=r"\.txt is missing; what lies along the walls needs it"):
+    with pytest.raises(DataError, match=r"\.txt is missing; it is needed for wall alignment"):
         ScanNet(tmp_path).axis_alignment(SCAN)
     (tmp_path / TABLE_NAME).unlink()
-    with pytest.raises(DataError, match="is missing, by which names of objects have classes"):
+    with pytest.raises(DataError, match="is missing, which maps object names to classes"):
         ScanNet(tmp_path).nyu40_class("chair")
 
 

@@ -171,7 +171,7 @@ def test_without_visible_cloud_all_points_count_except_for_replica(tmp_path: Pat
     assert truth.source.startswith("all points, gt_categories.json")
     labelled = LabelledPoints(truth.points, truth.object_of_point, "made")
     shutil.copytree(tmp_path / "lex/hm3d", tmp_path / "lex/replica")
-    with pytest.raises(GroundTruthMissing, match=r"replica/00824: gt_visible_cloud\.pcd: is not there"):
+    with pytest.raises(GroundTruthMissing, match=r"replica/00824: gt_visible_cloud\.pcd: is missing"):
         categories_truth(OpenLexFiles(tmp_path / "lex", "replica", "00824"), labelled)
 
 
@@ -181,7 +181,7 @@ def test_without_visible_cloud_all_points_count_except_for_replica(tmp_path: Pat
         ("[]", "expected an object"),
         ('{"objects": []}', "objects: List should have at least 1 item"),
         ('{"objects": [{"id": "7"}]}', "objects.0.id: Input should be a valid integer"),
-        ('{"objects": [{"id": 1}, {"id": 1}]}', "an object stands there twice"),
+        ('{"objects": [{"id": 1}, {"id": 1}]}', "an object is listed twice"),
     ],
 )
 def test_damaged_object_list_is_one_line(info: str, message: str, tmp_path: Path) -> None:

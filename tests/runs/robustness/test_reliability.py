@@ -84,7 +84,7 @@ def test_commands_killed_at_random_give_the_same_bytes_as_undisturbed_ones() -> 
         assert (row["faults"], row["orphans"], row["leftovers"]) == ("0", "0", "0")
         assert int(row["compared"]) > 0
     assert sum(int(row["kills"]) for row in rows) >= 10
-    assert sum(int(row["files spoilt"]) for row in rows) > 0
+    assert sum(int(row["files corrupted"]) for row in rows) > 0
 
 
 def test_full_disk_is_a_one_line_error_and_the_run_resumes(

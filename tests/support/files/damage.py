@@ -1,6 +1,6 @@
-"""Damaged copies of a file, and a check that a reader meets each with a typed error, soon and in little memory.
+"""Damaged copies of a file, and a check that a reader rejects each with a typed error, quickly and in little memory.
 
-How much memory this process has taken, and at most may take, is measured and set here.
+The peak memory of this process is measured and limited here.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, Su3dError
 
-N_DAMAGES = int(os.environ.get("SU3D_DAMAGES", "400"))  # of a file; make proofs takes 2,000
-MAX_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, yet no endless loop passes
-MAX_BYTES = 256 << 20  # of memory, taken or merely reserved, beyond what there was before the first read
+N_DAMAGES = int(os.environ.get("SU3D_DAMAGES", "400"))  # per file; make proofs uses 2,000
+MAX_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, but no infinite loop passes
+MAX_BYTES = 256 << 20  # of memory, used or only reserved, beyond that before the first read
 LENGTHS = (1, 1, 2, 4, 8, 64)
 EXTREMES = (0, 0x7F, 0x80, 0xFF)
 
 
 def truncations(content: bytes) -> Iterator[bytes]:
-    """Every proper beginning of ``content``."""
+    """Every proper prefix of ``content``."""
     for end in range(len(content)):
         yield content[:end]
 
 
 def damages(content: bytes, n: int = N_DAMAGES, seed: int = 0) -> Iterator[bytes]:
-    """``n`` copies with random damage: bytes flipped, set to extremes, runs cut out, doubled or overwritten."""
+    """``n`` copies with random damage: bytes flipped or set to extremes, ranges removed, doubled or overwritten."""
     rng = np.random.default_rng(seed)
     for _ in range(n):
         damaged = bytearray(content)
@@ -61,9 +61,9 @@ def outcomes(
     must_name: str,
     refusal: type[Su3dError] = DataError,
 ) -> tuple[int, int]:
-    """How many copies were read and how many refused; fails on any other error, and where time or memory run away.
+    """How many copies were read and how many rejected; fails on any other error, or if time or memory is exceeded.
 
-    Each refusal must be one ``refusal`` of one line that holds ``must_name``, the name of the file.
+    Each rejection must be a one-line ``refusal`` that contains ``must_name``, the name of the file.
     """
     n_read = n_refused = 0
     with bounded_addresses(MAX_BYTES):
@@ -88,12 +88,12 @@ def assert_fit(error: Su3dError, must_name: str) -> None:
 
 
 def lacked_memory(error: BaseException | None) -> bool:
-    """Whether a reader took the want of memory that it had made itself for damage."""
+    """Whether a reader reported its own lack of memory as damage."""
     return error is not None and (isinstance(error, MemoryError) or lacked_memory(error.__context__))
 
 
 def facts(value: Any) -> Any:
-    """A value with the types of all that is in it."""
+    """A value with the types of all its parts."""
     if is_dataclass(value) or isinstance(value, dict):
         return [(key, facts(one)) for key, one in (value if isinstance(value, dict) else vars(value)).items()]
     if isinstance(value, np.ndarray):
@@ -107,7 +107,7 @@ def assert_same(ours: Any, theirs: Any) -> None:
 
 @contextmanager
 def bounded_addresses(max_bytes: int) -> Iterator[None]:
-    """No more than ``max_bytes`` of address space beyond what is taken now; what asks for more gets a MemoryError."""
+    """At most ``max_bytes`` of address space beyond current use; larger requests raise MemoryError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + max_bytes, hard))
     try:
@@ -118,7 +118,7 @@ def bounded_addresses(max_bytes: int) -> Iterator[None]:
 
 @contextmanager
 def traced(max_bytes: int) -> Iterator[None]:
-    """The block must end, by whatever, with less than ``max_bytes`` allocated at any time."""
+    """The block must end, in any way, with less than ``max_bytes`` allocated at any time."""
     tracemalloc.start()
     try:
         yield
@@ -128,7 +128,7 @@ def traced(max_bytes: int) -> Iterator[None]:
 
 
 def reset_peak() -> int:
-    """The resident memory now, from which the peak is counted afresh."""
+    """The current resident memory; resets the peak."""
     Path("/proc/self/clear_refs").write_text("5")  # proc(5): resets the peak of the resident set
     return _status("VmRSS")
 

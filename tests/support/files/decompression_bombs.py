@@ -1,6 +1,6 @@
-"""Small files that swell when they are read: archives, streams and images that promise or hold far more than they are.
+"""Small files that expand when read: archives, streams and images that state or contain far more than their size.
 
-Nothing large is made on the way: the packed form of a mebibyte of zeros is repeated.
+Nothing large is created: the compressed form of a mebibyte of zeros is repeated.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MIB = 1 << 20
 
 @dataclass(frozen=True)
 class Member:
-    """A member of an archive: its packed bytes, how they are packed, and how many bytes the archive says they are."""
+    """A member of an archive: its compressed bytes, the compression method, and its size as stated by the archive."""
 
     name: str
     packed: bytes
@@ -28,25 +28,25 @@ class Member:
 
 @functools.cache
 def _mebibyte_of(byte: int) -> bytes:
-    """A mebibyte of one byte as blocks of deflate that may be repeated."""
+    """A mebibyte of one byte as deflate blocks that may be repeated."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     return packer.compress(bytes([byte]) * MIB) + packer.flush(zlib.Z_FULL_FLUSH)
 
 
 def deflated(first: bytes, n_mebibytes: int, byte: int = 0, last: bytes = b"") -> bytes:
-    """Raw deflate of ``first``, so many mebibytes of one byte, and ``last``."""
+    """Raw deflate of ``first``, that many mebibytes of one byte, and ``last``."""
     head, tail = (zlib.compressobj(9, zlib.DEFLATED, -15) for _ in range(2))
     begin = head.compress(first) + head.flush(zlib.Z_FULL_FLUSH)
     return begin + _mebibyte_of(byte) * n_mebibytes + tail.compress(last) + tail.flush()
 
 
 def whole_member(name: str, content: bytes) -> Member:
-    """A member that is what it says."""
+    """A correctly described member."""
     return Member(name, deflated(content, 0), len(content), checksum=zlib.crc32(content))
 
 
 def zip_of(members: Sequence[Member]) -> bytes:
-    """A zip archive of members as they say they are."""
+    """A zip archive of members with their stated sizes."""
     out, directory = bytearray(), bytearray()
     for one in members:
         name, at = one.name.encode(), len(out)
@@ -59,20 +59,20 @@ def zip_of(members: Sequence[Member]) -> bytes:
 
 
 def npy_head(shape: tuple[int, ...], code: str = "|b1") -> bytes:
-    """What stands before the values of a .npy file."""
+    """The header before the values of a .npy file."""
     text = f"{{'descr': '{code}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
 
 def npz_of_zeros(name: str, n_mebibytes: int) -> bytes:
-    """An .npz file of one matrix of so many mebibytes of False."""
+    """An .npz file of one matrix of that many mebibytes of False."""
     head = npy_head((n_mebibytes << 10, 1024))
     packed = deflated(head, n_mebibytes)
     return zip_of([Member(f"{name}.npy", packed, len(head) + n_mebibytes * MIB)])
 
 
 def gzip_of(first: bytes, n_mebibytes: int, byte: int = 0, last: bytes = b"") -> bytes:
-    """A gzip stream of ``first``, so many mebibytes of one byte, and ``last``; its checksum is 0."""
+    """A gzip stream of ``first``, that many mebibytes of one byte, and ``last``; its checksum is 0."""
     return b"\x1f\x8b\x08" + bytes(6) + b"\xff" + deflated(first, n_mebibytes, byte, last) + bytes(8)
 
 
@@ -90,7 +90,7 @@ def _chunk(content: bytes) -> bytes:
 
 
 def jpeg_of_scans(width: int, height: int, n_scans: int) -> bytes:
-    """A progressive JPEG, grey, of which each scan says again that there is nothing."""
+    """A progressive JPEG, grey, in which every scan repeats that it is empty."""
     tables = b"\xff\xdb\x00\x43\x00" + bytes([1]) * 64
     frame = b"\xff\xc2" + struct.pack(">HBHHBBBB", 11, 8, height, width, 1, 1, 0x11, 0)
     codes = b"\xff\xc4\x00\x14\x10\x01" + bytes(15) + b"\xe0"  # one code of one bit: 32,767 blocks end

@@ -1,4 +1,4 @@
-"""A small scene of labelled vertices, its masks and texts as files, and what ``evaluate`` says of them."""
+"""A small scene of labelled vertices, its masks and texts as files, and the output of ``evaluate`` for them."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def numbers(folder: Path, protocol: str = "scannet-instance", **more: Any) -> di
 
 
 def said(found: dict[str, Any], beginning: str) -> str:
-    """The only warning that begins so."""
+    """The only warning with this beginning."""
     (line,) = [line for line in found["warnings"] if line.startswith(beginning)]
     return str(line)
 
 
 def feature_scene(folder: Path) -> None:
-    """OpenMask3D's files of two masks, the first like a chair, the second like a table; no feature for the third."""
+    """OpenMask3D's files of two masks, the first like a chair, the second like a table; none for the third."""
     write_truth(folder / "gt")
     features = np.zeros((3, 16))
     features[0, 3], features[1, 9] = 2.0, 5.0

@@ -1,9 +1,9 @@
-"""Servers of files on loopback that behave as the real ones do, well or badly, and count what they are asked.
+"""File servers on loopback that behave like the real ones, well or badly, and record requests.
 
-``FileServer`` gives plain files with ranges, validators and redirections; ``serve_repository`` makes it answer as the
-hub of Hugging Face: a list of a repository's files with checksums, and large files by a redirection to another host.
-The other ``serve_`` functions serve tiny files in the layouts in which they are published, and say what a table of
-sources says of them.
+``FileServer`` serves plain files with ranges, validators and redirections; ``serve_repository`` makes it answer like
+the Hugging Face hub: a list of a repository's files with checksums, and large files by redirection to another host.
+The other ``serve_`` functions serve tiny files in their published layouts, and return the matching row of a
+table of sources.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class LocalServer:
             protocol_version = "HTTP/1.1"
 
             def handle(self) -> None:
-                """Clients that give up close the connection at any moment, also while its next request is awaited."""
+                """Clients may close the connection at any moment, also while the next request is awaited."""
                 with suppress(ConnectionError):
                     super().handle()
 
@@ -64,7 +64,7 @@ class LocalServer:
 
 
 def send(handler: BaseHTTPRequestHandler, status: int, headers: Mapping[str, str], body: bytes) -> None:
-    """An answer to a client that may be gone."""
+    """An answer to a client that may have disconnected."""
     with suppress(OSError):
         handler.send_response(status)
         for name, value in headers.items():
@@ -75,7 +75,7 @@ def send(handler: BaseHTTPRequestHandler, status: int, headers: Mapping[str, str
 
 @dataclass
 class Served:
-    """A file and how it is given: ``breaks_after`` bytes of an answer, once a number in the list, the line is cut."""
+    """A file and how it is served: ``breaks_after`` lists byte counts at which answers are cut, one per answer."""
 
     content: bytes
     etag: str | None = None
@@ -90,7 +90,7 @@ class Served:
         return self.etag if self.etag is not None else f'"{hashlib.md5(self.content).hexdigest()}"'
 
     def start(self, headers: Mapping[str, str]) -> int | None:
-        """From where on a part is given: asked for, and of the state that the client has (RFC 9110, 13.1.5)."""
+        """The start of a requested part, if it matches the client's version (RFC 9110, 13.1.5)."""
         wanted = re.fullmatch(r"bytes=(\d+)-", headers.get("range", ""))
         is_same = headers.get("if-range") in (None, self.tag())
         return int(wanted[1]) if wanted is not None and self.takes_ranges and is_same else None
@@ -107,7 +107,7 @@ class Asked:
 
 
 class FileServer(LocalServer):
-    """``files`` by path; ``url`` names it as 127.0.0.1, ``other_host`` as localhost."""
+    """``files`` by path; ``url`` uses 127.0.0.1, ``other_host`` localhost."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class FileServer(LocalServer):
 
 
 def serve_repository(server: FileServer, repository: str, files: Mapping[str, bytes], *, large: int = 1000) -> None:
-    """A repository of the hub; files of at least ``large`` bytes lie in its store of large files on another host."""
+    """A repository of the hub; files of at least ``large`` bytes are stored on another host."""
     siblings = []
     for name, content in files.items():
         blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
@@ -158,21 +158,21 @@ def serve_repository(server: FileServer, repository: str, files: Mapping[str, by
 
 
 def entry(name: str, group: str, files: Mapping[str, Mapping[str, Any]], **keys: Any) -> dict[str, Any]:
-    """A row of the table: ``files`` by name with what is said of each."""
+    """A row of the table: ``files`` by name with their entries."""
     rows = [{"name": file, "read_at": "here", **facts} for file, facts in files.items()]
     fixed = {"what": "a tiny one", "licence": LICENCE, "hosts": ["127.0.0.1"]}
     return {"name": name, "group": group, **fixed, "files": rows} | keys
 
 
 def serve_file(server: FileServer, name: str, content: bytes, *, is_stated: bool = True) -> dict[str, Any]:
-    """Serve a file; what the table says of it."""
+    """Serve a file; its entry in the table."""
     server.files[f"/{name}"] = Served(content)
     facts: dict[str, Any] = {"address": f"{server.url}/{name}", "n_bytes": len(content)}
     return facts | ({"sha256": hashlib.sha256(content).hexdigest()} if is_stated else {})
 
 
 def serve_replica(server: FileServer, made: Path) -> list[dict[str, Any]]:
-    """Serve what lies in ``made``: ``Replica`` as NICE-SLAM packs it, ``replica_v1`` in parts like the release."""
+    """Serve the content of ``made``: ``Replica`` packed as by NICE-SLAM, ``replica_v1`` in parts like the release."""
     packed = shutil.make_archive(str(made / "frames"), "zip", made, "Replica")
     facts = serve_file(server, "Replica.zip", Path(packed).read_bytes(), is_stated=False)
     del facts["n_bytes"]
@@ -209,7 +209,7 @@ def hub_entry(server: FileServer, name: str, hub: dict[str, Any]) -> dict[str, A
 
 
 def write_table(place: Path, rows: list[dict[str, Any]]) -> Path:
-    """A file for ``--sources``: TOML takes JSON's values but for the names of keys."""
+    """A file for ``--sources``: TOML accepts JSON's values, but not its keys."""
     place.write_text("sources = " + _toml(rows) + "\n")
     return place
 

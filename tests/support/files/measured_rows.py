@@ -1,4 +1,4 @@
-"""Rows as a run measures them, for tests of tables."""
+"""Rows as measured by a run, for tests of tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCENES = tuple(f"replica/{kind}{k}" for kind, n in (("office", 5), ("room", 3)) 
 
 
 def measured(method: str = "opensu3d", accuracy: float = 0.4, **more: Any) -> Measured:
-    """Eight scenes under ConceptGraphs' rules, a little apart from each other."""
+    """Eight scenes under ConceptGraphs' rules, with slightly different values."""
     per_scene: Mapping[str, Any] = {
         scene: {"mAcc": accuracy + 0.001 * k, "F-mIoU": accuracy / 2} for k, scene in enumerate(SCENES)
     }

@@ -1,4 +1,4 @@
-"""Predictions written as the programs themselves write them, over the vertices of a mesh or with their own points."""
+"""Predictions written like by the original programs, over the vertices of a mesh or with their own points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from su3d_bench.store.predictions import write_prediction
 
 
 def scenes_of(case: str) -> list[dict[str, Any]]:
-    """Masks (K, N), labels and scores of each scene of a reference case, in the order of its prediction lines."""
+    """Masks (K, N), labels and scores of each scene of a reference case, in prediction order."""
     with np.load(CASES / f"{case}.npz") as archive:
         arrays = {key: archive[key] for key in archive.files}
     found = []
@@ -44,7 +44,7 @@ def scenes_of(case: str) -> list[dict[str, Any]]:
 
 
 def write_list(folder: Path, scene: dict[str, Any], files: list[str], masks: list[str], labels: Any) -> None:
-    """Mask files, and a list with the name, the class (a text) and the confidence of each."""
+    """Mask files, and a list with the file name, class (a text) and confidence of each."""
     lines = []
     for file, content, label, score in zip(files, masks, labels, scene["scores"], strict=True):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -55,13 +55,13 @@ def write_list(folder: Path, scene: dict[str, Any], files: list[str], masks: lis
 
 
 def write_scannet_text(folder: Path, scene: dict[str, Any], *, file_end: str = "\n") -> None:
-    """The submission format: a list of mask files, class and confidence, and one digit a line in each mask file."""
+    """The submission format: a list of mask files, class and confidence, and one digit per line in each mask file."""
     masks = ["\n".join("1" if member else "0" for member in mask) + file_end for mask in scene["masks"]]
     write_list(folder, scene, scene["files"], masks, [f"{label} " for label in scene["labels"]])
 
 
 def runs(mask: Any) -> Any:
-    """Start (from 1) and length of each run of members, as Open3DIS and ScanNet++ encode masks."""
+    """Start (from 1) and length of each run of members, as encoded by Open3DIS and ScanNet++."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))) + 1
     edges[1::2] -= edges[::2]
     return edges
@@ -82,7 +82,7 @@ def write_maskclustering(folder: Path, scene: dict[str, Any]) -> None:
 
 
 class TorchName:
-    """A name of torch's, such as ``torch._utils _rebuild_tensor_v2``, which nobody needs to import."""
+    """A name in torch, such as ``torch._utils _rebuild_tensor_v2``, that need not be importable."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -92,14 +92,14 @@ class TorchName:
 
 @dataclass(frozen=True, eq=False)
 class Tensor:
-    """An array that is pickled as torch pickles a tensor; one that stands in several places is written once."""
+    """An array pickled like a torch tensor; if it occurs several times it is written once."""
 
     array: Any
 
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """The ones at ``indices`` (2, n) of a matrix, as torch pickles a sparse tensor."""
+    """The ones at ``indices`` (2, n) of a matrix, pickled like a torch sparse tensor."""
 
     indices: Any
     shape: tuple[int, ...]
@@ -110,7 +110,7 @@ STORAGES = {"bool": "Bool", "float16": "Half", "float32": "Float", "float64": "D
 
 
 class TorchPickler(pickle._Pickler):
-    """Writes what torch.save writes, without torch: the values of tensors go into ``storages``."""
+    """Writes the format of torch.save without torch: tensor values go into ``storages``."""
 
     def __init__(self, stream: Any, *, is_stream: bool) -> None:
         super().__init__(stream, 2)
@@ -146,7 +146,7 @@ class TorchPickler(pickle._Pickler):
 
 
 def tensors(value: Any) -> Any:
-    """``value`` with tensors in place of its arrays."""
+    """``value`` with its arrays replaced by tensors."""
     if isinstance(value, dict):
         return {key: tensors(one) for key, one in value.items()}
     if isinstance(value, list):
@@ -155,12 +155,12 @@ def tensors(value: Any) -> Any:
 
 
 def write_torch(path: Path, value: Any, *, is_stream: bool = False) -> None:
-    """What torch.save writes; ``is_stream``: before 1.6, and still with ``_use_new_zipfile_serialization=False``."""
+    """The output of torch.save; ``is_stream``: before 1.6, or with ``_use_new_zipfile_serialization=False``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pickler = TorchPickler(stream := io.BytesIO(), is_stream=is_stream)
     pickler.dump(value)
     storages = {str(k): array for k, array in enumerate(pickler.storages)}
-    if is_stream:  # a magic number, a version, facts of the machine, the value, the names of the storages, and these
+    if is_stream:  # a magic number, a version, machine info, the value, the storage names, and the storages
         facts = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
         first = b"".join(pickle.dumps(one, 2) for one in (0x1950A86A20F9469CFC6C, 1001, facts))
         contents = b"".join(struct.pack("<q", array.size) + array.tobytes() for array in storages.values())
@@ -180,7 +180,7 @@ def write_openmask3d(folder: Path, scene: dict[str, Any], features: Any) -> None
 
 
 def write_openyolo3d(folder: Path, scene: dict[str, Any], *, has_labels: bool = False) -> None:
-    """Masks and scores; with what predict of Open-YOLO 3D gives, the positions of their classes between them."""
+    """Masks and scores; for Open-YOLO 3D's predict, with their class indices in between."""
     labels = [scene["labels"].astype(np.int64)] if has_labels else []
     columns = scene["masks"].T, *labels, scene["scores"].astype(np.float32)
     write_torch(folder / f"{scene['name']}.pt", tuple(map(Tensor, columns)))
@@ -207,7 +207,7 @@ def write_opensun3d(folder: Path, scene: dict[str, Any]) -> None:
 
 
 def write_sam3d_colours(file: Path, groups: Any) -> None:
-    """The cloud that SAM3D draws: doubles, a random colour a group, black for -1, as Open3D writes it."""
+    """The cloud drawn by SAM3D: doubles, a random colour per group, black for -1, as written by Open3D."""
     rng = np.random.default_rng(1)
     palette = np.vstack([rng.integers(1, 256, (int(np.max(groups)) + 1, 3)), np.zeros((1, 3), int)]).astype(np.uint8)
     colours, points = palette[groups], rng.random((len(groups), 3))
@@ -237,7 +237,7 @@ def own_instances() -> Instances:
 
 
 def written_in(tmp_path: Path, format: str) -> Path:
-    """A folder with one small scene in ``format``, named scene0011_00 (or replica/scene0011_00 for our own)."""
+    """A folder with one small scene in ``format``, named scene0011_00 (replica/scene0011_00 for our format)."""
     folder = tmp_path / format
     folder.mkdir()
     name = TOY["name"]
@@ -263,7 +263,7 @@ def written_in(tmp_path: Path, format: str) -> Path:
 
 
 def refused(path: Path, scene: str, format: str) -> str:
-    """The message with which a reader refuses a scene."""
+    """The message with which a reader rejects a scene."""
     with pytest.raises(PredictionError) as caught:
         READERS[format].read(path, scene)
     message = str(caught.value)
@@ -277,7 +277,7 @@ CLASSES = ["couch", "lamp", "wall"]
 
 
 def an_object(n_points: int, class_ids: list[int], **more: Any) -> dict[str, Any]:
-    """An object of ConceptGraphs with keys of every kind that its map has."""
+    """An object of ConceptGraphs with keys of every kind in its map."""
     n = len(class_ids)
     feature = RNG.normal(size=16)
     return {
@@ -319,7 +319,7 @@ def write_gradslam(folder: Path, points: Any, embeddings: Any) -> None:
 
 
 def write_object(path: Path, points: Any) -> None:
-    """A cloud as Open3D writes it: doubles, and colours behind them."""
+    """A cloud as written by Open3D: doubles, followed by colours."""
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
     colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
@@ -344,7 +344,7 @@ def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: s
 
 
 def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, is_stream: bool = True) -> None:
-    """A checkpoint of OVO: the points of its SLAM with the object of each in a column, a feature an object."""
+    """A checkpoint of OVO: the points of its SLAM with their object in a column, one feature per object."""
     cloud = {
         "xyz": np.asarray(points, np.float32),
         "obj_ids": np.asarray(ids, np.int32)[:, np.newaxis],
@@ -358,7 +358,7 @@ def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, 
 
 
 def write_esam(folder: Path, points: Any, groups: Any) -> None:
-    """What ESAM's stream demo leaves: the points (frames, points, 3) and one of its 256 colours each, 200 for none."""
+    """Output of ESAM's stream demo: the points (frames, points, 3) with one of its 256 colours each, 200 for none."""
     folder.mkdir(parents=True, exist_ok=True)
     palette = (np.random.default_rng(0).random((256, 3)) * 255).astype(int)
     palette[-1] = 200
@@ -367,7 +367,7 @@ def write_esam(folder: Path, points: Any, groups: Any) -> None:
 
 
 def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = None) -> None:
-    """Masks over the rebuilt points, class 0 and score 1 for each, its features in columns; and these points."""
+    """Masks over the reconstructed points, class 0 and score 1 for each, features in columns; and these points."""
     write_object(folder / "final.ply", points)
     arrays: dict[str, Any] = {"pred_masks": np.stack(masks, 1), "pred_score": np.ones(len(masks))}
     arrays |= {"pred_classes": np.zeros(len(masks), np.int32)}
@@ -376,7 +376,7 @@ def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = No
 
 
 def write_small(folder: Path, format: str) -> Path:
-    """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
+    """The small scene room0 in ``format``; returns the parent of the scene's folder."""
     scene = folder / "room0"
     points, rows = RNG.normal(size=(6, 3)).astype(np.float32), np.ones((6, 8), np.float32)
     ovo = {5: rows[0], 0: rows[:1]}
@@ -397,7 +397,7 @@ def write_small(folder: Path, format: str) -> Path:
 
 
 def write_fross(path: Path, clouds: list[Any]) -> None:
-    """A scene graph of the scene room0, a chain of edges through its objects."""
+    """A scene graph of the scene room0, with a chain of edges through its objects."""
     k = len(clouds)
     graph = {
         "pcd": [np.asarray(cloud, np.float64) for cloud in clouds],

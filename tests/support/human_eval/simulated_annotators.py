@@ -1,4 +1,4 @@
-"""Sets of sheets with a known truth, people who answer them with known error rates, and the files they send back."""
+"""Sets of sheets with known ground truth, annotators with known error rates, and the files they return."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from su3d_bench.human_eval.scores import Scores, score
 from su3d_bench.questions.model import KINDS
 
 SCHEMES = tuple(f"opensu3d@scheme{k}" for k in range(1, 5))
-RATES = {SCHEMES[0]: 0.5, SCHEMES[1]: 0.6, SCHEMES[2]: 0.7, SCHEMES[3]: 0.9}  # how often each is right, in truth
+RATES = {SCHEMES[0]: 0.5, SCHEMES[1]: 0.6, SCHEMES[2]: 0.7, SCHEMES[3]: 0.9}  # true accuracy of each
 SET_ID = "-0123456789ab"
 
 
 def retrieval_set(
     n_questions: int, annotators: Sequence[str] = ("ann",), scenes: Sequence[str] = ("rooms/a",)
 ) -> tuple[Sheet, Key]:
-    """Sheet and key of ``n_questions`` to each of ``SCHEMES``, each as often right as ``RATES`` says.
+    """Sheet and key of ``n_questions`` to each of ``SCHEMES``, each correct at its rate in ``RATES``.
 
-    All schemes that are right retrieve the same instance, which is one item; so do all that are wrong.
+    All correct schemes retrieve the same instance, which is one item; so do all wrong ones.
     """
     asked: list[tuple[str, KeyItem]] = []
     for k in range(n_questions):
         kind, scene = KINDS[k % len(KINDS)], scenes[k % len(scenes)]
-        place = (k // len(KINDS) + 0.5) / (n_questions // len(KINDS))  # the same shares in each kind
+        place = (k // len(KINDS) + 0.5) / (n_questions // len(KINDS))  # the same shares for each kind
         for choice in ("right", "wrong"):
             methods = tuple(one for one in SCHEMES if (place < RATES[one]) == (choice == "right"))
             if methods:
@@ -42,9 +42,9 @@ def retrieval_set(
 
 
 def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
-    """One instance for each (label n, label n', merging) of the truth; equal labels are asked once.
+    """One instance for each (label n, label n', merging) of the ground truth; equal labels are asked once.
 
-    Where they are not, label 1 is n' in every other item. An empty label n': these labels leave the instance out.
+    Otherwise label 1 is n' in every other item. An empty label n': these labels exclude the instance.
     """
     asked = []
     for k, (first, second, merging) in enumerate(truths):
@@ -60,7 +60,7 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
 
 
 def reasoning_set(truths: Sequence[tuple[str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
-    """One question for each (answer, objects) of the truth."""
+    """One question for each (answer, objects) of the ground truth."""
     asked = []
     for k, (answer, objects) in enumerate(truths):
         truth = {"answer": answer, "objects": objects}
@@ -71,7 +71,7 @@ def reasoning_set(truths: Sequence[tuple[str, str]], annotators: Sequence[str] =
 def _set(
     kind: Any, asked: Sequence[tuple[str, KeyItem]], methods: tuple[str, ...], annotators: Sequence[str]
 ) -> tuple[Sheet, Key]:
-    """A set of texts that are asked, each with its key, which says what is asked and gets its number here."""
+    """A set of texts to ask, each with its key, which describes the question and is numbered here."""
     set_id, names = kind + SET_ID, [f"item-{number:04d}" for number in range(len(asked))]
     keys = tuple(replace(key, id=name) for name, (_, key) in zip(names, asked, strict=True))
     items = tuple(
@@ -84,7 +84,7 @@ def _set(
 
 
 def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int = 0) -> list[AnswerRow]:
-    """The rows of people who err in so many of their answers, choosing any other choice but "cannot tell"."""
+    """The rows of annotators who err in that many of their answers, choosing any other choice but "cannot tell"."""
     rng = np.random.default_rng(seed)
     truth = {one.id: one.automatic for one in key.items}
     rows: list[AnswerRow] = []
@@ -100,7 +100,7 @@ def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int
 
 
 def as_csv(rows: Sequence[AnswerRow], separator: str = ",") -> str:
-    """The rows as a page exports them."""
+    """The rows as exported by a page."""
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator)
     writer.writerow(ANSWER_COLUMNS)
@@ -109,7 +109,7 @@ def as_csv(rows: Sequence[AnswerRow], separator: str = ",") -> str:
 
 
 def workbook(rows: Sequence[AnswerRow], header_at: int = 1) -> bytes:
-    """The rows as a workbook, which may have instructions above its header."""
+    """The rows as a workbook, possibly with instructions above its header."""
     book = openpyxl.Workbook()
     for k, name in enumerate(ANSWER_COLUMNS, 1):
         for number, value in enumerate((name, *(getattr(row, name) for row in rows)), header_at):
@@ -120,7 +120,7 @@ def workbook(rows: Sequence[AnswerRow], header_at: int = 1) -> bytes:
 
 
 def both(small: tuple[Sheet, Key]) -> list[AnswerRow]:
-    """The answers of two people without an error."""
+    """The answers of two annotators without errors."""
     return answered(*small, {"ann": 0.0, "bob": 0.0})
 
 

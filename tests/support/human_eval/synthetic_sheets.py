@@ -29,7 +29,7 @@ HOSTILE = (
 
 
 def drafts_of(kind: SheetKind, texts: Sequence[str]) -> list[Draft]:
-    """A draft for each text, by two methods in turn."""
+    """A draft per text, by two methods in turn."""
     asks = tuple(one.name for one in ASKS[kind])
     by = itertools.cycle((("opensu3d@scheme1",), ("opensu3d@scheme1", "opensu3d@scheme4")))
     return [
@@ -51,7 +51,7 @@ def drafts_of(kind: SheetKind, texts: Sequence[str]) -> list[Draft]:
 
 
 def painted_png(draft: Draft) -> bytes:
-    """A picture in a colour that the draft's text gives it."""
+    """A picture with a colour determined by the draft's text."""
     shade = np.frombuffer(draft.text.encode()[:3].ljust(3), np.uint8)
     return png_bytes(np.tile(shade, (60, 80, 1)).astype(np.uint8))
 
@@ -59,7 +59,7 @@ def painted_png(draft: Draft) -> bytes:
 def made(
     kind: SheetKind, texts: Sequence[str], *, seed: int = 0, annotators: int = 1, overlap: float = 0.5
 ) -> GeneratedSheets:
-    """A set of sheets of one item a text."""
+    """A set of sheets with one item per text."""
     safe = [replace(one, text=printable(one.text, 1000)) for one in drafts_of(kind, texts)]
     methods = ("opensu3d@scheme1", "opensu3d@scheme4")
     origin = Key("", kind, "runs/secret-run", "secret-code", methods, "secret-rule", ())

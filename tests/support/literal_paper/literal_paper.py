@@ -1,7 +1,7 @@
-"""OpenSU3D as the text of its paper says it, sentence by sentence: slow, sharing its settings alone with the pipeline.
+"""OpenSU3D by the text of its paper, sentence by sentence: slow, sharing only its settings with the pipeline.
 
-Numpy, a KD-tree and scikit-learn's DBSCAN. A function an equation or a sentence, which its docstring names; what the
-paper leaves open is a field of ``OpenSU3DConfig``. The whole scene is one array, and every image looks at all of it.
+NumPy, a KD-tree and scikit-learn's DBSCAN. One function per equation or sentence, named in its docstring; choices that
+the paper leaves open are fields of ``OpenSU3DConfig``. The whole scene is one array, and every image uses all of it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 
 Array = NDArray[Any]
-View = tuple[int, int]  # the index of an image, and the row of a detection in what was found there
+View = tuple[int, int]  # the index of an image, and the row of a detection in it
 
 NONE = -1
 
 
 class Cloud(NamedTuple):
-    """Points (N, 3) and the ID (N,) of each, ``NONE`` where there is none."""
+    """Points (N, 3) and the ID (N,) of each, ``NONE`` if there is none."""
 
     points: Array
     ids: Array
@@ -39,7 +39,7 @@ class Cloud(NamedTuple):
 
 
 class Sighting(NamedTuple):
-    """What is stored of a detection: its points, and the metadata n, c, s_pred, f_MS and f_G."""
+    """The stored data of a detection: its points, and the metadata n, c, s_pred, f_MS and f_G."""
 
     points: Array
     name: str
@@ -50,7 +50,7 @@ class Sighting(NamedTuple):
 
 
 class Thing(NamedTuple):
-    """An element (P, n, c, f_MV, bb_3D, centroid) of the map M, with the views that Q holds for it.
+    """An element (P, n, c, f_MV, bb_3D, centroid) of the map M, with its views in Q.
 
     ``rows`` are those of P_scene.
     """
@@ -67,7 +67,7 @@ class Thing(NamedTuple):
 def mask_image(masks: Array, border_px: int, shape: str) -> Array:
     """M': "masks M are updated to M' with these IDs as per-pixel labels, including a border of px pixels around each".
 
-    The largest first, so that of masks that overlap the smaller shows; a ring is of no instance, also on other masks.
+    Largest first, so that the smaller of overlapping masks is on top; a ring has no instance, even on other masks.
     """
     image = np.full(masks.shape[1:], NONE)
     for k in sorted(range(len(masks)), key=lambda k: -np.count_nonzero(masks[k])):
@@ -77,12 +77,12 @@ def mask_image(masks: Array, border_px: int, shape: str) -> Array:
 
 
 def around(mask: Array, border_px: int, shape: str) -> Array:
-    """The pixels no further than ``border_px`` from a pixel of ``mask``, itself among them."""
+    """The pixels at most ``border_px`` from a pixel of ``mask``, including the mask."""
     from scipy.ndimage import distance_transform_cdt, distance_transform_edt
 
     near = mask.copy()
     if mask.any():
-        # Only where the border can reach: the distances of a whole image take long.
+        # Only where the border can reach: distances of a whole image are slow.
         v, u = (slice(max(one.min() - border_px, 0), one.max() + border_px + 1) for one in np.nonzero(mask))
         outside = ~mask[v, u]
         distance = distance_transform_edt(outside) if shape == "disc" else distance_transform_cdt(outside, "chessboard")
@@ -103,14 +103,14 @@ def back_projected(depth: Array, intrinsics: Array, pose: Array, image: Array, s
 
 
 def cells_of(*columns: Array) -> Array:
-    """A number (N,) for each row of whole ``columns`` (N, any): equal rows have equal numbers, others have not."""
+    """A number (N,) for each row of integer ``columns`` (N, any): equal exactly for equal rows."""
     rows = np.column_stack(columns).astype(np.int64)
     rows -= rows.min(axis=0)
     return np.asarray(np.ravel_multi_index(tuple(rows.T), tuple(rows.max(axis=0) + 1)))
 
 
 def reduced(cloud: Cloud, voxel: float) -> Cloud:
-    """One point a voxel an ID: the first."""
+    """One point per voxel and ID: the first."""
     if voxel == 0 or not len(cloud.ids):
         return cloud
     _, first = np.unique(cells_of(np.floor(cloud.points / voxel), cloud.ids), return_index=True)
@@ -118,7 +118,7 @@ def reduced(cloud: Cloud, voxel: float) -> Cloud:
 
 
 def crop_of(scene: Cloud, frame: Cloud, eps: float) -> Array:
-    """P'_scene: "only points within the bounds of P_frame", which eps widens so that every match lies inside."""
+    """P'_scene: "only points within the bounds of P_frame", widened by eps so that every match is inside."""
     low, high = frame.points.min(axis=0) - eps, frame.points.max(axis=0) + eps
     return np.asarray(((scene.points >= low) & (scene.points <= high)).all(axis=1))
 
@@ -135,7 +135,7 @@ def index_pairs(frame: Cloud, crop: Cloud, eps: float) -> tuple[Array, Array]:
 
 
 def replaced_ids(frame: Cloud, crop: Cloud, settings: OpenSU3DConfig) -> dict[int, int]:
-    """ID_f to ID_s where Eq. 2 says so: "if OverlapRatio >= rho, we perform an ID replacement"."""
+    """ID_f to ID_s according to Eq. 2: "if OverlapRatio >= rho, we perform an ID replacement"."""
     i_frame, i_scene = index_pairs(frame, crop, settings.eps)
     same: dict[int, int] = {}
     for id_f in frame.named:
@@ -143,7 +143,7 @@ def replaced_ids(frame: Cloud, crop: Cloud, settings: OpenSU3DConfig) -> dict[in
         id_s, c_s = np.unique(met[met != NONE], return_counts=True)
         if not len(id_s):
             continue
-        most = int(np.argmax(c_s))  # of equal ones the lowest ID
+        most = int(np.argmax(c_s))  # the lowest ID in a tie
         c_f, of_scene = np.count_nonzero(frame.ids == id_f), np.count_nonzero(crop.ids == id_s[most])
         divisor = {
             "as-printed": min(c_f, c_s[most]),
@@ -159,7 +159,7 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConf
     """P_scene after "P'_frame, which is then concatenated to P_scene"; ``near`` (N,) are the points of P'_scene.
 
     "Additionally, set of points from P'_scene can also be deleted to retain constant sparsity": those whose voxel a new
-    point takes, but none of an instance for a point of none, which is then left out itself.
+    point takes, but no instance point for a point of none, which is then dropped itself.
     """
     if settings.density == "all":
         return scene.followed_by(frame)
@@ -177,19 +177,19 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConf
 
 
 def one_per_voxel(voxel: Array, is_instance: Array, step: int) -> Array:
-    """Whether a point is the first of its voxel, or the last (step -1): of those of instances where there is one."""
+    """Whether a point is the first of its voxel, or the last (step -1): of instance points if there are any."""
     in_turn = np.lexsort([step * np.arange(len(voxel)), ~is_instance])
     _, first = np.unique(voxel[in_turn], return_index=True)
     return np.isin(np.arange(len(voxel)), in_turn[first])
 
 
 def cosine(a: Array, b: Array) -> float:
-    """The bracket of the two updated fusion equations, with their 1e-8."""
+    """The bracket in the two updated fusion equations, with their 1e-8."""
     return float(a @ b) / max(float(np.linalg.norm(a)) * float(np.linalg.norm(b)), 1e-8)
 
 
 def multi_scale_feature(crops: Sequence[Array], settings: OpenSU3DConfig) -> Array:
-    """f_MS of the k crops: the direct mean, or the weighted one in which f_1, the best-fit crop, is that of ratio 1."""
+    """f_MS of the k crops: the plain mean, or the weighted one in which f_1, the best-fit crop, has ratio 1."""
     k = len(crops)
     if settings.fusion.multi_scale == "direct":
         return np.asarray(sum(crops) / k)
@@ -198,7 +198,7 @@ def multi_scale_feature(crops: Sequence[Array], settings: OpenSU3DConfig) -> Arr
 
 
 def multi_view_feature(top: Sequence[Sighting], settings: OpenSU3DConfig) -> Array:
-    """f_MV of the top m views: the direct mean, or with the images' own features, both terms inside the sum."""
+    """f_MV of the top m views: the plain mean, or with the images' own features, both terms inside the sum."""
     m = len(top)
     if settings.fusion.multi_view == "direct":
         return np.asarray(sum(one.multi_scale for one in top) / m)
@@ -206,7 +206,7 @@ def multi_view_feature(top: Sequence[Sighting], settings: OpenSU3DConfig) -> Arr
 
 
 def clusters_of(points: Array, settings: OpenSU3DConfig) -> list[Array]:
-    """The rows of each cluster "with points >= 80% of the largest cluster", the largest first; the rest is noise."""
+    """The rows of each cluster "with points >= 80% of the largest cluster", largest first; the rest is noise."""
     from sklearn.cluster import DBSCAN
 
     dbscan = DBSCAN(eps=settings.dbscan_eps, min_samples=settings.dbscan_min_points, algorithm="kd_tree")
@@ -216,7 +216,7 @@ def clusters_of(points: Array, settings: OpenSU3DConfig) -> list[Array]:
 
 
 class PaperProgram:
-    """P_scene, Q and the stored metadata, which grow image by image."""
+    """P_scene, Q and the stored metadata, extended image by image."""
 
     def __init__(self, settings: OpenSU3DConfig) -> None:
         self.settings = settings
@@ -225,9 +225,9 @@ class PaperProgram:
         self.seen: dict[View, Sighting] = {}
 
     def add_image(self, frame: Any, detections: Any) -> None:
-        """Takes in an image I' with what was found in it: section "2D to 3D Fusion & Tracking"."""
+        """Processes an image I' with its detections: section "2D to 3D Fusion & Tracking"."""
         settings = self.settings
-        width = frame.depth_m.shape[1]  # the paper's px are those of images of the reference width
+        width = frame.depth_m.shape[1]  # the paper's px refer to images of the reference width
         px = settings.border_px * (width / settings.border_reference_width if settings.border_reference_width else 1)
         image = mask_image(detections.masks, round(px), settings.border_shape)
         cloud = back_projected(frame.depth_m, frame.intrinsics, frame.camera_to_world, image, settings)
@@ -246,7 +246,7 @@ class PaperProgram:
         self.scene = concatenated(self.scene, near, Cloud(cloud.points, updated), settings)
 
     def sighting(self, detections: Any, k: int, points: Array) -> Sighting:
-        """What is stored of detection ``k``."""
+        """The stored data of detection ``k``."""
         crops = [
             np.asarray(detections.crop_features[k, detections.crop_ratios.index(ratio)], float)
             for ratio in self.settings.fusion.crop_ratios
@@ -262,7 +262,7 @@ class PaperProgram:
         )
 
     def things(self) -> list[Thing]:
-        """M, section "Post Processing": for each i of uniq(ID of P_scene) the instances that DBSCAN finds in it."""
+        """M, section "Post Processing": for each i of uniq(ID of P_scene) the instances found in it by DBSCAN."""
         found = []
         for parent in self.scene.named:
             own = np.flatnonzero(self.scene.ids == parent)
@@ -275,14 +275,14 @@ class PaperProgram:
         return found
 
     def hits(self, view: View, points: Array) -> bool:
-        """Whether the mask of ``view``, back-projected, lies on ``points``: both have a point in one voxel of eps."""
+        """Whether the back-projected mask of ``view`` overlaps ``points``: both have a point in one voxel of eps."""
         of_mask, of_points = (np.floor(cloud / self.settings.eps) for cloud in (self.seen[view].points, points))
         return not {*map(tuple, of_mask)}.isdisjoint(map(tuple, of_points))
 
     def thing(self, rows: Array, views: list[View]) -> Thing:
         """Label and caption "corresponding to the highest S'_pred", f_MV of the top m, box and centroid of P_i."""
         points = self.scene.points[rows]
-        by_score = sorted(views, key=lambda view: -self.seen[view].score)  # of equal ones the earlier
+        by_score = sorted(views, key=lambda view: -self.seen[view].score)  # the earlier in a tie
         top = [self.seen[view] for view in by_score[: self.settings.top_m]]
         return Thing(
             rows,

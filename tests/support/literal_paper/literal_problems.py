@@ -1,4 +1,4 @@
-"""Random problems for the paper's text and the pipeline, and their settings."""
+"""Random problems and settings for the literal paper and the pipeline."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Problem(NamedTuple):
 
 
 def random_problem(seed: int) -> Problem:
-    """A wall with boxes before it, seen by a camera that trembles or moves, and masks that do so too."""
+    """A wall with boxes in front, seen by a camera that trembles or moves, and masks that do too."""
     rng = np.random.default_rng(seed)
     settings = random_settings(rng)
     height, width = (int(n) for n in rng.integers(10, 30, 2))
@@ -41,7 +41,7 @@ def random_problem(seed: int) -> Problem:
     return Problem(settings, tuple(images))
 
 
-# Values of tiny images and the defaults come up more often.
+# Values for tiny images and defaults are more frequent.
 CHOICES: dict[str, tuple[Any, ...]] = {
     "multi_scale": ("direct", "weighted"),
     "multi_view": ("direct", "global"),
@@ -64,7 +64,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 
 def random_settings(rng: np.random.Generator) -> OpenSU3DConfig:
-    """Any values that the settings can take together."""
+    """Random values, in combinations allowed by the settings."""
     chosen = {name: values[rng.integers(len(values))] for name, values in CHOICES.items()}
     ratios = rng.choice([0.8, 1.2, 2.0, 4.0], rng.integers(4), replace=False).tolist()
     if chosen["multi_scale"] == "weighted" or not ratios or rng.random() < 0.5:
@@ -72,14 +72,14 @@ def random_settings(rng: np.random.Generator) -> OpenSU3DConfig:
     if chosen["frame_voxel"] is not None:
         chosen["frame_voxel"] *= chosen["eps"]
     if chosen["density"] != "scene":
-        chosen["dbscan_eps"] = 5.0  # which views hit a part is settled where a voxel's points are of one instance
+        chosen["dbscan_eps"] = 5.0  # which views hit a part is determined if a voxel's points are of one instance
     if chosen["background_pixels"] == "drop":
         chosen["border_pixels"] = "drop"
     return OpenSU3DConfig(crop_ratios=tuple(ratios), **chosen)
 
 
 def random_depth(rng: np.random.Generator, height: int, width: int) -> Array:
-    """Metres to a slanted wall with up to three boxes before it."""
+    """Metres to a slanted wall with up to three boxes in front."""
     v, u = np.mgrid[:height, :width]
     depth = rng.uniform(0.8, 1.2) + rng.uniform(-0.01, 0.01) * u + rng.uniform(-0.01, 0.01) * v
     for _ in range(int(rng.integers(0, 4))):
@@ -88,7 +88,7 @@ def random_depth(rng: np.random.Generator, height: int, width: int) -> Array:
 
 
 def random_masks(rng: np.random.Generator, height: int, width: int, n: int) -> Array:
-    """Masks (n, H, W), rectangles or two of them, which may overlap, be equal or cover all."""
+    """Masks (n, H, W), rectangles or pairs of them, which may overlap, be equal or cover everything."""
     masks = np.zeros((n, height, width), bool)
     for mask in masks:
         for _ in range(int(rng.integers(1, 3))):
@@ -102,7 +102,7 @@ def random_rectangle(rng: np.random.Generator, height: int, width: int) -> tuple
 
 
 def random_pose(rng: np.random.Generator, turn: float, move: float) -> Array:
-    """Camera to world: a turn of about so many radians and a step of about so many metres."""
+    """Camera to world: a rotation of about that many radians and a step of about that many metres."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", rng.normal(0, turn, 3)).as_matrix()
     pose[:3, 3] = rng.normal(0, move, 3)
@@ -110,7 +110,7 @@ def random_pose(rng: np.random.Generator, turn: float, move: float) -> Array:
 
 
 def random_detections(rng: np.random.Generator, index: int, masks: Array, settings: OpenSU3DConfig) -> Detections:
-    """Some of ``masks``, shifted by a pixel or not, in another order, and now and then one that only this image has."""
+    """Some of ``masks``, possibly shifted by a pixel, in another order, and sometimes one unique to this image."""
     seen = [np.roll(mask, rng.integers(-1, 2, 2), axis=(0, 1)) for mask in rng.permutation(masks) if rng.random() < 0.8]
     if rng.random() < 0.2:
         _, height, width = masks.shape

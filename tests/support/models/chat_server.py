@@ -1,4 +1,4 @@
-"""An OpenAI-compatible server on loopback that behaves as a test tells it to, and counts what it is asked."""
+"""An OpenAI-compatible server on loopback that behaves as instructed by a test, and records requests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Body = dict[str, Any]
 
 @dataclass
 class Answered:
-    """What the server does with a request: a chat completion of ``text``, or something else."""
+    """The server's reaction to a request: a chat completion of ``text``, or something else."""
 
     text: str = "ok"
     status: int = 200
@@ -53,7 +53,7 @@ def completion(body: Body, answered: Answered) -> bytes:
 
 
 class ChatServer(LocalServer):
-    """``script`` is worked off first, one answer a request; after it ``answer`` says what to do with a body."""
+    """``script`` is used up first, one answer per request; after that ``answer`` maps a body to an answer."""
 
     def __init__(self) -> None:
         self.forget()
@@ -63,7 +63,7 @@ class ChatServer(LocalServer):
         self.url = f"http://127.0.0.1:{self.port}/v1"
 
     def forget(self) -> None:
-        """As nothing had been asked: no script, "ok" to every body, nothing counted."""
+        """Reset: no script, "ok" to every body, no recorded requests."""
         self.script: list[Answered] = []
         self.answer: Callable[[Body], Answered] = lambda body: Answered()
         self.bodies: list[Body] = []

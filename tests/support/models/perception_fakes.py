@@ -1,4 +1,4 @@
-"""Small stand-ins that the tests of perception share."""
+"""Small stand-ins shared by the tests of perception."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ INTRINSICS: Float64Array = np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 
 
 
 class CountingEncoder:
-    """A deterministic encoder of colour statistics that counts the images it is asked for."""
+    """A deterministic encoder of colour statistics that counts the images it encodes."""
 
     name = "counting"
     digest = "counting-1"

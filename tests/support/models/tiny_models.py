@@ -1,4 +1,4 @@
-"""Tiny networks with random weights in the forms in which the published ones come, and images to run them on."""
+"""Tiny networks with random weights in the published formats, and images to run them on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SAM_PX = 64
 
 
 def write_models(root: Path) -> Path:
-    """Folders of tiny SAM and GroundingDINO in the hub's form under the names that they are looked for."""
+    """Folders of tiny SAM and GroundingDINO in the hub's format, with the expected names."""
     for name, model in (("sam-vit-h", tiny_sam()), ("grounding-dino", tiny_dino())):
         model.save_pretrained(root / name)
         (root / name / "preprocessor_config.json").write_text("{}")
@@ -30,10 +30,10 @@ def write_models(root: Path) -> Path:
 
 
 def write_fetched(root: Path) -> Path:
-    """Tiny networks in the folders of the models that are fetched for the papers, RAM++ as its export."""
+    """Tiny networks in the folders of the models fetched for the papers, RAM++ as its export."""
     write_models(root)
     for name, seed in (("clip-vit-h-14", 14), ("clip-vit-l-14-336", 336)):
-        write_tiny_clip(root / name, seed, n_tokens=77)  # as published, so that no text is cut
+        write_tiny_clip(root / name, seed, n_tokens=77)  # as published, so that no text is truncated
     write_tagger(root / "ram-plus-onnx", [word for word in DINO_WORDS if word.isalpha() and len(word) > 1])
     return root
 
@@ -41,7 +41,7 @@ def write_fetched(root: Path) -> Path:
 def paper_words(models: Path, out: Path, scene: str, settings: Sequence[str] = (), *words: str) -> list[str]:
     """``su3d-bench run --profile paper`` on the models of ``write_models``, over two small images of a scene."""
     lenient = [f"models.folder={models}", "models.encoder=embedded", "paper.n_tags=6"]
-    # Random masks are scattered over the image; their own boxes would be too large to count.
+    # Random masks are scattered over the image; their boxes would be too large to count.
     lenient += ["paper.grounded.boxes.box_threshold=0.3", "paper.grounded.region_boxes=detector"]
     lenient += ["paper.automatic.points_per_side=2", "paper.automatic.pred_iou_thresh=0"]
     lenient += ["paper.automatic.stability_score_thresh=0", "paper.automatic.box_nms_thresh=1.0"]
@@ -66,7 +66,7 @@ def frame_of(rgb: UInt8Array, index: int = 0) -> Frame:
 
 
 def noise_images(n: int, seed: int = 0) -> list[UInt8Array]:
-    """RGB images of different sizes, one of them a single pixel high, in colours that differ."""
+    """RGB images of different sizes, one of them a single pixel high, in different colours."""
     rng = np.random.default_rng(seed)
     sizes = [((1, 9), (50, 20), (33, 90), (64, 64), (120, 45))[k % 5] for k in range(n)]
     return [rng.integers(0, 256, (*size, 3), np.uint8) // 2 + rng.integers(0, 128, 3, np.uint8) for size in sizes]
@@ -94,14 +94,14 @@ def tiny_sam() -> Any:
     model = transformers.SamModel(config)
     with torch.no_grad():
         for parameter in model.parameters():
-            if parameter.dim() > 1:  # weights that carry signals on; as initialised all images look the same
+            if parameter.dim() > 1:  # weights that propagate signals; as initialised all images look the same
                 parameter.normal_(0, 1.5 / parameter[0].numel() ** 0.5)
     return model.eval()
 
 
 # ---- GroundingDINO
 
-# Where transformers' GroundingDINO expects its marks, those of bert-base-uncased.
+# Ids of special tokens expected by transformers' GroundingDINO, as in bert-base-uncased.
 _MARKS = {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]", 1012: ".", 1029: "?"}
 _N_WORDS, _FIRST_WORD = 1100, 200
 DINO_WORDS = (
@@ -138,7 +138,7 @@ def tiny_dino() -> Any:
 
 
 def tiny_tokenizer(folder: Path) -> Any:
-    """A tokenizer over ``vocab.txt`` in ``folder``: bert's marks in their places, and some words."""
+    """A tokenizer over ``vocab.txt`` in ``folder``: bert's special tokens at their ids, and some words."""
     named = {_FIRST_WORD + k: word for k, word in enumerate(DINO_WORDS)} | _MARKS
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "vocab.txt").write_text("".join(f"{named.get(k, f'[unused{k}]')}\n" for k in range(_N_WORDS)))
@@ -159,7 +159,7 @@ _LAYERS = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "
 
 
 def write_tiny_clip(folder: Path, seed: int = 0, n_tokens: int = N_TOKENS) -> Path:
-    """A CLIP of two layers as transformers saves it."""
+    """A two-layer CLIP as saved by transformers."""
     n_words = write_clip_tokenizer(folder)
     ends = {"bos_token_id": n_words - 2, "eos_token_id": n_words - 1, "pad_token_id": n_words - 1}
     words = {"vocab_size": n_words, "max_position_embeddings": n_tokens, **ends}
@@ -169,7 +169,7 @@ def write_tiny_clip(folder: Path, seed: int = 0, n_tokens: int = N_TOKENS) -> Pa
 
 
 def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
-    """A SigLIP of two layers as transformers saves it, with a ``tokenizer.json`` of whole words."""
+    """A two-layer SigLIP as saved by transformers, with a ``tokenizer.json`` of whole words."""
     tokenizers = require("tokenizers", "a stand-in of SigLIP")
     folder.mkdir(parents=True, exist_ok=True)
     known = {word: k for k, word in enumerate(["<unk>", "</s>", *CLIP_WORDS])}
@@ -184,7 +184,7 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
 def _write_encoder(
     folder: Path, seed: int, kind: str, words: dict[str, Any], images: dict[str, Any], **more: int
 ) -> Path:
-    """An encoder with larger random weights than a fresh one has, so that features of different inputs differ."""
+    """An encoder with larger random weights than initially, so that features of different inputs differ."""
     import torch
 
     transformers = require_transformers("a stand-in of an encoder")
@@ -223,7 +223,7 @@ def write_clip_tokenizer(folder: Path) -> int:
     return len(vocabulary)
 
 
-# ---- RAM++ as it is exported
+# ---- RAM++ as exported
 
 _N_SEEN = 3 * 4**2  # mean colours of 4 x 4 cells of 96 px
 _RAM_PLUS = """
@@ -239,7 +239,7 @@ ram_plus (float[1, 3, {px}, {px}] image) => (float[1, {n}] tag) {{
 
 
 def write_tagger(folder: Path, tags: Sequence[str], seed: int = 0) -> Path:
-    """A network that answers ``image`` (1, 3, 384, 384) with ``tag`` (1, T): 1 for some of ``tags``, by colours."""
+    """A network that maps ``image`` (1, 3, 384, 384) to ``tag`` (1, T): 1 for some of ``tags``, by colours."""
     onnx = require("onnx", "a stand-in of RAM++")
     random = np.random.default_rng(seed)
     weight = (random.normal(size=(_N_SEEN, len(tags))) / _N_SEEN**0.5).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Made problems of boxes, which VoteNet's evaluation and this program both answer.
+"""Synthetic box problems, answered by both VoteNet's evaluation and this program.
 
-A problem is a list of scenes. In a scene all boxes are turned about y by one ``heading`` in radians: ``true`` boxes
-with a class, a middle and sizes in metres, and those ``found`` with a confidence too, no two in a problem alike.
+A problem is a list of scenes. In a scene all boxes are rotated about y by one ``heading`` in radians: ``true`` boxes
+with a class, centre and sizes in metres, and ``found`` ones also with a confidence, all different within a problem.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def turn(heading: float) -> Float64Array:
 
 
 def names_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
-    """The id and name of each slot's class."""
+    """The id and name of the class of each slot."""
     return {k: (entry.id, entry.name) for k in SLOTS for entry in [rules.scored[5 * k + 2]]}
 
 
 def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
-    """The score of a scene; an instance is the corners of its box."""
+    """The score of a scene; an instance is given by the corners of its box."""
     classes, rotation = names_of(rules), turn(scene["heading"])
     labels = LabelSet(rules.label_space, *(tuple(column) for column in zip(*classes.values(), strict=True)))
     true = {k + 1: one for k, one in enumerate(scene["true"])}

@@ -1,4 +1,4 @@
-"""Made problems of instances, which original evaluators and this program both answer: runs of points and masks.
+"""Synthetic instance problems, answered by both original evaluators and this program: runs of points and masks.
 
 A problem is a list of scenes. A scene has its ``truth`` as [class, number, length] of runs of points and ``masks`` with
 a class, a score and runs [start, end]. Classes are slots: four that are scored, -2 one that is not, -1 void.
@@ -28,13 +28,13 @@ def members(mask: dict[str, Any]) -> Int64Array:
 
 
 def columns_of(scene: Scene) -> tuple[Int64Array, Int64Array]:
-    """The slot (N,) and the instance number (N,) of every point."""
+    """The slot (N,) and instance number (N,) of every point."""
     slot, number, length = (np.array(column) for column in zip(*scene["truth"], strict=True))
     return np.repeat(slot, length), np.repeat(number, length)
 
 
 def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
-    """The score of a scene under a protocol of instances."""
+    """The score of a scene under an instance protocol."""
     ids, names = classes_of(rules)
     slots, numbers = columns_of(scene)
     known = [one for one in ids if one != VOID]
@@ -49,18 +49,18 @@ def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
 
 
 def _points(n: int) -> Float32Array:
-    """A point a metre, so that each has one neighbour within reach: itself."""
+    """One point per metre, so that each has one neighbour within reach: itself."""
     points = np.zeros((n, 3), np.float32)
     points[:, 0] = np.arange(n)
     return points
 
 
 def classes_of(rules: ProtocolRules) -> tuple[dict[int, int], dict[int, str]]:
-    """The ids and names that a protocol has for the slots."""
+    """A protocol's ids and names of the slots."""
     if not rules.classes:
         return {VOID: 0, LEFT_OUT: 1, 0: 4, 1: 7, 2: 11, 3: 21}, {one: f"c{one}" for one in (LEFT_OUT, VOID, *SCORED)}
     first = 0 if rules.name == "scannet200-instance" else 3
-    step = 3 if rules.name.startswith("openscan") else 7  # the next would be the first again among 21
+    step = 3 if rules.name.startswith("openscan") else 7  # the next would repeat the first among 21
     entries = {k: rules.scored[(step * k + first) % len(rules.scored)] for k in SCORED}
     left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
     return (

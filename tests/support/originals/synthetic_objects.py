@@ -1,8 +1,8 @@
-"""Made problems of objects that vote for the points near them, which OVO's script and this program both answer.
+"""Synthetic problems of objects that vote for nearby points, answered by both OVO's script and this program.
 
-A problem is a list of scenes. A scene has the ``truth`` of every vertex, an index of a class or -1, void. Either a
-class is ``called`` on each vertex, or ``places_mm`` are where the vertices are, ``own_mm`` the points of a map,
-``owner`` the object of each, -1 for none, and ``of_object`` the class of each object. Predicted -1 is no class.
+A problem is a list of scenes. A scene has the ``truth`` of every vertex, a class index or -1 (void). Either a
+class is ``called`` on each vertex, or ``places_mm`` are the vertex positions, ``own_mm`` the points of a map,
+``owner`` the object of each (-1 for none), and ``of_object`` the class of each object. Predicted -1 is no class.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GROUPS = ("head", "common", "tail")
 
 
 def slots_of(rules: ProtocolRules, problem: Problem) -> Problem:
-    """The problem in the indices of a protocol's classes."""
+    """The problem with a protocol's class indices."""
     named = [k for k, entry in enumerate(rules.classes) if entry.name != rules.unnamed]
     unnamed = next(k for k, entry in enumerate(rules.classes) if entry.name == rules.unnamed)
     index = np.array([*(named[(7 * k + 1) % len(named)] for k in range(N_SLOTS - 1)), unnamed, NONE])
@@ -37,15 +37,15 @@ def slots_of(rules: ProtocolRules, problem: Problem) -> Problem:
 
 
 def our_means(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The means over all classes and over thirds of them, NaN where a third has no class that is true or called."""
+    """The means over all classes and over thirds of them; NaN if no class of a third is true or called."""
     found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
     of_groups = [found.groups[group][key] for group in GROUPS for key in OVERALL[:2]]
     return np.array([*(found.metrics[key] for key in OVERALL), *of_groups], float)
 
 
 def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
-    """The score of vertices of classes, -1 is void; a class is ``called`` on each, or of the objects of a map, where -1
-    is none."""
+    """The score of vertices with classes, -1 is void; a class is ``called`` on each, or given by the objects of a map,
+    -1 for none."""
     kinds = np.array(scene["truth"])
     places = np.array(scene.get("places_mm", [[1000 * k, 0, 0] for k in range(len(kinds))])) / 1000
     if "called" in scene:

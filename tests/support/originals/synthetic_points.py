@@ -1,8 +1,8 @@
-"""Made problems of one class a point, which original evaluators and this program both answer.
+"""Synthetic problems with one class per point, answered by both original evaluators and this program.
 
-A problem is a list of scenes. A scene has the ``truth`` of every point and what it is ``called``: 0 to 7 are scored
-classes, 8 is none that is scored, -1 void or nothing. ``places_mm`` are where the true points are, ``own_mm`` those of
-the prediction and ``seen_mm`` those that are scored, where these are others.
+A problem is a list of scenes. A scene has the ``truth`` of every point and its prediction ``called``: 0 to 7 are scored
+classes, 8 is not scored, -1 void or nothing. ``places_mm`` are the positions of the true points, ``own_mm`` of
+predicted points and ``seen_mm`` of scored points, if these differ.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ VOID, OTHER = -1, 8
 
 
 def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
-    """The id and name that a protocol has for each slot but void."""
+    """A protocol's id and name of each slot except void."""
     left = [(entry.id, entry.name) for entry in rules.classes if rules.is_ignored(entry.name)]
     scored = {k: rules.scored[(3 * k + 1) % len(rules.scored)] for k in range(OTHER)}
     return {
@@ -33,7 +33,7 @@ def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
 
 
 def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
-    """The score of a scene under a protocol of points."""
+    """The score of a scene under a point protocol."""
     of_slot = classes_of(rules)
     kinds, called = np.array(scene["truth"]), np.array(scene["called"])
     places = np.array(scene.get("places_mm", [[1000 * k, 0, 0] for k in range(len(kinds))])) / 1000

@@ -1,4 +1,4 @@
-"""Made problems of text queries, which ScanNet's script and this program both answer: runs of points, masks, cosines.
+"""Synthetic text query problems, answered by both ScanNet's script and this program: runs of points, masks, cosines.
 
 A problem is a list of scenes. A scene has ``objects`` as [id, length] of runs of points, -1 for none, ``queries`` as
 lists of ids, ``masks`` as [start, end] and for each mask its ``cosines`` with the queries.

@@ -1,8 +1,8 @@
-"""Made problems of labelled points in segments of things and of stuff, which panopticapi and this program both answer.
+"""Synthetic problems of labelled points in segments of things and stuff, for both panopticapi and this program.
 
 A problem is a list of scenes. A scene has the ``truth`` of every point, its ``instance`` (0 for none), its ``owner``
-among the predicted masks (-1 for none) and what each mask is ``called``. 0 to 2 are things, 3 and 4 stuff, 5 is a class
-that is not scored, -1 no label, -2 a point that evaluations leave out where the dataset has such.
+among the predicted masks (-1 for none) and the class ``called`` of each mask. 0-2 are things, 3-4 stuff, 5 is a class
+that is not scored, -1 no label, -2 a point excluded by evaluations if the dataset has such points.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PARTS = ("", " things", " stuff")
 
 
 def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
-    """The id and name that a protocol has for each slot of a class."""
+    """A protocol's id and name of each slot of a class."""
     things = [entry for entry in rules.scored if entry.name not in rules.stuff]
     stuff = [entry for entry in rules.scored if entry.name in rules.stuff]
     left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
@@ -34,12 +34,12 @@ def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
 
 
 def has_left_out(rules: ProtocolRules) -> bool:
-    """Whether the truth has points that evaluations leave out; elsewhere they have no label."""
+    """Whether the ground truth has points excluded from evaluation; otherwise they have no label."""
     return rules.label_space == "scannetpp"
 
 
 def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
-    """The score of a scene, its points a metre from one another."""
+    """The score of a scene, with points one metre apart."""
     of_slot = classes_of(rules)
     id_of = {slot: number for slot, (number, _) in of_slot.items()}
     id_of |= {UNLABELLED: 0, LEFT_OUT: -1 if has_left_out(rules) else 0}
@@ -59,7 +59,7 @@ def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
 
 
 def our_qualities(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """PQ, SQ and RQ of all classes, of things, of stuff, and of each slot, 0 for one of which there is nothing."""
+    """PQ, SQ and RQ of all classes, of things, of stuff, and of each slot, 0 if a class does not occur."""
     found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
     means = [found.metrics[name + part] for part in PARTS for name in QUALITIES]
     slots = [name for _, name in classes_of(rules).values()][:N_SCORED]

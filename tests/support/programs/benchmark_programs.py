@@ -1,4 +1,4 @@
-"""The measuring programs of ``benchmarks``, for the tests of what they promise."""
+"""The programs in ``benchmarks``, for tests of their output."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ from places import ROOT
 
 
 def benchmark_program(name: str) -> ModuleType:
-    """The module ``name`` of ``benchmarks``, with what it imports from the others."""
+    """The module ``name`` of ``benchmarks``, and the modules that it imports there."""
     runpy.run_path(str(ROOT / "benchmarks" / "measuring" / "folders.py"))
     return importlib.import_module(name)

@@ -22,7 +22,7 @@ FLAGS: tuple[str, ...] = (
     "--remote-debugging-pipe",
 )  # fmt: skip
 WAIT_S = 120.0
-# What a page's own controls know keys by.
+# Key names as seen by the page's controls.
 KEY_CODES = {
     "Tab": 9, "Enter": 13, "Escape": 27, "Space": 32, "End": 35, "Home": 36, "ArrowLeft": 37, "ArrowUp": 38,
     "ArrowRight": 39, "ArrowDown": 40, "Backspace": 8,
@@ -30,23 +30,23 @@ KEY_CODES = {
 
 
 def find_chromium() -> str | None:
-    """The browser's program; None where none is installed."""
+    """Path of the browser; None if none is installed."""
     return next((found for name in NAMES if (found := shutil.which(name)) is not None), None)
 
 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium: apt-get install chromium")
 
 
-# What the browser answers where the page that was asked goes away.
+# Answers of the browser if the page navigates away.
 LEAVES = ("navigated or closed", "context was destroyed")
 
 
 class PageLeftError(Exception):
-    """The page went away before it answered."""
+    """The page navigated away before it answered."""
 
 
 class Chromium:
-    """A browser with one page; its profile is in ``folder`` and stays there, so that a second one finds it again."""
+    """A browser with one page; its profile stays in ``folder``, so that a second one can use it."""
 
     def __init__(self, folder: Path, *, width: int = 1280, height: int = 800, is_phone: bool = False) -> None:
         program = find_chromium()
@@ -55,7 +55,7 @@ class Chromium:
         self._read, from_browser = os.pipe()
         self._rest, self._number = b"", 0
         command = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
-        # The protocol speaks on descriptors 3 and 4; a plain sh knows descriptors above 9 by their paths alone.
+        # The protocol uses descriptors 3 and 4; plain sh can access descriptors above 9 only by path.
         shell = ["sh", "-c", f'exec "$@" 3</dev/fd/{to_browser} 4>/dev/fd/{from_browser}', "sh", *command]
         self._process = subprocess.Popen(
             shell, pass_fds=(to_browser, from_browser), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -84,7 +84,7 @@ class Chromium:
         os.close(self._read)
 
     def call(self, method: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Ask the page; what it says unasked in the meantime is kept in ``messages``."""
+        """Send a command to the page; unrelated messages received meanwhile are kept in ``messages``."""
         return self._call(method, values or {}, self._session)
 
     def _call(self, method: str, values: Mapping[str, Any], session: str | None) -> dict[str, Any]:
@@ -111,22 +111,22 @@ class Chromium:
             ready, _, _ = select.select([self._read], [], [], max(0.0, end - time.monotonic()))
             assert ready, "the browser does not answer"
             part = os.read(self._read, 1 << 16)
-            assert part, "the browser has gone"
+            assert part, "the browser has exited"
             self._rest += part
         line, _, self._rest = self._rest.partition(b"\0")
         answer: dict[str, Any] = json.loads(line)
         return answer
 
     def open(self, path: Path) -> None:
-        """Open a file, as a person does who double-clicks on it."""
+        """Open a file, like a double click on it."""
         self._arrive("Page.navigate", {"url": path.resolve().as_uri()})
 
     def reload(self, until: str, keep: str = "0") -> None:
-        """Load the page again until an expression is true of it.
+        """Reload the page until an expression is true.
 
-        Unlike ``open`` in the same process, which has what the page has just kept; and again, for what a page keeps
-        is on its way to the browser's store when the page goes on, and a reload may come before it. ``keep``: what is
-        run before each load, since a browser whose store opens late forgets what was kept before.
+        Unlike ``open`` in the same process, which sees data just stored; repeated, because stored data
+        may reach the browser's store only after a reload. ``keep``: a script to
+        run before each load, because a browser whose store opens late loses earlier data.
         """
 
         def is_so() -> bool:
@@ -134,7 +134,7 @@ class Chromium:
             self._arrive("Page.reload", {})
             return bool(self.run(until))
 
-        wait_until(is_so, f"it is not true of the page that is loaded again: {until}", WAIT_S)
+        wait_until(is_so, f"not true of the reloaded page: {until}", WAIT_S)
 
     def _arrive(self, method: str, values: Mapping[str, Any]) -> None:
         self.run("window.isOfThePageBefore = true")
@@ -144,10 +144,10 @@ class Chromium:
         def has_arrived() -> bool:
             try:
                 return bool(self.run(there))
-            except PageLeftError:  # the page before went while it was asked
+            except PageLeftError:  # the previous page closed during the call
                 return False
 
-        wait_until(has_arrived, f"the page never came: {method}", WAIT_S)
+        wait_until(has_arrived, f"the page did not load: {method}", WAIT_S)
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""
@@ -157,10 +157,10 @@ class Chromium:
 
     def until(self, script: str) -> None:
         """Wait until an expression is true."""
-        wait_until(lambda: self.run(script), f"it never came true: {script}", WAIT_S)
+        wait_until(lambda: self.run(script), f"it did not become true: {script}", WAIT_S)
 
     def press(self, *keys: str) -> None:
-        """Press keys one after another, as a keyboard does: ``1``, ``u``, ``ArrowLeft``, ``Enter``, ``Shift+Tab``."""
+        """Press keys one after another: ``1``, ``u``, ``ArrowLeft``, ``Enter``, ``Shift+Tab``."""
         for name in keys:
             *held, key = name.split("+") if len(name) > 1 else [name]
             text = {"Enter": "\r", "Space": " "}.get(key, key if len(key) == 1 else "")
@@ -174,7 +174,7 @@ class Chromium:
         self._call("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)}, None)
 
     def faults(self) -> list[str]:
-        """What the page complained of: errors, what was refused, every address that it asked for."""
+        """Complaints of the page: errors, blocked resources, every requested address."""
         self.run("0")
         found = []
         for one in self.messages:

@@ -1,4 +1,4 @@
-"""The command line called in this process, and what is wrong with the way in which it ended."""
+"""The command line called in this process, and faults in the way it ended."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from fuzzing import BadMessage, fault_of_message
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, EXIT_INTERNAL, Su3dError
 
-MAX_LINES = 200  # on stderr: faults of many answers are listed one by one
+MAX_LINES = 200  # on stderr: many faults are listed one by one
 
 
 class Declined(Su3dError):
-    """The command said what is wrong, as it should."""
+    """The command reported an error properly."""
 
 
 def called(words: Sequence[str]) -> None:
-    """Run a command; ``Declined`` where it says properly what is wrong, ``BadMessage`` where it does not."""
+    """Run a command; ``Declined`` if it reports an error properly, ``BadMessage`` if it does not."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(list(words))

@@ -1,4 +1,4 @@
-"""Waiting for what another thread or program does, never longer than it takes."""
+"""Wait for another thread or program, no longer than necessary."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TypeVar
 Value = TypeVar("Value")
 
 
-def wait_until(is_so: Callable[[], Value], what: str = "it never became so", seconds: float = 60.0) -> Value:
-    """The first value of ``is_so`` that counts as true; fails with ``what`` where none came in ``seconds``."""
+def wait_until(is_so: Callable[[], Value], what: str = "it stayed false", seconds: float = 60.0) -> Value:
+    """The first true value of ``is_so``; fails with ``what`` after ``seconds``."""
     end = time.monotonic() + seconds
     while not (value := is_so()):
         assert time.monotonic() < end, f"{what} in {seconds:g} s"
@@ -20,6 +20,6 @@ def wait_until(is_so: Callable[[], Value], what: str = "it never became so", sec
 
 
 def hear_signals() -> None:
-    """For ``preexec_fn``: the child hears signals that ``nohup`` or a shell's background has this process ignore."""
+    """For ``preexec_fn``: restores signals that ``nohup`` or a background job makes this process ignore."""
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)

@@ -32,11 +32,11 @@ def write_images(folder: Path, colour: str, depth: str, size: tuple[int, int]) -
 
 
 def write_scene(root: Path, *, is_3dod: bool = False) -> Path:
-    """The scene in the layout of the challenge, or of the 3DOD release; the folder of its images."""
+    """The scene in the layout of the challenge, or of the 3DOD release; its image folder."""
     scene = root / ("3dod/Training" if is_3dod else "ChallengeDevelopmentSet") / SCENE
     folder = scene / f"{SCENE}_frames" if is_3dod else scene
     write_images(folder, "lowres_wide", "lowres_depth", SIZE)
-    shifts = [np.linalg.inv(matrix)[:3, 3] for matrix in POSES]  # of a half turn about x
+    shifts = [np.linalg.inv(matrix)[:3, 3] for matrix in POSES]  # with a half turn about x
     lines = [f"{time}4 {np.pi!r} 0 0 {x} {y} {z}\n" for time, (x, y, z) in zip(TIMES, shifts, strict=True)]
     vertices, faces = grid(4, 2)
     write_mesh(scene / f"{SCENE}_3dod_mesh.ply", vertices, faces)

@@ -1,4 +1,4 @@
-"""A walk of two frames with two objects in one room, and a scene graph of it, in HOV-SG's own files."""
+"""A walk of two frames with two objects in one room, and a scene graph of it, in HOV-SG's file formats."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def write_walk(root: Path) -> Path:
 
 
 def info() -> dict[str, list[dict[str, object]]]:
-    """What stands in ``scene_info.json``."""
+    """The content of ``scene_info.json``."""
     room = {"id": 5, "floor_id": 0, "voted_category": "office", "category": None, "min_height": 0.0, "max_height": 2.4}
     objects = [
         {
@@ -50,7 +50,7 @@ def info() -> dict[str, list[dict[str, object]]]:
 
 
 def write_graph(folder: Path, n_dimensions: int = 4) -> Path:
-    """A scene graph that is right: one floor, one room, both objects; its folder."""
+    """A valid scene graph: one floor, one room, both objects; its folder."""
     corners = [[x, y, z] for x in (-1.0, 1.0) for y in (0.0, 2.4) for z in (-3.0, -1.0)]
     floor = {"floor_id": "0", "rooms": ["0_0"], "vertices": corners, "floor_height": 2.4, "floor_zero_level": 0.0}
     room = {"room_id": "0_0", "name": "office", "floor_id": "0", "room_height": 2.4, "room_zero_level": 0.0}

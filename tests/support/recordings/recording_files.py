@@ -1,4 +1,4 @@
-"""Files of a made recording out of what they hold, and the floor that most of them show."""
+"""Write the files of a synthetic recording, and the floor shown by most of them."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 LEFT, RIGHT = (200, 60, 40), (40, 80, 200)
 HEIGHT_M = 2.0
-WIDTH, HEIGHT = 12, 8  # of images whose depth tells the pixel
+WIDTH, HEIGHT = 12, 8  # of images whose depth identifies the pixel
 
 
 def depth_values(index: int) -> UInt16Array:
-    """A depth image of frame ``index``, another value in each pixel."""
+    """A depth image of frame ``index``, with a different value in each pixel."""
     return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * np.uint16(600) + np.uint16(index)
 
 
 def text_of(matrix: np.ndarray) -> str:
-    """A row a line, in full precision."""
+    """One row per line, in full precision."""
     return "\n".join(" ".join(repr(float(value)) for value in row) for row in matrix) + "\n"
 
 
 def write_files(root: Path, files: Mapping[str, Any]) -> None:
-    """Bytes, texts, and by the ends of their names JSON, images, clouds and tables below ``root``."""
+    """Write files below ``root``: bytes, texts, and by file extension JSON, images, clouds and tables."""
     for name, content in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def write_files(root: Path, files: Mapping[str, Any]) -> None:
 
 
 def turn(index: int) -> Float64Array:
-    """A pose that walks and turns."""
+    """A pose that moves and rotates."""
     matrix, angle = np.eye(4), 0.1 * index
     matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     matrix[:3, 3] = index, 1 / 3, -index
@@ -67,14 +67,14 @@ def pose(x_m: float) -> Float64Array:
 
 
 def floor_image(size: tuple[int, int], x_m: float) -> UInt8Array:
-    """What a camera at ``pose(x_m)`` sees: ``LEFT`` of x = 2 m and ``RIGHT`` of it."""
+    """The view of a camera at ``pose(x_m)``: ``LEFT`` of x = 2 m and ``RIGHT`` of it."""
     u = (np.arange(size[0]) - (size[0] - 1) / 2) / size[0]
     row = np.where((u * HEIGHT_M + x_m < 2.0)[:, None], LEFT, RIGHT).astype(np.uint8)
     return np.ascontiguousarray(np.broadcast_to(row, (size[1], *row.shape)))
 
 
 def grid(columns: int = 6, rows: int = 4, spacing_m: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of a floor, row by row, and two triangles a cell."""
+    """Vertices of a floor, row by row, and two triangles per cell."""
     y, x = np.mgrid[:rows, :columns]
     points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3).astype(np.float32) * np.float32(spacing_m)
     a = (y * columns + x)[:-1, :-1].reshape(-1)

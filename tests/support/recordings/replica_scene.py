@@ -58,7 +58,7 @@ def write_original(
     objects: list[tuple[int, int]],
     folder: str = "replica_v1/room_0",
 ) -> Path:
-    """A mesh on a grid of nine points, three a row, and its table of objects."""
+    """A mesh on a grid of nine points, three per row, and its table of objects."""
     habitat = root / folder / "habitat"
     write_files(habitat, {"info_semantic.json": info_table(objects)})
     grid = np.array([(i % 3, i // 3, 0) for i in range(9)], np.float32)
@@ -70,7 +70,7 @@ def write_original(
 
 
 def first_pose() -> Float64Array:
-    """A turn about x, then z, and a shift."""
+    """A rotation about x, then z, and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("xz", (0.7, -1.9)).as_matrix()
     matrix[:3, 3] = 0.3, -1.25, 1.5

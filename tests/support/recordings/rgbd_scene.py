@@ -1,4 +1,4 @@
-"""A described folder of a few small frames, in every form that one may have."""
+"""A described folder of a few small frames, in every supported form."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def log_of(indices: range) -> str:
 
 
 def write_scene(root: Path, n_frames: int = 3, **changes: Any) -> Path:
-    """A scene 'desk' with images, pose files and every kind of trajectory and camera file; None drops a key."""
+    """A scene 'desk' with images, pose files and every kind of trajectory and camera file; None removes a key."""
     folder = root / "rgbd" / "desk"
     files: dict[str, Any] = {"trajectory.log": log_of(range(n_frames)), "camera.json": CAMERA}
     for index in range(n_frames):

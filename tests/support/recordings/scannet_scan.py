@@ -1,4 +1,4 @@
-"""A small scan in the files of ScanNet: a floor of two halves, seen from above, annotated by segments."""
+"""A small scan in ScanNet's file formats: a floor of two halves, seen from above, annotated by segments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WHERE = f"scannet/{SCAN}"
 COLOUR_SIZE, DEPTH_SIZE = (64, 48), (32, 24)
 LOST = np.full((4, 4), -np.inf)
 
-# As in the released table: raw category, id, nyu40id, nyu40class; "stool" has another class in each set of labels.
+# As in the released table: raw category, id, nyu40id, nyu40class; "stool" has a different class in each label set.
 TABLE_ROWS = (
     ("wall", 1, 1, "wall"),
     ("chair", 2, 5, "chair"),
@@ -35,7 +35,7 @@ TABLE_ROWS = (
 
 
 def table_text(rows: Sequence[tuple[str, int, int, str]] = TABLE_ROWS) -> str:
-    """A label table with the columns that matter among others."""
+    """A label table with the relevant columns among others."""
     lines = ["id\traw_category\tcategory\tcount\tnyu40id\teigen13id\tnyuClass\tnyu40class"]
     lines += [f"{number}\t{raw}\t{raw} \t7\t{nyu40}\t4\t\t{name}" for raw, number, nyu40, name in rows]
     return "\n".join(lines) + "\n"
@@ -51,7 +51,7 @@ def write_truth(
     prefix: str = "scannet.",
     mesh: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """The four files of a scan's truth; ``groups`` are (id, raw category, segments)."""
+    """The four files of a scan's ground truth; ``groups`` are (id, raw category, segments)."""
     write_mesh(folder / f"{scan}_vh_clean_2.ply", *(mesh or grid()))
     write_mesh(folder / f"{scan}_vh_clean_2.labels.ply", *(mesh or grid()), np.array(labels))
     segments_file = f"{scan}_vh_clean_2.0.010000.segs.json"
@@ -80,12 +80,12 @@ def header(colour_size: tuple[int, int] = COLOUR_SIZE, depth_size: tuple[int, in
 
 
 def positions(n_frames: int) -> Float64Array:
-    """Where the camera is in each frame of a walk along the floor."""
+    """The position of the camera in each frame of a trajectory along the floor."""
     return np.linspace(1.0, 3.0, n_frames)
 
 
 def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), head: SensHeader | None = None) -> None:
-    """A walk along the floor; frames in ``lost`` have no pose."""
+    """A trajectory along the floor; frames in ``lost`` have no pose."""
     head = head or header()
     path.parent.mkdir(parents=True, exist_ok=True)
     depth = np.full((head.depth_height, head.depth_width), round(HEIGHT_M * 1000), "<u2")
@@ -99,7 +99,7 @@ def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), hea
 
 
 def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int = 5, lost: Sequence[int] = ()) -> Path:
-    """A scan with recording and truth; the folder that it lies in."""
+    """A scan with recording and ground truth; its folder."""
     folder = root / place / scan
     write_recording(folder / f"{scan}.sens", n_frames, lost)
     write_floor_truth(folder, scan)
@@ -112,7 +112,7 @@ def dataset(root: Path, **options: Any) -> ScanNet:
     return ScanNet(root, ScannetOptions(**options))
 
 
-# ---- the toy recording of the cases, as both readers of ScanNet export it
+# ---- the toy recording of the cases, as exported by both ScanNet readers
 
 TOY = CASES / "sens01_toy.sens"
 RECORDED = json.loads((CASES / "sens01_toy.json").read_text())
@@ -120,14 +120,14 @@ N_FRAMES = 4
 
 
 def pgm_bytes(values: np.ndarray) -> bytes:
-    """A PGM as the C++ reader writes it, big-endian."""
+    """A PGM as written by the C++ reader, big-endian."""
     return b"P5\n%d %d\n65535\n" % (values.shape[1], values.shape[0]) + values.astype(">u2").tobytes()
 
 
 def write_python_export(
     folder: Path, *, images: str = "", rest: str = "", cameras: str = "intrinsic", frame_skip: int = 1
 ) -> Path:
-    """The toy recording as ScanNet's Python reader exports it, colour as in the recording; returns ``folder``."""
+    """The toy recording as exported by ScanNet's Python reader, colour as in the recording; returns ``folder``."""
     toy, files = SensFile(TOY, WHERE), dict[str, Any]()
     for i in range(N_FRAMES):
         files[f"{images}color/{i * frame_skip}.jpg"] = toy.colour_bytes(i)
@@ -139,7 +139,7 @@ def write_python_export(
 
 
 def write_cpp_export(folder: Path) -> Path:
-    """The toy recording as ScanNet's C++ reader exports it; returns ``folder``."""
+    """The toy recording as exported by ScanNet's C++ reader; returns ``folder``."""
     toy, files = SensFile(TOY, WHERE), dict[str, Any]()
     for i in range(N_FRAMES):
         files[f"frame-{i:06d}.color.jpg"] = toy.colour_bytes(i)

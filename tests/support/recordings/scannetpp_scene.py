@@ -1,4 +1,4 @@
-"""A small scene in the files of ScanNet++: a floor of two halves, a mat across both, seen from above by an iPhone."""
+"""A small scene in ScanNet++'s file formats: a floor of two halves and a mat across both, seen from above."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAP = "class,count,semantic_map_to,instance_map_to\nchair,3,,\ncouch,2,sofa,sofa
 
 
 def write_colmap(folder: Path, distortion: Sequence[float] = (0, 0, 0, 0), model: str = "OPENCV") -> None:
-    """Cameras and images as COLMAP writes them; the camera sees 2 m of the floor."""
+    """Cameras and images as written by COLMAP; the camera sees 2 m of the floor."""
     bent = " ".join(map(str, distortion))
     camera = f"# Camera list\n1 {model} {WIDTH} {HEIGHT} {WIDTH} {WIDTH} {WIDTH / 2} {HEIGHT / 2} {bent}\n"
     lines = ["# Image list with two lines of data per image:", "# Number of images: 3, mean observations per image: 1"]
@@ -33,7 +33,7 @@ def write_colmap(folder: Path, distortion: Sequence[float] = (0, 0, 0, 0), model
 
 
 def tracking(**changes: Any) -> dict[str, Any]:
-    """``pose_intrinsic_imu.json``; ``changes`` of the first frame."""
+    """``pose_intrinsic_imu.json`` with ``changes`` to the first frame."""
     camera = [[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]]
     entries: dict[str, Any] = {
         f"frame_{number:06d}": {"timestamp": number / 60, "aligned_pose": matrix.tolist(), "intrinsic": camera}
@@ -44,7 +44,7 @@ def tracking(**changes: Any) -> dict[str, Any]:
 
 
 def depth_values(number: int) -> np.ndarray:
-    """Millimetres (192, 256): the floor, and a mark of the frame in the first pixels."""
+    """Millimetres (192, 256): the floor, and the frame number encoded in the first pixels."""
     values = np.full(DEPTH_SIZE[::-1], round(HEIGHT_M * 1000), np.uint16)
     values[:8, :8] = number + 1
     return values
@@ -57,7 +57,7 @@ def write_lists(root: Path) -> None:
 
 
 def write_scans(folder: Path, segments: Any, groups: Any, masked: Any = (), mesh: Any = None) -> None:
-    """The four files of a scan's truth; ``groups`` are (word, segments)."""
+    """The four files of a scan's ground truth; ``groups`` are (word, segments)."""
     write_mesh(folder / "mesh_aligned_0.05.ply", *(mesh or grid()))
     rows = enumerate(groups)
     entries = [{"id": k, "objectId": k + 1, "label": word, "segments": list(parts)} for k, (word, parts) in rows]
@@ -66,7 +66,7 @@ def write_scans(folder: Path, segments: Any, groups: Any, masked: Any = (), mesh
 
 
 def write_scene(root: Path, *, spacing_m: float = 0.1) -> Path:
-    """A whole scene below ``root``; its folder.
+    """A complete scene below ``root``; its folder.
 
     A floor of 4 x 2 m: left half a chair, right half a couch, a rug across the middle; the last row is masked.
     """

@@ -1,4 +1,4 @@
-"""Runs of painted scenes: the words that make one, and what it leaves."""
+"""Runs of painted scenes: their command lines and results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 
 def see_painted(patch: pytest.MonkeyPatch) -> None:
-    """This process sees painted scenes, and encodes texts as their perception does."""
+    """Makes this process find painted scenes, and encode texts like their perception."""
     patch.setattr(scene_run, "build_perception", colour_perception)
     patch.setattr(finished_run, "encoder_of", lambda run, device="cpu": WordEncoder())
 
@@ -50,7 +50,7 @@ def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
 
 
 def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,), scenes: str = "ab") -> Path:
-    """A finished run of some scenes, made in this process."""
+    """A finished run of some scenes, created in this process."""
     named = ["run", *(f"{PAINTED}/{scene}" for scene in scenes), "--methods", *methods, *PROTOCOLS, "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
@@ -59,7 +59,7 @@ def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,),
 
 
 def painted_page(run: Path, page: Path, *more: str) -> str:
-    """The page of a run, made with the encoder of painted scenes."""
+    """The page of a run, created with the encoder of painted scenes."""
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
         assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *more]) == 0

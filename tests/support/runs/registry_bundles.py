@@ -1,4 +1,4 @@
-"""Bundles for registries: of painted scenes, which are soon made, and of a small room, which can be scored anew."""
+"""Bundles for registries: of painted scenes (fast), and of a small room, which can be scored again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Files = dict[str, bytes]
 def painted_bundle(
     folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), said: str = ""
 ) -> Path:
-    """``folder/name.zip``: variants of the painted collector; it names code of its own, so no verifier takes it."""
+    """``folder/name.zip``: variants of the painted collector; it uses its own code, so verifiers reject it."""
     named = [f"{COLLECTOR}{method}" for method in methods]
     painted_run(folder / "runs" / name, "--quiet", *more, methods=named, scenes=scenes)
     bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], said)
@@ -33,7 +33,7 @@ def painted_bundle(
 
 
 def room_bundle(folder: Path, *, data: Path) -> Path:
-    """A bundle that holds: three methods on one small room, perception by the truth; one has no instances to score."""
+    """A valid bundle: three methods on a small room, perception by ground truth; one has no instances to score."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(data))
         patch.setenv("SU3D_CACHE", str(folder / "cache"))
@@ -53,7 +53,7 @@ def read_bundle(bundle: Path) -> tuple[Files, dict[str, object]]:
 
 
 def rewrite_bundle(place: Path, files: Files, manifest: Mapping[str, object]) -> Path:
-    """A bundle all of whose digests are right."""
+    """Recompute all digests of a bundle."""
     entries = {name: {"n_bytes": len(content), "sha256": digest_bytes(content)} for name, content in files.items()}
     place.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(place, "w") as archive:
@@ -64,7 +64,7 @@ def rewrite_bundle(place: Path, files: Files, manifest: Mapping[str, object]) ->
 
 
 def flip_labels(files: Files, job: str) -> None:
-    """Instances of the map of ``job`` change their names and features; the job's seal is made to fit."""
+    """Change names and features of instances in the map of ``job``, and update the job's completion record."""
     arrays = dict(np.load(io.BytesIO(files[f"{job}/prediction.npz"])))
     for name in {"features", "names", "view_names"} & arrays.keys():
         arrays[name] = arrays[name][::-1].copy()
@@ -77,6 +77,6 @@ def flip_labels(files: Files, job: str) -> None:
 
 
 def edit_record(files: Files, name: str, old: str, new: str) -> None:
-    """Every ``old`` in the text of a record becomes ``new``; at least one is there."""
+    """Replace every ``old`` in the text of a record by ``new``; at least one exists."""
     assert old.encode() in files[name], (old, name)
     files[name] = files[name].replace(old.encode(), new.encode())

@@ -20,7 +20,7 @@ def thing(object_id: int, name: str, bounds: Float64Array, caption: str = "") ->
 
 
 def placed(number: int, name: str, low: Sequence[float], sizes: Sequence[float], caption: str = "") -> MapObject:
-    """A thing by its lowest corner and its sizes."""
+    """An object by its lowest corner and its sizes."""
     return thing(number, name, np.array([low, np.add(low, sizes)], np.float64), caption)
 
 

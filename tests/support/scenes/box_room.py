@@ -1,4 +1,4 @@
-"""A tiny empty room in the layout of Replica whose frames and truth agree exactly: walls, floor, ceiling as a box."""
+"""A tiny empty room in the layout of Replica whose frames match its ground truth: walls, floor, ceiling as a box."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLOURS = np.array([[200, 80, 60], [80, 200, 60], [60, 80, 200], [200, 200, 60],
 
 
 def pose(index: int) -> np.ndarray:
-    """Camera-to-world of a camera that walks and turns, looking a little down."""
+    """Camera-to-world of a moving, rotating camera, looking slightly down."""
     yaw = 0.3 * index
     forward = np.array([np.cos(yaw), np.sin(yaw), -0.25])
     forward /= np.linalg.norm(forward)
@@ -74,7 +74,7 @@ def write_box_room(root: Path, n_frames: int = 8, scene: str = "room0", *, with_
 
 
 def write_truth(habitat: Path, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-    """The box as a mesh of quads, each side one object; ``offset`` moves it away from what the cameras see."""
+    """The box as a mesh of quads, each side one object; ``offset`` shifts it away from what the cameras see."""
     corners, objects = [], []
     for axis in range(3):
         u, v = (other for other in range(3) if other != axis)

@@ -1,6 +1,6 @@
-"""What runs that are killed on purpose are made of: light parts that write every kind of file that a run has.
+"""Parts of runs that are killed on purpose: lightweight, but writing every kind of file of a run.
 
-Importing this puts ``KeptPerception`` in the place of perception, in workers that nobody else can reach too.
+Importing this replaces perception by ``KeptPerception``, also in worker processes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ logger = logging.getLogger("su3d_bench.kill_subject")
 
 
 class Dense(Collector):
-    """Every point with the feature of its colour, and a warning that the run's record must keep."""
+    """Every point with the feature of its colour, and a warning that the run's record must contain."""
 
     name = "dense"
 
@@ -44,7 +44,7 @@ class Dense(Collector):
 
 
 class KeptPerception(ColourPerception):
-    """Masks that are kept in the perception cache."""
+    """Masks that are stored in the perception cache."""
 
     def __init__(self, cache_root: Path) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class KeptPerception(ColourPerception):
         if kept is None:
             self._cache.save(key, {"masks": found.masks})
         elif not np.array_equal(kept["masks"], found.masks):
-            raise AssertionError("the perception cache answered with masks of another frame")
+            raise AssertionError("the perception cache returned masks of another frame")
         return found
 
 

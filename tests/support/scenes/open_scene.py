@@ -1,4 +1,4 @@
-"""A scene with OpenLex3D's kind of labels and queries, and perfect and empty predictions of it, for tests."""
+"""A scene with OpenLex3D's labels and queries, and perfect and empty predictions of it, for tests."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ PROMPTS = (
 
 @dataclass
 class WordEncoder:
-    """Each prompt has an axis of its own; any other text points along the last one."""
+    """Each prompt has its own axis; any other text points along the last one."""
 
     name: str = "words"
     digest: str = "words"
     dim: int = len(PROMPTS) + 1
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise AssertionError("scoring looks at no image")
+        raise AssertionError("scoring uses no image")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         return np.stack([self.feature({text: 1.0}) for text in texts])
@@ -53,7 +53,7 @@ ENCODER: Encoder = WordEncoder()
 
 
 def cloud(seed: int = 0, n_each: int = 60) -> tuple[Float32Array, np.ndarray]:
-    """Points of the five objects, 40 cm boxes half a metre apart, and some points of none."""
+    """Points of the five objects, 40 cm boxes half a metre apart, and some outside."""
     rng = np.random.default_rng(seed)
     points = [rng.random((n_each + 5 * i, 3)) * 0.4 + [i * 0.9, 0, 0] for i in range(len(OBJECTS))]
     ids = np.repeat([*OBJECTS, -1], [*(len(part) for part in points), 10])
@@ -82,7 +82,7 @@ def instances_with(
 
 
 def perfect(truth: OpenLexTruth | QueryTruth, *, first: str | None = None, second: float = 1.0) -> Instances:
-    """The objects as masks, each with a feature that ranks its own labels as they stand; ``first`` may outrank them."""
+    """The objects as masks, each with a feature that ranks its labels in order; ``first`` may outrank them."""
     masks = [np.flatnonzero(truth.object_of_point == one) for one in OBJECTS]
     features = []
     for labels in OBJECTS.values():

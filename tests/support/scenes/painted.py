@@ -1,6 +1,6 @@
 """A tiny dataset, method and perception for tests of the runner.
 
-Each object of a scene is painted in a colour of its own, perception finds regions by colour, the method collects their
+Each object of a scene has its own colour, perception finds regions by colour, the method collects their
 points.
 """
 
@@ -41,9 +41,9 @@ COLOURS = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [120, 120, 120]
 
 
 class Painted:
-    """Four scenes of three painted boxes before a wall, seen by a camera that moves sideways.
+    """Four scenes of three painted boxes in front of a wall, seen by a camera that moves sideways.
 
-    ``painted_as``: what scenes of other names are painted as.
+    ``painted_as``: the scene whose objects another name shows.
     """
 
     name = "painted"
@@ -53,7 +53,7 @@ class Painted:
     image_domain = "rendered-rooms"
 
     class Options(BaseModel):
-        """``fault`` strikes ``fault_scene``; ``frame_ms`` makes frames slow."""
+        """``fault`` applies to ``fault_scene``; ``frame_ms`` makes frames slow."""
 
         model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -157,7 +157,7 @@ def _surface(scene: str, n_frames: int) -> tuple[Float32Array, Any]:
 
 
 class Collector:
-    """Collects the points of each colour; one instance a colour."""
+    """Collects the points of each colour; one instance per colour."""
 
     name = "collector"
 
@@ -215,20 +215,20 @@ class Collector:
 
 
 class Twins(Painted):
-    """Scenes whose names differ in one character that no folder's name can hold, all painted differently."""
+    """Scenes whose names differ in one character not allowed in folder names, all painted differently."""
 
     name = "twins"
     painted_as: ClassVar[dict[str, str]] = {"a/b": "a", "a_b": "b", "a%2Fb": "c"}
 
 
 class SlashCollector(Collector):
-    """A method whose name is a way to another folder."""
+    """A method whose name is a path to another folder."""
 
     name = "../elsewhere"
 
 
 class WordEncoder:
-    """Texts to pseudo-random features, equal for equal last words; images to the feature of their colour's class."""
+    """Maps texts to pseudo-random features by their last word; images to the feature of their colour's class."""
 
     name = "words"
     digest = "words-1"
@@ -246,7 +246,7 @@ class WordEncoder:
 
 
 class ColourPerception:
-    """Regions of one colour, named after the class that the colour stands for."""
+    """Regions of one colour, named after the colour's class."""
 
     profile = "embedded"
     caveat: str | None = None

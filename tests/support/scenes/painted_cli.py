@@ -1,4 +1,4 @@
-"""``painted.py`` for processes that no test can reach: importing it puts its perception in place there.
+"""``painted.py`` for other processes: importing it installs its perception there.
 
 As a program it is the command line.
 """
@@ -14,7 +14,7 @@ from painted import Collector, Painted, WordEncoder, colour_perception
 from su3d_bench.cli.main import main
 from su3d_bench.runs import finished, scene
 
-if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
+if "pytest" not in sys.modules:  # a test patches its own process, and undoes it
     scene.build_perception = colour_perception  # type: ignore[attr-defined, assignment]
     finished.encoder_of = lambda run, device="cpu": WordEncoder()
 

@@ -1,4 +1,4 @@
-"""Plates before a camera, each with a feature and a name, for the tests of methods that map them."""
+"""Plates in front of a camera, each with a feature and a name, for tests of methods that map them."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def axis(k: int) -> tuple[float, ...]:
 
 
 def at_cosine(cosine: float) -> tuple[float, ...]:
-    """A unit feature of that cosine to ``axis(0)``."""
+    """A unit feature with that cosine to ``axis(0)``."""
     return (cosine, float(np.sqrt(1 - cosine**2)), 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Plate:
-    """A rectangle facing the camera, bent so far towards it: its lower and upper x and y and its depth, metres."""
+    """A rectangle facing the camera, bent towards it by ``bend_m``, with bounds in x and y and a depth (m)."""
 
     x: tuple[float, float]
     y: tuple[float, float] = (-0.3, 0.3)
@@ -80,7 +80,7 @@ def mapped(method, views: Sequence[Sequence[Plate]]):  # type: ignore[no-untyped
 
 
 def block(low: Sequence[float], size: Sequence[float] = (0.3, 0.3, 0.3), step: float = 0.05) -> np.ndarray:
-    """A filled block of points ``step`` apart from its corner ``low``."""
+    """A filled block of points ``step`` apart from the corner ``low``."""
     grid = np.meshgrid(*(np.arange(0, side - 1e-9, step) for side in size), indexing="ij")
     return np.stack([part.ravel() for part in grid], axis=1) + np.asarray(low, np.float64)
 
@@ -91,5 +91,5 @@ def contents(found: Instances) -> tuple[object, ...]:
     return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
 
 
-# Frames without noise, so that values can be worked out by hand; the rest as published.
+# Noise-free frames, so that values can be computed by hand; the rest as published.
 QUIET = MappingConfig(noise_m=0.0, max_bbox_area_ratio=1.0)

@@ -1,4 +1,4 @@
-"""A small room, its truth as a prediction, and noisy scenes, for the tests of scoring."""
+"""A small room, its ground truth as a prediction, and noisy scenes, for tests of scoring."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ID = {entry.name: entry.id for entry in ROOM.classes}
 
 @dataclass
 class OneHotEncoder:
-    """Each known class name has an axis of its own: a prompt points along the axis of the longest name in it."""
+    """Each known class name has its own axis: a prompt points along the axis of the longest name in it."""
 
     name: str = "one-hot"
     digest: str = "one-hot"
     dim: int = len(LABELS.names) + 1
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-        raise AssertionError("scoring looks at no image")
+        raise AssertionError("scoring uses no image")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         return np.stack([self.feature(text) for text in texts])
@@ -48,7 +48,7 @@ NAMES = ("wall", "chair", "chair", "table", "lamp", "cushion", "book", "backpack
 
 
 def room(seed: int = 0, n_each: int = 150) -> GroundTruth:
-    """Eight objects in a row, each a cloud of points of its own, and some points that nobody annotated."""
+    """Eight objects in a row, each a separate cloud of points, and some unannotated points."""
     rng = np.random.default_rng(seed)
     points = np.concatenate(
         [rng.random((n_each, 3)) * [0.8, 0.8, 0.8] + [i, 0, 0] for i in range(len(NAMES))] + [rng.random((20, 3)) - 2]

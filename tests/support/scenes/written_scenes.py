@@ -11,12 +11,12 @@ from su3d_bench.datasets.writing import Layout, finish_scene, plan_scenes, write
 
 def write_scene(
     layout: Layout,
-    dataset: Any,  # rooms, or a stage in their place
+    dataset: Any,  # rooms, or a replacement
     scene: str,
     out: Path,
     report: Callable[[int], None] = lambda n_done: None,
 ) -> None:
-    """Write one scene whole; nothing is done where it is there already."""
+    """Write one complete scene; nothing is done if it exists already."""
     for target in plan_scenes(layout, dataset, [scene], out):
         write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
         layout.write_truth(dataset, target)
