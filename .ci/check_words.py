@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-THINGS = "|".join("row column line file folder scene frame class method mask object instance page sheet question".split())
+THINGS = "row|column|line|file|folder|scene|frame|class|method|mask|object|instance|page|sheet|question"
 STANDARD = {  # pattern -> what to write
     r"anew": "again",
     r"held against|hold against": "compared with",
@@ -44,7 +44,9 @@ def faults(path: str) -> list[str]:
 def main() -> int:
     command = ["git", "ls-files", "*.py", "*.md", "*.toml", "*.js", "*.html", "*.yml", "Makefile"]
     files = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\n")
-    lines = [line for path in files if path and not path.startswith(DATA) and path not in ALLOWED for line in faults(path)]
+    lines = [
+        line for path in files if path and not path.startswith(DATA) and path not in ALLOWED for line in faults(path)
+    ]
     print("\n".join(lines) or "words: OK")
     return int(bool(lines))
 

@@ -167,7 +167,7 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     sam = server.files[f"/sam/{SAM}"]
     expect("full disk", fetch("models", "sam-vit-h", *once, max_bytes=MAX_SMALL_FILE), 2, SAM)
     server.files[f"/sam/{SAM}"] = Served(sam.content, breaks_after=[50_000])
-    expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "run the same command again to resume")
+    expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "rerun to resume")
     assert not here(place), "a damaged file was accepted as complete"
     expect(
         "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
@@ -189,7 +189,7 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
     server.files[f"/{REPLICA}"] = Served(archive.content, redirect=f"{server.other_host}/there")
     expect("redirect to another host", fetch("replica", *once), 2, "host 'localhost' is not allowed for it")
     server.files[f"/{REPLICA}"] = Served(archive.content, breaks_after=[len(archive.content) // 2])
-    expect("break in the middle", fetch("replica", *once), 2, "run the same command again to resume")
+    expect("break in the middle", fetch("replica", *once), 2, "rerun to resume")
     assert not (place.data / "Replica").exists()
     expect("the same again", fetch("replica", *once), 0, "(no published checksum; recorded)")
     expect("checked", place.run("datasets", "check", "replica/*", "--quick"), 0, "replica/office4")

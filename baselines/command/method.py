@@ -177,9 +177,7 @@ class Command:
     def __init__(self, config: CommandConfig | None = None) -> None:
         self.config = config or CommandConfig()
         if not self.config.words:
-            raise ConfigError(
-                "method 'command': no program is set; use --set 'command.command=[\"run.sh\", \"{frames}\"]'"
-            )
+            raise ConfigError("method 'command': no program; use --set 'command.command=[\"run.sh\", \"{frames}\"]'")
         self._tools: SceneTools | None = None
         self._scene: SceneInfo | None = None
         self._frames: FrameFolder | None = None

@@ -86,9 +86,7 @@ def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:
         raise DataError(f"{where}: results/ has no frames; expected frame000000.jpg and depth000000.png and so on")
     check_complete(kinds, range(n_frames), where, "copy results/ again")
     if n_frames != n_poses:
-        raise DataError(
-            f"{where}: traj.txt has {n_poses} poses but results/ has {n_frames} frames; copy the scene again"
-        )
+        raise DataError(f"{where}: traj.txt has {n_poses} poses but results/ has {n_frames} frames; copy it again")
 
 
 def colour_name(index: int) -> str:

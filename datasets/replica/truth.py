@@ -99,9 +99,7 @@ def read_info(path: Path, where: str) -> Info:
     class_of_object = info.class_of_object
     for one in info.objects:
         if (class_id := class_of_object[one.id]) != one.class_id:
-            raise DataError(
-                f"{where}: object {one.id} is listed twice, as class {one.class_id} and as class {class_id}"
-            )
+            raise DataError(f"{where}: object {one.id} is listed twice, as class {one.class_id} and {class_id}")
     return info
 
 

@@ -271,9 +271,7 @@ def _open3d_camera(text: str, where: str) -> tuple[Float64Array, tuple[int, int]
         content = content["intrinsic"]  # of Open3D's PinholeCameraParameters
     values = content.get("intrinsic_matrix") if isinstance(content, dict) else None
     if not (isinstance(values, list) and len(values) == 9 and all(map(_is_number, values))):
-        raise DataError(
-            f"{where}: 'intrinsic_matrix' is not a list of 9 numbers, column by column, as Open3D writes it"
-        )
+        raise DataError(f"{where}: 'intrinsic_matrix' is not a list of 9 numbers, column by column, as in Open3D")
     size = content.get("width"), content.get("height")
     if not all(isinstance(side, int) and not isinstance(side, bool) and 0 < side < 100_000 for side in size):
         raise DataError(f"{where}: width and height are {str(size)[:60]}; expected whole pixels")

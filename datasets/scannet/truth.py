@@ -177,9 +177,7 @@ def read_label_table(path: Path, where: str) -> LabelTable:
     header = [cell.strip() for cell in lines[0][1].split("\t")] if lines else []
     missing = [name for name in columns if name not in header]
     if missing:
-        raise DataError(
-            f"{where}: has no column '{missing[0]}'; expected the table of the release, tabs between columns"
-        )
+        raise DataError(f"{where}: has no column '{missing[0]}'; expected the release's tab-separated table")
     at = [header.index(name) for name in columns]
     nyu40_of: dict[str, int] = {}
     raw_id_of: dict[str, int] = {}

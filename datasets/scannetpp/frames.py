@@ -90,9 +90,7 @@ class IphoneRecording:
 def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> IphoneRecording:
     """The recording in the ``iphone`` folder of a scene."""
     if not folder.is_dir():
-        raise DataError(
-            f"{where}: no iphone/ folder; only the iPhone's frames are used, because the DSLR's have no depth"
-        )
+        raise DataError(f"{where}: no iphone/ folder; only the iPhone's frames are used, the DSLR's have no depth")
     colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, images.VIDEO_NAME, where)
     depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, images.DEPTH_NAME, where)
     if pose_source(folder, kind) == "colmap":

@@ -469,10 +469,8 @@ def _draw_shift_panel(axes: Any, apart: Mapping[str, Any], name: str, *, has_nam
     axes.set_xlim(low - 0.1 * span, high + 0.3 * span)
     axes.set_ylim(len(places) + 0.6, -0.6)
     labels = [apart["first"], *(", ".join(step["rules"]) for step in walk["steps"]), apart["second"]]
-    shown = [
-        drawable(text if len(text) <= MAX_NAME_CHARACTERS else text[: MAX_NAME_CHARACTERS - 3] + "...")
-        for text in labels
-    ]
+    most = MAX_NAME_CHARACTERS
+    shown = [drawable(text if len(text) <= most else text[: most - 3] + "...") for text in labels]
     axes.set_yticks(range(len(labels)), shown if has_names else [""] * len(labels), fontsize=9, parse_math=False)
     axes.set_title(f"{name}: {end - start:+.1f} points", fontsize=10.5, loc="left", parse_math=False)
     _without_frame(axes, "per cent")

@@ -250,11 +250,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             + (QUESTION_NOTE if scores["kind"] == "questions" else GROUND_TRUTH_NOTE),
             f"set {scores['sheet_id']}{origin}; {judged}",
             *(printable(remark, 300) for remark in scores["remarks"]),
-            *(
-                [f"{ROLE_LABELS[scores['kind']]}{printable(scores['answered_by'], 200)}"]
-                if scores["answered_by"]
-                else []
-            ),
+            *([f"{ROLE_LABELS[scores['kind']]}{printable(by, 200)}"] if (by := scores["answered_by"]) else []),
             *([f"'cannot tell' is excluded: at most {counted(unclear, 'judgement')} per number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),

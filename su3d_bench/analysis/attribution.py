@@ -103,13 +103,11 @@ class Explained:
             self.check_same_counts(name, scene, counts.as_is)
         return corrected
 
-    def errors(
-        self, scene: str, protocol: str, evaluated: EvaluatedScene, most: int
-    ) -> tuple[int, Sequence[SingleError]]:
+    def errors(self, scene: str, protocol: str, evaluated: EvaluatedScene, n: int) -> tuple[int, Sequence[SingleError]]:
         """The number of errors in ``scene`` under ``protocol``, and the ``most`` errors that cost the run most."""
         scores = self._scores[protocol]
         others = [score.counts for name, score in scores.items() if name != scene]
-        return evaluated.errors(self.rules(protocol), scores[scene].counts, others, most)
+        return evaluated.errors(self.rules(protocol), scores[scene].counts, others, n)
 
     def instance_ids(self, scene: str) -> Sequence[int]:
         """The ids of the method's instances; empty if they are numbered by position."""

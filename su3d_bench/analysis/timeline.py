@@ -172,7 +172,7 @@ def _panels(sdk: Any, methods: Sequence[str]) -> Any:
 
 
 @dataclass(frozen=True)
-class OwnedPoints:
+class Owned:
     """Drawn points with the ``instance`` and ``label`` (n,) of each, -1 for none.
 
     ``names`` and ``corners`` (k, 2, 3) m describe the instances, ``labels`` are the names of the classes.
@@ -257,9 +257,7 @@ class OwnedPoints:
 class Growth:
     """A finished map, revealed over time: the points seen so far of the instances known so far."""
 
-    def __init__(
-        self, recording: Recording, place: tuple[str, ...], owned: OwnedPoints, first_frame: Sequence[int]
-    ) -> None:
+    def __init__(self, recording: Recording, place: tuple[str, ...], owned: Owned, first_frame: Sequence[int]) -> None:
         self._recording, self._place, self._owned = recording, place, owned
         self._first_frame = np.append(np.array(first_frame, np.int64), 0)  # the last entry: no instance
         self._is_seen = np.zeros(len(owned.cloud.points), np.bool_)
@@ -358,11 +356,9 @@ class SceneTimeline:
         frame: Frame | None = self._reader.had("a frame is omitted", read)
         return frame
 
-    def _maps(
-        self, rules: ProtocolRules | None, truth: GroundTruth | None
-    ) -> dict[str, tuple[OwnedPoints, Sequence[int]]]:
+    def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:
         """Each method's map, and the first frame in which each of its instances was seen (0 if unknown)."""
-        maps: dict[str, tuple[OwnedPoints, Sequence[int]]] = {}
+        maps: dict[str, tuple[Owned, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
             prediction = self._reader.had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
@@ -374,7 +370,7 @@ class SceneTimeline:
                 maps[method] = self._owned(prediction, rules, truth), first
         return maps
 
-    def _owned(self, prediction: Prediction, rules: ProtocolRules | None, truth: GroundTruth | None) -> OwnedPoints:
+    def _owned(self, prediction: Prediction, rules: ProtocolRules | None, truth: GroundTruth | None) -> Owned:
         cloud = thinned(prediction.points, MAX_POINTS)
         instance = point_owners(prediction, cloud.rows).astype(np.int64)
         is_dense = isinstance(prediction, DenseFeatures)
@@ -388,7 +384,7 @@ class SceneTimeline:
             if classes is not None:
                 labels = tuple(entry.name for entry in rules.classes)
                 label = classes if is_dense else np.append(classes, -1)[instance]
-        return OwnedPoints(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
+        return Owned(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
 
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, from the update records of a method."""
@@ -459,7 +455,7 @@ def smaller(frame: Frame, width: int) -> Frame:
     )
 
 
-def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> OwnedPoints:
+def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> Owned:
     """The ground truth as a map: its instances, named by their classes, and the classes of ``rules``."""
     cloud = thinned(truth.points, MAX_POINTS)
     own, first, instance = np.unique(truth.instance, return_index=True, return_inverse=True)
@@ -468,7 +464,7 @@ def owned_of_truth(rules: ProtocolRules, truth: GroundTruth) -> OwnedPoints:
     name_of = dict(zip(truth.labels.ids, truth.labels.names, strict=True))
     names = tuple(name_of.get(int(truth.semantic[row]), "") for row in first[own > 0])
     instance = place[instance.reshape(-1)]
-    return OwnedPoints(
+    return Owned(
         cloud,
         instance[cloud.rows],
         class_index_of_ids(rules, truth.semantic[cloud.rows]),

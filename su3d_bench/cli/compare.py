@@ -87,9 +87,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
     about = {"reference": str(arguments.out), "n_runs": reference.n_runs, "n_values": n_values, "n_exact": n_exact}
-    line = (
-        f"{arguments.out}: {n_values} headline values from {counted(reference.n_runs, 'run')}, {n_exact} of them exact"
-    )
+    line = f"{arguments.out}: {n_values} headline values from {counted(reference.n_runs, 'run')}, {n_exact} exact"
     output.answer_either(arguments, about, line)
     if reference.n_runs == 1:
         remark("built from one run: every value must match exactly; use several runs if results vary")

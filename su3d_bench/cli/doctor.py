@@ -183,9 +183,7 @@ def _folder(what: str, folder: Path, setting: str) -> Check:
             os.close(hold_folder(Path(made)))
     except OSError as error:
         if error.errno in NO_LOCKS:
-            return Check(
-                what, "note", f"{where}: the file system does not support locks", f"choose another with {setting}"
-            )
+            return Check(what, "note", f"{where}: no support for file locks", f"choose another with {setting}")
         reason = error.strerror or str(error)
         return Check(what, "missing", f"{where}: cannot be written: {reason}", f"choose another with {setting}")
     found = f"{where}: {size_text(free := shutil.disk_usage(existing).free)} free"

@@ -66,17 +66,15 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     accept(arguments, [entry.source for entry in missing])
     keep = getattr(arguments, "keep_archives", False)
     with progress_callback(arguments) as watch:
-        brought = [fetch(entry, watch, n_retries, keep_archives=keep) for entry in missing]
-    answer_fetched(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
+        new = [fetch(entry, watch, n_retries, keep_archives=keep) for entry in missing]
+    answer_fetched(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], new)
 
 
-def answer_fetched(
-    arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[FetchResult]
-) -> None:
+def answer_fetched(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], new: Sequence[FetchResult]) -> None:
     """Print folders and checksums."""
     rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
     lines = [f"{name}: already present: {folder}" for name, folder in here]
-    for entry in brought:
+    for entry in new:
         row = {"name": entry.source.name, "folder": str(entry.place), "files": [asdict(file) for file in entry.files]}
         rows.append(row | {"remarks": list(entry.remarks)})
         lines.append(f"{entry.source.name}: {entry.place}")
@@ -253,7 +251,7 @@ def call_scannet(arguments: argparse.Namespace) -> None:
     accept(arguments, [source])
     with progress_callback(arguments) as watch:
         if arguments.script is not None:
-            brought = fetch_by_script(source, scans, arguments.script, watch)
+            new = fetch_by_script(source, scans, arguments.script, watch)
         else:
-            brought = fetch_from(source, scans, arguments.address, watch, retries_of(arguments))
-    answer_fetched(arguments, [], [brought])
+            new = fetch_from(source, scans, arguments.address, watch, retries_of(arguments))
+    answer_fetched(arguments, [], [new])

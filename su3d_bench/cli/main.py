@@ -74,9 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         out.flush()
         if out.refused is not None:
             reason = out.refused.strerror or out.refused
-            remark(
-                f"su3d-bench: stdout: write error ({reason}); the results are saved, the printed output is incomplete"
-            )
+            remark(f"su3d-bench: stdout: write error ({reason}); results are saved, the printed output is incomplete")
             code = code or EXIT_WRONG_INPUT
     return code
 

@@ -94,9 +94,7 @@ def _make_beacon3d(arguments: argparse.Namespace) -> None:
     objects = {}
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         if scene in objects:
-            raise ConfigError(
-                f"query make: two datasets have a scene '{scene}', but this form identifies scenes by name"
-            )
+            raise ConfigError(f"query make: two datasets have a scene '{scene}', this form identifies scenes by name")
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
     content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.form) - 1]

@@ -90,9 +90,7 @@ def lines_of(inspection: Inspection) -> list[str]:
     rows += [("ground truth", _truth_text(variant)) for variant in inspection.truth]
     if inspection.meeting is not None:
         meeting = inspection.meeting
-        rows.append(
-            ("seen points", f"{meeting.share:.1%} within {meeting.distance_m * 100:.3g} cm of the ground truth")
-        )
+        rows.append(("seen points", f"{meeting.share:.1%} within {meeting.distance_m * 100:.3g} cm of ground truth"))
     rows.append(("digest", inspection.digest or "none"))
     lines = [printable(inspection.scene), *(f"  {name:<13} {text}" for name, text in rows)]
     for _, group in groupby(inspection.findings, key=lambda finding: (finding.severity, finding.check)):

@@ -267,9 +267,7 @@ def check_keys(settings: Settings) -> None:
         depth = {"perception": 2, "method": 3, "dataset": 3}.get(entry.path[0], 1)
         if len(entry.path) < depth:
             names = ".".join([*entry.path, "<name>"][: depth - 1])
-            raise ConfigError(
-                f"{entry.source}: '{'.'.join(entry.path)}' is a section; write [{names}] and keys below it"
-            )
+            raise ConfigError(f"{entry.source}: '{'.'.join(entry.path)}' is a section; write [{names}] and its keys")
 
 
 def check_names(section: str, settings: Settings, known: Sequence[str]) -> None:

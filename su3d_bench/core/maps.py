@@ -264,9 +264,7 @@ def _views(views: Sequence[Sequence[tuple[int, int]]], k: int) -> Int32Array:
 def _sets(masks: Any, n_points: int) -> list[NDArray[Any]]:
     """The points of each mask, ascending and without duplicates; for ``masks`` see ``Instances.of``."""
     if not isinstance(masks, Iterable):
-        raise PredictionError(
-            f"instances: masks is {masks!r:.40}; expected a list of point indices or bools per instance"
-        )
+        raise PredictionError(f"instances: masks is {masks!r:.40}; expected point indices or bools per instance")
     if isinstance(masks, np.ndarray) and masks.ndim == 1:
         return _sets_of_owners(masks, n_points)
     return [_set(f"the mask of instance {k}", mask, n_points) for k, mask in enumerate(masks)]

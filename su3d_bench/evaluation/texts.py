@@ -119,9 +119,7 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
     if (encoder := _real_encoder(rules.encoder)) is None:
         return f"needs the encoder '{rules.encoder}' to classify the features, which is not available; {how}"
     if encoder.dim != n_dimensions:
-        return (
-            f"the features have {n_dimensions} dimensions, those of the encoder '{rules.encoder}' {encoder.dim}; {how}"
-        )
+        return f"the features have {n_dimensions} dimensions, those of '{rules.encoder}' {encoder.dim}; {how}"
     return encoder
 
 

@@ -34,7 +34,7 @@ Progress = Callable[[str, int, int | None], None]
 
 
 @dataclass(frozen=True)
-class ExpectedContent:
+class Expected:
     """Known checksums of a file: ``git_blob`` is git's SHA-1, ``recorded`` the SHA-256 of an earlier download.
 
     ``md5_prefix``: the beginning of the MD5. All are hexadecimal digits in lower case.
@@ -61,7 +61,7 @@ class ExpectedContent:
         return tuple(words for value, words in kinds if value)
 
 
-def checked(path: Path, stated: ExpectedContent) -> tuple[str, str | None]:
+def checked(path: Path, stated: Expected) -> tuple[str, str | None]:
     """The SHA-256 of a file, and a message on the first mismatch with ``stated``; None if all agree."""
     sha256, md5 = hashlib.sha256(), hashlib.md5(usedforsecurity=False)
     blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
@@ -90,7 +90,7 @@ class Download:
     address: str
     hosts: tuple[str, ...]
     n_bytes: int | None = None
-    stated: ExpectedContent = field(default_factory=ExpectedContent)
+    stated: Expected = field(default_factory=Expected)
 
 
 class _Broken(Exception):
@@ -124,9 +124,7 @@ def download_file(wanted: Download, place: Path, watch: Progress, n_retries: int
             n_idle = 1 if n_held > n_before else n_idle + 1
             if n_idle > n_retries:
                 come = f"{n_held:,} bytes were downloaded" if n_held else "nothing was downloaded"
-                raise DataError(
-                    f"{wanted.address}: {printable(str(error), 200)}; {come}; run the same command again to resume"
-                ) from None
+                raise DataError(f"{wanted.address}: {printable(str(error), 200)}; {come}; rerun to resume") from None
             time.sleep(min(FIRST_PAUSE_S * 2 ** (n_idle - 1), 60.0))
     sha256, wrong = checked(part, wanted.stated)
     if wrong is None:
@@ -295,7 +293,7 @@ def hub_files(source: Source) -> list[Download]:
                 f"{ours.sha256}: the file has changed; if that is intended, give its new facts with --sources"
             )
         n_bytes = file.size if ours is None or file.size is not None else ours.n_bytes
-        checksums = ExpectedContent(sha256=sha256, git_blob=None if sha256 else file.blob_id)
+        checksums = Expected(sha256=sha256, git_blob=None if sha256 else file.blob_id)
         address = hub.hf_hub_url(repository, name, revision=info.sha, endpoint=endpoint)
         wanted.append(Download(name, address, hosts, n_bytes, checksums))
     return wanted

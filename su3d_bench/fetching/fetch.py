@@ -24,7 +24,7 @@ from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
 from su3d_bench.fetching.download import (
     N_RETRIES,
     Download,
-    ExpectedContent,
+    Expected,
     Progress,
     checked,
     download_file,
@@ -42,7 +42,7 @@ FETCHED, UNPACKED = ".fetched", "unpacked"
 
 @dataclass(frozen=True)
 class FetchedFile:
-    """One downloaded file; ``verified_against`` names the checksums that its content matched, empty if none is known."""
+    """One downloaded file; ``verified_against`` names the checksums that it matched, empty if none is known."""
 
     source: str
     name: str
@@ -186,7 +186,7 @@ def locked_state(planned: Planned) -> Iterator[None]:
 def plain_files(source: Source) -> list[Download]:
     """The files of a source with their own addresses, not from the hub."""
     return [
-        Download(file.name, file.address, source.hosts, file.n_bytes, ExpectedContent(file.sha256, file.md5_prefix))
+        Download(file.name, file.address, source.hosts, file.n_bytes, Expected(file.sha256, file.md5_prefix))
         for file in source.files
     ]
 

@@ -29,7 +29,7 @@ from su3d_bench.datasets.scannet.folders import (
     split_scenes,
 )
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
-from su3d_bench.fetching.download import N_RETRIES, Download, ExpectedContent, Progress, checked
+from su3d_bench.fetching.download import N_RETRIES, Download, Expected, Progress, checked
 from su3d_bench.fetching.fetch import FetchedFile, FetchResult, Planned, fetch_file, locked_state, move, write_arrival
 from su3d_bench.fetching.sources import Source, check_address
 
@@ -70,9 +70,7 @@ def plan_scans(names: Sequence[str], root: Path) -> Scans:
         elif SCAN_NAME.fullmatch(name):
             scans.append(name)
         else:
-            raise ConfigError(
-                f"fetch scannet: unknown scan '{name}'{suggest(name, ('paper', *SPLITS, 'scene0000_00'))}"
-            )
+            raise ConfigError(f"fetch: unknown scan '{name}'{suggest(name, ('paper', *SPLITS, 'scene0000_00'))}")
     found = find_scans(root)
     missing = {}
     for scan in dict.fromkeys(scans):
@@ -107,7 +105,7 @@ def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Progress)
         words = ["--id", scan, "--type", name.removeprefix(scan)] if scan else ["--label_map"]
         path = planned.state / _folder(scan) / name
         _run(script, planned.state, words, path)
-        sha256, n_bytes = checked(path, ExpectedContent())[0], path.stat().st_size
+        sha256, n_bytes = checked(path, Expected())[0], path.stat().st_size
         arrived = FetchedFile(source.name, name, "the user's own script", n_bytes, sha256, ())
         write_arrival(planned.root, arrived)
         return path, arrived
@@ -131,16 +129,14 @@ def fetch_from(source: Source, scans: Scans, address: str, watch: Progress, n_re
     return _fetch(source, scans, fetch_one)
 
 
-def _fetch(
-    source: Source, scans: Scans, fetch_one: Callable[[Planned, str, str], tuple[Path, FetchedFile]]
-) -> FetchResult:
+def _fetch(source: Source, scans: Scans, fetch: Callable[[Planned, str, str], tuple[Path, FetchedFile]]) -> FetchResult:
     """Fetch each missing file and move each complete scan to its place, the table of labels (of no scan) last."""
     planned, files = Planned(source, scans.root), list[FetchedFile]()
     with locked_state(planned):
         for scan, names in (scans.missing | ({"": (TABLE_NAME,)} if scans.label_table else {})).items():
-            brought = [fetch_one(planned, scan, name) for name in names]
-            files += [arrived for _, arrived in brought]
-            move([path for path, _ in brought], scans.root / _folder(scan))
+            new = [fetch(planned, scan, name) for name in names]
+            files += [arrived for _, arrived in new]
+            move([path for path, _ in new], scans.root / _folder(scan))
     return FetchResult(source, scans.root / "scans", tuple(files))
 
 
@@ -164,6 +160,5 @@ def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None
     if done.returncode != 0 or not result.is_file() or not result.stat().st_size:
         last = printable(lines[-1], 200) if lines else "nothing"
         raise DataError(
-            f"{script}: did not download {result.name} (exit code {done.returncode}); its last output: {last}; run the "
-            "same command again to resume"
+            f"{script}: did not download {result.name} (exit code {done.returncode}): {last}; rerun to resume"
         )

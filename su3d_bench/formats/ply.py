@@ -171,9 +171,7 @@ def read_header(content: bytes, where: str) -> Header:
                     raise DataError(f"{where}:{n_lines}: property '{printable(new.name, 60)}' is declared twice")
                 elements[-1].properties.append(new)
             case _:
-                raise DataError(
-                    f"{where}:{n_lines}: header line '{printable(line, 60)}' is not PLY 1.0; is it damaged?"
-                )
+                raise DataError(f"{where}:{n_lines}: header line '{printable(line, 60)}' is not PLY 1.0; damaged?")
     if not format_name:
         raise DataError(f"{where}: its header names no format; expected one of {', '.join(FORMATS)}")
     return Header(format_name, tuple(elements), at)

@@ -56,9 +56,7 @@ def labels_taken(rules: ProtocolRules) -> str:
     if rules.n_labels is None:
         return "no label counts"
     if rules.n_labels > 1:
-        return (
-            f"the top {rules.n_labels} labels of features, or one label each; never both in a prediction or a ranking"
-        )
+        return f"the top {rules.n_labels} labels of features, or one label each; never both in one prediction"
     if not rules.names_masks:
         return "one label"
     only = {"one": "one label of a mask", "top-k": "the top labels of a mask"}

@@ -291,10 +291,8 @@ def unpack_scores(data: bytes) -> dict[str, SceneScore]:
     try:
         arrays = read_arrays(io.BytesIO(data))
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
-        if foreign_files := [key for key in arrays if key.rpartition("/")[0] not in names]:
-            raise DataError(
-                f"counts: '{printable(foreign_files[0], 80)}' belongs to no protocol; score the scene again"
-            )
+        if unknown := [key for key in arrays if key.rpartition("/")[0] not in names]:
+            raise DataError(f"counts: '{printable(unknown[0], 80)}' belongs to no protocol; score the scene again")
         return {name: _unpack_one(name, arrays) for name in names}
     except DAMAGE as error:
         raise DataError(f"counts: are damaged or of another version ({error}); score the scene again") from error

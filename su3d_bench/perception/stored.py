@@ -102,7 +102,7 @@ class StoredSource(Protocol):
 
 
 def _inside(folder: Path, name: str, where: str, key: str) -> Path:
-    """``folder / name``; ``ConfigError`` if that is outside the folder."""
+    """``folder / name``; ``ConfigError`` if that is not a box in the folder."""
     path = folder / name
     is_plain = name.isprintable() and bool(name) and not name.startswith("/") and ".." not in PurePosixPath(name).parts
     try:
@@ -265,9 +265,7 @@ def _boxes(arrays: Mapping[str, NDArray[Any]], frame: Frame, where: str) -> Floa
     bad = ~(is_near & is_seen & (x0 <= x1) & (y0 <= y1))
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
-        raise DataError(
-            f"{where}, region {k}: box {boxes[k].tolist()} is inverted or outside the {width}x{height} image"
-        )
+        raise DataError(f"{where}, region {k}: box {boxes[k].tolist()} is not a box in the {width}x{height} image")
     return boxes
 
 

@@ -200,9 +200,7 @@ def _as_map(content: Content, vertices: Float32Array, rules: ProtocolRules) -> I
     if not isinstance(content, VertexMasks):
         return content
     if content.n_points not in {None, len(vertices)}:
-        raise PredictionError(
-            f"is of {content.n_points} points, the scene of {len(vertices)}; both must be of one mesh"
-        )
+        raise PredictionError(f"is of {content.n_points} points, the scene of {len(vertices)}; both need one mesh")
     return content.on(vertices, rules)
 
 
@@ -246,9 +244,7 @@ def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene:
     scores = labelled.scores
     if len(scores) and (scores.min() < 0 or scores.max() > 1):
         distinct, rank = np.unique(scores, return_inverse=True)
-        remark = (
-            "confidences outside 0 to 1, which the benchmark rejects, were written as ranks divided by their number"
-        )
+        remark = "confidences outside 0 to 1, which the benchmark rejects, are written as ranks divided by their number"
         labelled = replace(labelled, scores=(rank + 1) / len(distinct), remarks=(*labelled.remarks, remark))
     form = RUNS_FOLDER, MASK_OF_RUNS, lambda k: _runs_json(labelled.masks.mask(k), labelled.n_points)
     return write_list(labelled, places, scene, folder, 0, form)

@@ -188,9 +188,7 @@ def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> 
     """(points, masks): Open3DIS has masks in rows; decided by the number of scores or classes, or the longer side."""
     n_rows, n_columns = matrix.shape
     if n_known is not None and n_known not in {n_rows, n_columns}:
-        raise PredictionError(
-            f"{where}: the masks are {arrays.kind_of(matrix)}, but there are {n_known} scores or classes"
-        )
+        raise PredictionError(f"{where}: the masks are {arrays.kind_of(matrix)}, with {n_known} scores or classes")
     are_rows = n_rows == n_known if n_known is not None else n_rows <= n_columns
     return matrix.T if are_rows else matrix
 

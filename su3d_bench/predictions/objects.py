@@ -129,9 +129,7 @@ def _instances(
     for k, entry in enumerate(everything):
         at = f"{where}: object {k}"
         if not isinstance(entry, dict) or "pcd_np" not in entry:
-            raise PredictionError(
-                f"{at}: is {arrays.kind_of(entry)} without 'pcd_np'; expected an object of ConceptGraphs"
-            )
+            raise PredictionError(f"{at}: is {arrays.kind_of(entry)} without 'pcd_np'; expected a ConceptGraphs object")
         clouds.append(arrays.checked_points(entry["pcd_np"], at))
         names.append(_name(entry, _majority(entry.get("class_id")), class_names))
         caption = entry.get("consolidated_caption")

@@ -46,8 +46,8 @@ TONES = frozenset(("dark", "light-coloured"))
 class Sight:
     """``share``: the largest share of an image that an object fills; ``colour``: a word, empty if none fits.
 
-    ``is_certain_colour``: whether it stays the same in slightly different light; ``possible_colours``: words for many of its
-    pixels in one of these lights; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a side of
+    ``is_certain_colour``: whether it stays the same in slightly different light; ``possible_colours``: words for many
+    of its pixels in such light; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a side of
     its box was seen only at the border of the images.
     """
 

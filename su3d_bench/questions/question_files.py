@@ -223,9 +223,7 @@ def read_external_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     queries_of_scene: dict[str, list[TextQuery]] = {}
     for question in read_external_questions(path):
         if not question.is_known:
-            raise DataError(
-                f"{printable(str(path), 200)}: {question.source} has no answer objects and cannot be scored"
-            )
+            raise DataError(f"{printable(str(path), 200)}: {question.source} has no answer objects to score")
         scene = question.scene.rpartition("/")[2]
         query = TextQuery(question.text, question.answers or (), question.groups, question.name)
         queries_of_scene.setdefault(scene, []).append(query)

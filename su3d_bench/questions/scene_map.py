@@ -30,7 +30,7 @@ MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may have texts of a
 class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
-    For ground truth: ``is_query_target``, whether it is visible enough to be asked about; ``is_whole``, whether its box is
+    For ground truth: ``is_query_target``, whether it is visible enough for questions; ``is_whole``, whether its box is
     that of the complete object and not only of its recorded part; ``is_cut``, whether it ends at the border of the
     images; ``looks``, only for a recording.
     """

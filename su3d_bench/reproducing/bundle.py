@@ -233,9 +233,7 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
             raise StoreError(f"{where}: {counted(len(names), 'file')} {what}, such as {printable(min(names), 120)}")
     for name in manifest.runs:
         if not is_safe(name) or f"{name}/run.json" not in manifest.files:
-            raise StoreError(
-                f"{where}: its manifest names the run '{printable(name, 100)}', but it has no run.json of it"
-            )
+            raise StoreError(f"{where}: its manifest names the run '{printable(name, 100)}', but has no run.json of it")
 
 
 def _unpack_one(

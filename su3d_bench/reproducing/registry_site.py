@@ -66,9 +66,7 @@ def _earlier_pages(out: Path) -> set[str]:
     value = read_json(out / DATA) if is_file(out / DATA) else None
     pages = value.get("pages") if isinstance(value, dict) and value.get("kind") == KIND else None
     if not isinstance(pages, list):
-        raise ConfigError(
-            f"{shown(out)}: contains something other than a registry site; name an empty folder with --out"
-        )
+        raise ConfigError(f"{shown(out)}: is not empty and not a registry site; name an empty folder with --out")
     return {name for name in pages if isinstance(name, str) and _is_page(name)}
 
 

@@ -167,7 +167,7 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 
 
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
-    """The outcome of ``unit`` in this process, as a message for ``unwrap`` in another one; raises only ``Terminated``."""
+    """The outcome of ``unit`` in this process, as a message for ``unwrap``; raises only ``Terminated``."""
     try:
         with doors(), one_thread():
             return "outcome", work(unit, report)

@@ -97,8 +97,8 @@ def existing_run(folder: Path) -> ExistingRun | None:
     if not is_file(folder / "run.toml"):
         return None if record is None else ExistingRun(folder, None, record)
     content = file_bytes(folder / "run.toml")
-    text, mark_complete, digest = content.rpartition(SEAL.encode())
-    if not mark_complete or digest != f"{digest_bytes(text)}\n".encode():
+    text, completion, digest = content.rpartition(SEAL.encode())
+    if not completion or digest != f"{digest_bytes(text)}\n".encode():
         return ExistingRun(folder, content, record)
     lines = text.decode().splitlines()
     entries = (_as_first_requested(entry, lines) for entry in read_file(folder / "run.toml").entries)
@@ -114,9 +114,7 @@ def _as_first_requested(entry: Setting, lines: Sequence[str]) -> Setting:
 def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
     """The request of ``held`` merged with the present one; ``where`` is the run's folder or its URL."""
     if held is None or not held.is_known:
-        raise ConfigError(
-            f"--extend: {printable(where, 300)} contains no complete run.toml; omit --extend to start a run"
-        )
+        raise ConfigError(f"--extend: {printable(where, 300)} has no complete run.toml; omit --extend to start a run")
     joined = []
     for name in JOINED:
         given = [entry for entry in asked.entries if entry.path == (name,)]

@@ -340,8 +340,8 @@ def _request_of(run: RunFolder) -> records.RunRecord:
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
     """The data from which ``map_file``, a completed map of ``scene`` in the folder ``run``, was made."""
-    mark_complete = JobFolder(map_file.parent).completion_records().get("predict")
-    digests = {} if mark_complete is None else {scene: mark_complete.key.get("data", "")}
+    completion = JobFolder(map_file.parent).completion_records().get("predict")
+    digests = {} if completion is None else {scene: completion.key.get("data", "")}
     return RunData(read_file(run / "run.toml"), digests, _request_of(RunFolder(run)).truth_files)
 
 

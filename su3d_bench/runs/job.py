@@ -234,15 +234,11 @@ class JobInputs:
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.uses_names for protocol in rules.values()) else key
 
-    def is_scored(self, folder: JobFolder, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``mark_complete`` records scores under ``key``; pictures that are not requested now do no harm."""
-        if (
-            mark_complete is not None
-            and not self.job.config.pictures
-            and mark_complete.key.get("pictures") == str(True)
-        ):
+    def is_scored(self, folder: JobFolder, completion: CompletionRecord | None, key: Mapping[str, str]) -> bool:
+        """Whether ``completion`` records scores under ``key``; pictures that are not requested now do no harm."""
+        if completion is not None and not self.job.config.pictures and completion.key.get("pictures") == str(True):
             key = {**key, "pictures": str(True)}
-        return folder.is_whole(mark_complete, key)
+        return folder.is_whole(completion, key)
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are complete; ``remarks`` are stored with the completion record of the scores."""

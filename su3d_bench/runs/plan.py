@@ -374,9 +374,7 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
         if len(reasons) == len(truths):
             raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(
-            name for name, rule in zip(wanted, rules, strict=True) if truth_incompatibility(rule, truth) is None
-        )
+        target: tuple(name for name, one in zip(wanted, rules, strict=True) if not truth_incompatibility(one, truth))
         for target, truth in truths.items()
     }
 

@@ -258,8 +258,8 @@ class StoredRun:
         """The run at ``url``; the mirror then contains exactly its records and completion records."""
         place = cls(url, RunFolder(mirror_of(url, cache_root)))
         mirror, store = place.folder.path, RemoteFolder(url)
-        mark_complete = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
-        names = [name for name in store.files() if name in RECORDS or mark_complete.fullmatch(name)]
+        completion = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
+        names = [name for name in store.files() if name in RECORDS or completion.fullmatch(name)]
         if names or mirror.exists():
             with place.folder.locked():
                 for path in (*mirror.glob(f"{JOBS}/*/*/{SEAL}"), *(mirror / name for name in RECORDS)):

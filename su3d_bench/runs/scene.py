@@ -315,9 +315,7 @@ class _Scene:
         unscored: dict[str, str] = {}
         for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
             if rules.ground_truth not in self._truths:
-                self.report_activity(
-                    part, "computing the ground truth" if self.is_rendered else "reading the ground truth"
-                )
+                self.report_activity(part, "computing ground truth" if self.is_rendered else "reading ground truth")
             try:
                 truth = self.truth(rules.ground_truth)
             except GroundTruthMissing as error:

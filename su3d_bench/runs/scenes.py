@@ -97,13 +97,13 @@ def expand_scenes(
     """
     root = data_root() if root is None else root
     chosen: dict[tuple[str, str], None] = {}
-    foreign_files = []
+    ignored = []
     for address in addresses:
         target, pattern = split_address(address)
         dataset = build_dataset(datasets[target], root) if target in datasets else None
         scenes = [] if dataset is None else _matching_scenes(dataset, pattern)
         if not scenes and os.path.exists(address):
-            foreign_files.append(address)
+            ignored.append(address)
         elif not scenes:
             assert dataset is not None
             known = [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
@@ -113,7 +113,7 @@ def expand_scenes(
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
         raise ConfigError(f"no scene matches {', '.join(addresses)}; expected such as rooms/living0 or 'rooms/*'")
-    notes = (f"ignored, not scenes: {' '.join(foreign_files)}",) if foreign_files else ()
+    notes = (f"ignored, not scenes: {' '.join(ignored)}",) if ignored else ()
     return list(chosen), notes
 
 

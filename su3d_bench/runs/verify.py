@@ -81,8 +81,8 @@ def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
 
 def _damage(job: JobFolder) -> str | None:
     completed: dict[str, str] = {}
-    for mark_complete in job.completion_records().values():
-        completed |= mark_complete.files
+    for completion in job.completion_records().values():
+        completed |= completion.files
     for file in (job.prediction, features_beside(job.prediction), job.updates, job.counts):
         if file.name not in completed:
             if file != features_beside(job.prediction):

@@ -327,9 +327,7 @@ def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
     if not np.isfinite(table).all():
         raise DataError(f"{where}: has a number that is not finite; run the same command again to repair it")
     if table.size and not 0 <= table.min() <= table.max() <= MAX_VALUE:
-        raise DataError(
-            f"{where}: has {table.min():g} and {table.max():g}; times and sizes must be from 0 to {MAX_VALUE:g}"
-        )
+        raise DataError(f"{where}: has {table.min():g} and {table.max():g}; expected 0 to {MAX_VALUE:g}")
     if len(set(header)) != len(header):
         raise DataError(f"{where}: has two columns with the same name; run the same command again to repair it")
     return {name: table[:, column] for column, name in enumerate(header)}

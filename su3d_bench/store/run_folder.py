@@ -106,10 +106,10 @@ class RunFolder:
             names = sorted(os.listdir(self.path))
         except OSError:  # writing there gives a better message
             return
-        foreign_files = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
-        if foreign_files and not any(name in MARKS for name in names):
+        others = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
+        if others and not any(name in MARKS for name in names):
             raise StoreError(
-                f"{shown(self.path)}: contains '{foreign_files[0]}' and is not a run folder; choose a new one with --out"
+                f"{shown(self.path)}: contains '{others[0]}' and is not a run folder; choose another with --out"
             )
 
     def jobs(self) -> list[JobFolder]:
@@ -233,9 +233,9 @@ class JobFolder:
             return {}
         steps = record.get("steps") if isinstance(record, dict) and record.get("schema") == SCHEMA else None
         completion_records = {}
-        for step, mark_complete in steps.items() if isinstance(steps, dict) else ():
+        for step, completion in steps.items() if isinstance(steps, dict) else ():
             with suppress(ValidationError, RecursionError):
-                completion_records[step] = checked(CompletionRecord, mark_complete)
+                completion_records[step] = checked(CompletionRecord, completion)
         return completion_records
 
     def mark_complete(
@@ -249,23 +249,20 @@ class JobFolder:
         temporary_path = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
         digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in [*files, *temporary_path]}
         steps[step] = CompletionRecord(key, digests, remarks or {})
-        write_json(
-            self.done,
-            {"schema": SCHEMA, "steps": {name: plain(mark_complete) for name, mark_complete in steps.items()}},
-        )
+        write_json(self.done, {"schema": SCHEMA, "steps": {name: plain(one) for name, one in steps.items()}})
 
     def remarks(self, step: str) -> Mapping[str, Any]:
         """The remarks in the completion record of ``step``."""
-        mark_complete = self.completion_records().get(step)
-        return {} if mark_complete is None else mark_complete.remarks
+        completion = self.completion_records().get(step)
+        return {} if completion is None else completion.remarks
 
     def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
         """A clause with the first field in which the recorded key differs from ``key``; None if equal.
 
         Fields in ``known_later`` are not compared.
         """
-        mark_complete = self.completion_records().get(step)
-        sealed = {} if mark_complete is None else mark_complete.key
+        completion = self.completion_records().get(step)
+        sealed = {} if completion is None else completion.key
         if not sealed or (key.items() <= sealed.items() and sealed.keys() - key.keys() <= set(known_later)):
             return None
         for name in [*key, *(name for name in sealed if name not in key)]:
@@ -277,9 +274,9 @@ class JobFolder:
         """Whether ``step`` is completed under exactly ``key`` and all its files are intact."""
         return self.is_whole(self.completion_records().get(step), key)
 
-    def is_whole(self, mark_complete: CompletionRecord | None, key: Mapping[str, str]) -> bool:
-        """Whether ``mark_complete``, one of ``completion_records``, has exactly ``key`` and all its files are intact."""
-        if mark_complete is None or mark_complete.key != dict(key):
+    def is_whole(self, completion: CompletionRecord | None, key: Mapping[str, str]) -> bool:
+        """Whether ``completion``, one of ``completion_records``, has exactly ``key`` and all its files are intact."""
+        if completion is None or completion.key != dict(key):
             return False
-        files = {self.path / name: digest for name, digest in mark_complete.files.items()}
+        files = {self.path / name: digest for name, digest in completion.files.items()}
         return all(file.is_file() and digest_file(file) == digest for file, digest in files.items())

@@ -133,7 +133,7 @@ def test_points_have_rows_by_predicted_name_and_by_true_object() -> None:
     assert (rows[0].centre_x_m, rows[0].size_x_m) == (1.5, 3.0)
 
 
-def test_samples_command_writes_one_row_per_instance(
+def test_samples_command_has_one_row_per_instance(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "samples.csv"

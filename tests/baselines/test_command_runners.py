@@ -71,9 +71,7 @@ if words[0] == "run":
 """
 
 
-def test_docker_gets_read_only_frames_no_network_and_inside_paths(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_docker_gets_read_only_frames_and_no_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = fake(tmp_path, monkeypatch, "docker", FAKE_DOCKER + MASKS)
     monkeypatch.setenv("MY_MODEL", "large")
     config = CommandConfig(

@@ -65,9 +65,7 @@ def test_cache_list_counts_every_kind_of_entry(cache: Path, capsys: pytest.Captu
     assert n_bytes == sum(path.stat().st_size for path in files) - len(FOREIGN) * len("mine")
 
 
-def test_clear_removes_only_cache_files_and_replies_only_by_name(
-    cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_clear_removes_cache_files_and_replies_only_by_name(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = held(capsys)
     assert main(["dev", "cache", "clear", "all", "--dry-run"]) == 0
     assert "perception: 1 file, 0.0 MB would be removed" in capsys.readouterr().out

@@ -104,7 +104,7 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
         ("run --methods oracle rooms/living0", "--methods rooms/living0: is a scene; write it before the"),
         ("run --extend", "--extend: name the run with --out, such as --out runs/demo"),
         ("run --replace", "--replace: name the run with --out, such as --out runs/demo"),
-        (f"{TYPED} --extend --out none", "--extend: none contains no complete run.toml; omit --extend to start"),
+        (f"{TYPED} --extend --out none", "--extend: none has no complete run.toml; omit --extend to start"),
     ],
 )
 def test_invalid_input_is_a_one_line_error_with_exit_code_2(
@@ -200,9 +200,7 @@ def test_pictures_of_different_texts_and_scenes_have_different_names() -> None:
     assert file_name_of_scene("replica/room0") == "replica-room0"
 
 
-def test_query_text_ranks_the_map_and_draws_it(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_query_text_ranks_and_draws_map(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "text", "painted/a", "a red sofa", "--method", "collector"]

@@ -87,9 +87,7 @@ def test_texts_of_a_protocol_are_listed_one_per_line(capsys: pytest.CaptureFixtu
         ("q.json", '{"synonyms": {"a place to sit": [1], "something to eat at": ["2"]}}'),
     ],
 )  # fmt: skip
-def test_queries_are_encoded_from_every_file_format(
-    name: str, content: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_queries_are_encoded_from_every_format(name: str, content: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path(name).write_text(content)
     assert make("query-ap", "texts.npz", "--queries", name) == 0
     assert ("--queries" in capsys.readouterr().err) == (name in ("q.csv", "q.toml"))

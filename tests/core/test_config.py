@@ -56,7 +56,7 @@ def test_later_source_overrides_and_each_value_records_its_source(tmp_path: Path
         ("seed = 1\nmetod = 2\n", "run.toml:2: unknown key 'metod'; did you mean 'method'?"),
         (
             "[method]\nopensu3d = 2\n",
-            "run.toml:2: 'method.opensu3d' is a section; write [method.opensu3d] and keys below it",
+            "run.toml:2: 'method.opensu3d' is a section; write [method.opensu3d] and its keys",
         ),
         ("seed = 1\nseed\n", "run.toml:2: not valid TOML: expected '=' after a key in a key/value pair"),
     ],

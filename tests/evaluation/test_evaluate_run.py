@@ -186,7 +186,7 @@ TEXTS = ["evaluate", "pred", "--ground-truth", "gt", "--protocol", "scannet-inst
 
 
 @pytest.mark.usefixtures("_texts")
-def test_run_from_text_ground_truth_has_attribution_and_states_what_is_missing(
+def test_run_from_text_ground_truth_has_attribution_and_states_gaps(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main([*TEXTS, "--json", "numbers.json"]) == 0
@@ -212,7 +212,7 @@ def test_run_from_text_ground_truth_has_attribution_and_states_what_is_missing(
     assert "is not the one of runs/mine" in answered(capsys, "report", "attribution", "runs/mine", code=2)
 
 
-def test_text_feature_file_classifies_features_and_is_needed_for_attribution(
+def test_text_feature_file_names_features_and_is_needed_for_attribution(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     names = [entry.name for entry in load_protocol("rooms-instance").classes]

@@ -64,9 +64,7 @@ def test_each_kind_of_protocol_states_its_number_of_labels(
     assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
 
 
-def test_masks_with_several_labels_are_detected_and_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_masks_with_several_labels_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_truth(tmp_path / "gt")
     for written, expected in ((ONE, "one label"), (PAIRS, "the top labels of a mask")):
         write_scannet_text(tmp_path / "pred", written)

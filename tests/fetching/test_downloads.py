@@ -14,13 +14,13 @@ from file_server import FileServer, Served
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.fetching import download
-from su3d_bench.fetching.download import Download, ExpectedContent, download_file, part_of
+from su3d_bench.fetching.download import Download, Expected, download_file, part_of
 
 CONTENT = np.random.default_rng(0).bytes(900_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 OTHER = np.random.default_rng(1).bytes(900_000)
 NAME = "weights.pth"
-UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": ExpectedContent()}
+UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": Expected()}
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
 
 
 def fetched(server: FileServer, place: Path, n_retries: int = 0, **changes: Any) -> str:
-    known: dict[str, Any] = {"n_bytes": len(CONTENT), "stated": ExpectedContent(sha256=SHA256)}
+    known: dict[str, Any] = {"n_bytes": len(CONTENT), "stated": Expected(sha256=SHA256)}
     wanted = Download(NAME, f"{server.url}/{NAME}", changes.pop("hosts", ("127.0.0.1",)), **(known | changes))
     return download_file(wanted, place, lambda *words: None, n_retries)
 
@@ -40,7 +40,7 @@ def fetched(server: FileServer, place: Path, n_retries: int = 0, **changes: Any)
 def test_interrupted_download_is_resumed_and_leaves_no_temporary_files(server: FileServer, tmp_path: Path) -> None:
     place = tmp_path / NAME
     server.files[f"/{NAME}"] = Served(CONTENT, breaks_after=[500_000])
-    with pytest.raises(DataError, match="500,000 bytes were downloaded; run the same command again to resume"):
+    with pytest.raises(DataError, match="500,000 bytes were downloaded; rerun to resume"):
         fetched(server, place, **UNSTATED)
     assert not place.exists() and part_of(place).read_bytes() == CONTENT[:500_000]
     assert fetched(server, place, **UNSTATED) == SHA256
@@ -75,13 +75,13 @@ def test_parts_of_two_files_are_never_joined(server: FileServer, tmp_path: Path,
 @pytest.mark.parametrize(
     "stated",
     [
-        ExpectedContent(sha256="0" * 64),
-        ExpectedContent(md5_prefix="4b8939"),
-        ExpectedContent(git_blob="1" * 40),
-        ExpectedContent(recorded="2" * 64),
+        Expected(sha256="0" * 64),
+        Expected(md5_prefix="4b8939"),
+        Expected(git_blob="1" * 40),
+        Expected(recorded="2" * 64),
     ],
 )
-def test_file_with_a_wrong_checksum_is_deleted(server: FileServer, tmp_path: Path, stated: ExpectedContent) -> None:
+def test_file_with_a_wrong_checksum_is_deleted(server: FileServer, tmp_path: Path, stated: Expected) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
     with pytest.raises(DataError, match="it was deleted"):
         fetched(server, tmp_path / NAME, stated=stated)
@@ -90,7 +90,7 @@ def test_file_with_a_wrong_checksum_is_deleted(server: FileServer, tmp_path: Pat
 
 def test_md5_prefix_is_compared_with_the_full_md5(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT)
-    fetched(server, tmp_path / NAME, stated=ExpectedContent(md5_prefix=hashlib.md5(CONTENT).hexdigest()[:6]))
+    fetched(server, tmp_path / NAME, stated=Expected(md5_prefix=hashlib.md5(CONTENT).hexdigest()[:6]))
     assert (tmp_path / NAME).is_file()
 
 

@@ -120,9 +120,7 @@ def test_hand_written_ply_file_is_read_as_specified(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("corners", [QUADS, MIXED], ids=["quads", "mixed"])
-def test_file_truncated_anywhere_is_a_data_error_that_names_it(
-    tmp_path: Path, format: str, corners: ListColumn
-) -> None:
+def test_file_truncated_anywhere_is_a_named_data_error(tmp_path: Path, format: str, corners: ListColumn) -> None:
     whole = (
         mesh_bytes(tmp_path, format, corners).rstrip() if format == "ascii" else mesh_bytes(tmp_path, format, corners)
     )

@@ -198,7 +198,7 @@ def test_predictions_unsupported_by_scannets_list_are_refused() -> None:
     for content in (dense, VertexLabels(np.zeros(3, np.int32))):
         with pytest.raises(PredictionError, match="has no masks"):
             export.masks_on_truth(content, RULES, room(), None)
-    with pytest.raises(PredictionError, match=r"is of 9 points, the scene of \d+; both must be of one mesh"):
+    with pytest.raises(PredictionError, match=r"is of 9 points, the scene of \d+; both need one mesh"):
         export.masks_on_truth(vertex_masks("x", [np.array([1], np.int32)], 9), RULES, room(), None)
     with pytest.raises(PredictionError, match="NaN or infinite"):
         export.masks_on_truth(replace(labelled_room(), scores=np.full(8, np.nan)), RULES, room(), None)

@@ -96,7 +96,7 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
     made.write_torch(tmp_path / "a.pt", (made.Tensor(MASKS), made.Tensor(np.ones(4, np.float32))))
     assert "3 masks, but the scores are an array of shape (4,)" in made.refused(tmp_path, "a", "openyolo3d")
     made.write_torch(tmp_path / "b.pth", {"ins": made.Tensor(MASKS), "conf": made.Tensor(np.ones(7))})
-    assert "but there are 7 scores or classes" in made.refused(tmp_path, "b", "open3dis")
+    assert "with 7 scores or classes" in made.refused(tmp_path, "b", "open3dis")
     made.write_openmask3d(tmp_path, made.TOY, made.FEATURES[:2])
     assert "3 masks, but the features are an array of shape (2, 768)" in made.refused(
         tmp_path, made.TOY["name"], "openmask3d"

@@ -231,9 +231,7 @@ class GalleryOfScene:
             else:
                 cards[of][k] = replace(cards[of][k], photo=len(photos), frame=photo[0], why=None)
                 photos.append(photo[1])
-        of_methods = tuple(
-            replace(summary, cards=tuple(own)) for (summary, _), own in zip(self._cards, cards, strict=True)
-        )
+        of_methods = tuple(replace(one, cards=tuple(own)) for (one, _), own in zip(self._cards, cards, strict=True))
         return SceneGallery(printable(self._scene, 200), of_methods, tuple(photos), not self.lacks)
 
 

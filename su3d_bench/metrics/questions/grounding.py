@@ -185,9 +185,7 @@ def chained(truth: QueryTruth) -> tuple[ChainedText, ...]:
     """The texts of a ground truth with their positions; ``DataError`` for texts without chains."""
     cases = tuple(query for query in truth.queries if isinstance(query, ChainedText))
     if len(cases) < len(truth.queries):
-        raise DataError(
-            "object-chains: the queries have no chains of objects; use a metadata_*_grounding.json of Beacon3D"
-        )
+        raise DataError("object-chains: the queries have no object chains; use a metadata_*_grounding.json of Beacon3D")
     return cases
 
 

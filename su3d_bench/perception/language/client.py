@@ -245,9 +245,7 @@ class Server:
         except openai.APIStatusError as error:
             return self._refused_parameter(error)
         except openai.APITimeoutError:
-            raise _Failed(
-                f"no answer within {self._config.timeout_s:g} s; tried {n_tries} times", is_down=True
-            ) from None
+            raise _Failed(f"no answer within {self._config.timeout_s:g} s, {n_tries} tries", is_down=True) from None
         except _TooLarge as error:
             raise _Failed(f"the answer is {error}", is_down=False) from None
         except openai.OpenAIError as error:

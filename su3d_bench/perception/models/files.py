@@ -268,9 +268,7 @@ def _read_pickled(path: Path, device: str) -> Any:
 def check_settings_size(path: Path) -> None:
     """Reject a file of settings or words that is far larger than any model's; a missing one is accepted."""
     if path.is_file() and path.stat().st_size > MAX_SETTINGS_BYTES:
-        raise DataError(
-            f"{path}: has {path.stat().st_size} bytes; a model's settings have at most {MAX_SETTINGS_BYTES}"
-        )
+        raise DataError(f"{path}: has {path.stat().st_size} bytes; settings have at most {MAX_SETTINGS_BYTES}")
 
 
 def read_settings(path: Path) -> dict[str, Any]:

@@ -90,9 +90,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
     used = session.get_providers()
     if PROVIDERS[provider] not in used:
         # ONNX Runtime falls back to the CPU if a provider's own libraries do not load
-        raise ModelMissing(
-            f"provider '{provider}': onnxruntime failed to start it; install the CUDA libraries it needs"
-        )
+        raise ModelMissing(f"provider '{provider}': onnxruntime failed to start it; install its CUDA libraries")
     return session
 
 

@@ -37,9 +37,7 @@ def write_depth(folder: Path, index: int, values: np.ndarray) -> None:
     cv2.imwrite(str(folder / f"data/depth/frame-{index}.png"), values.astype(np.uint16))
 
 
-def test_isolated_largest_value_is_no_depth_and_is_reported_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_isolated_largest_value_is_no_depth_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folder = write_scene(tmp_path)
     near = np.linspace(810, 4000, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)
     far = np.linspace(60_000, 65_535, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)

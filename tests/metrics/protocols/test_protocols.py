@@ -175,9 +175,7 @@ TRUTHS = [
 
 
 @pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
-def test_ground_truth_without_what_a_protocol_needs_gives_a_reason(
-    name: str, truth: TruthFacts, reason: str | None
-) -> None:
+def test_ground_truth_unfit_for_a_protocol_gives_a_reason(name: str, truth: TruthFacts, reason: str | None) -> None:
     said = truth_incompatibility(load_protocol(name), truth)
     assert said == reason if reason is None else str(said).startswith(reason)
 

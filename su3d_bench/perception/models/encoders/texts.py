@@ -166,7 +166,5 @@ def _load(folder: Path, load: Callable[[], Any]) -> Any:
         return load()
     except Exception as error:  # tokenizers raises plain Exception for an invalid file; others are re-raised
         if type(error) is Exception or isinstance(error, OSError | ValueError | KeyError | TypeError | AttributeError):
-            raise DataError(
-                f"{folder}: cannot read its tokenizer: {bounded(error)}; download its files again"
-            ) from error
+            raise DataError(f"{folder}: unreadable tokenizer: {bounded(error)}; download it again") from error
         raise
