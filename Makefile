@@ -67,6 +67,8 @@ docs: $(VENV)/docs
 
 lint: $(VENV)/dev
 	$(BIN)/python .ci/check_budget.py
+	$(BIN)/python .ci/check_words.py
+	$(BIN)/codespell su3d_bench datasets baselines reports benchmarks tests tools docs .ci *.md *.toml *.yml Makefile
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -142,19 +142,19 @@ class ConceptFusionConfig(BaseModel):
     weights: Weights = "uniqueness"
     temperature: Positive = 1.0
     # "small-over-large" is that of the branch fastsam.
-    overlaps: Overlaps = "sum"
+    mask_overlap: Overlaps = "sum"
     # gradslam at 59ca872 averages a feature only if no channel is zero; its comment (and forks) suggest
     # "not all channels are zero": "any-channel".
-    valid_features: Literal["no-zero-channel", "any-channel"] = "no-zero-channel"
+    valid_feature_rule: Literal["no-zero-channel", "any-channel"] = "no-zero-channel"
     # gradslam at 59ca872 multiplies confidence by feature in half precision, so that points beyond about 3 m, with
     # minimal confidence, lose the feature of the first image: "half", the preset half-products. The default is
     # "single", because that loss is neither in the paper nor intended.
-    products: Literal["single", "half"] = "single"
+    product_precision: Literal["single", "half"] = "single"
     distance_m: Positive = 0.05  # PointFusion's dist_th
     normal_angle_deg: float = Field(default=20.0, ge=0, le=180)  # angle_th
     sigma: Positive = 0.6  # m, of alpha
     # Ours: the same numbers in memory or in a file; a scene of 2 M points x 1024 dimensions takes 4.1 GB.
-    features_in: Place = "disk"
+    feature_storage: Place = "disk"
 
 
 class ConceptFusion:
@@ -163,7 +163,7 @@ class ConceptFusion:
     name = "conceptfusion"
     warms_up = True
     Config: type[ConceptFusionConfig] = ConceptFusionConfig
-    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"half-products": {"products": "half"}}
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"half-products": {"product_precision": "half"}}
     about = MethodAbout(
         paper=PAPER,
         source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are from the paper only",
@@ -230,7 +230,7 @@ class ConceptFusion:
     def _table_for(self, detections: Detections) -> FeatureTable:
         n_dimensions = len(detections.global_feature)
         if self._features is None:
-            self._features = FeatureTable(n_dimensions, self.config.features_in)
+            self._features = FeatureTable(n_dimensions, self.config.feature_storage)
         if self._features.n_dimensions != n_dimensions:
             raise DataError(
                 f"frame {detections.frame_index}: features have {n_dimensions} dimensions, those of the map have "
@@ -244,15 +244,15 @@ class ConceptFusion:
         if len(regions):
             weights = mixing_weights(whole, regions, config.weights, config.temperature)
             mixed = mixed_features(whole, regions, weights)
-        return paint(detections.masks, detections.boxes, mixed, config.overlaps, config.height, config.width)
+        return paint(detections.masks, detections.boxes, mixed, config.mask_overlap, config.height, config.width)
 
     def _average(self, features: FeatureTable, view: View, field: PixelFeatures, matched: Int64Array) -> None:
-        is_set = np.all if self.config.valid_features == "no-zero-channel" else np.any
+        is_set = np.all if self.config.valid_feature_rule == "no-zero-channel" else np.any
         is_valid = is_set(field.features != 0, axis=1)
         is_met = matched != ABSENT
         pixel = np.flatnonzero(is_met & is_valid[field.row.ravel()])
         seen = matched[pixel], field.features, field.row.ravel()[pixel], view.alpha[pixel]
-        if self.config.products == "single":
+        if self.config.product_precision == "single":
             features.average(*seen)
         elif is_met.any():
             features.average_in_half(*seen)

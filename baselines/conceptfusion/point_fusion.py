@@ -154,7 +154,7 @@ def _nameless_file(place: Place) -> IO[bytes]:
 def _disk_error(error: OSError) -> StoreError:
     return StoreError(
         f"cannot write features to {scratch_folder()}: {error.strerror or error}; set TMPDIR to a larger disk, or "
-        "features_in = 'memory'"
+        "feature_storage = 'memory'"
     )
 
 

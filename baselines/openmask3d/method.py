@@ -336,7 +336,7 @@ class OpenMask3DSegment3DConfig(OpenMask3DConfig):
     surface_max: int = Field(default=400, ge=1, le=100_000)  # queries of the evaluation script
     surface_min_points: int = Field(default=16, ge=1)  # more than part_max_dropped
     # SAM splits objects into parts and parts of parts; so more nested proposals are kept.
-    surface_same_iou: Annotated[float, Field(gt=0, le=1)] = 0.8
+    surface_duplicate_iou: Annotated[float, Field(gt=0, le=1)] = 0.8
 
 
 class OpenMask3DSegment3D(OpenMask3D):

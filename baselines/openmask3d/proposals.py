@@ -210,7 +210,7 @@ def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, 
     """The nodes that become masks, best first, ties in order; ``n_points`` (S,) of the segments.
 
     At most ``surface_max``, of ``surface_min_points`` vertices up to ``surface_max_share`` of all; of two nested ones
-    whose IoU exceeds ``surface_same_iou`` only the better one is kept.
+    whose IoU exceeds ``surface_duplicate_iou`` only the better one is kept.
     """
     before = np.concatenate([[0], np.cumsum(n_points[tree.leaves])])
     n_of_node = before[tree.end] - before[tree.start]
@@ -220,7 +220,7 @@ def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, 
         if len(taken) == config.surface_max:
             break
         smaller, larger = np.minimum(n_of_node[taken], n_of_node[node]), np.maximum(n_of_node[taken], n_of_node[node])
-        is_same = is_within(tree, taken, int(node)) & (smaller > config.surface_same_iou * larger)
+        is_same = is_within(tree, taken, int(node)) & (smaller > config.surface_duplicate_iou * larger)
         if fits[node] and not is_same.any():
             taken = np.append(taken, node)
     return taken
@@ -255,7 +255,7 @@ class ProposalConfig(BaseModel):
     surface_max: int = Field(default=150, ge=1, le=100_000)
     surface_min_points: int = Field(default=100, ge=1)
     surface_max_share: Share = 0.25
-    surface_same_iou: Share = 0.5
+    surface_duplicate_iou: Share = 0.5
     segment_threshold: Annotated[float, Field(gt=0, allow_inf_nan=False)] = THRESHOLD
     segment_min_vertices: int = Field(default=MIN_VERTICES, ge=1)
 

@@ -49,7 +49,7 @@ _QUESTIONS = (
 )  # fmt: skip
 _PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
 _COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_pairs", ""))
-_GATE = tuple(f"analysis/regression_check/test_regression_check{name}" for name in ("", "_costs"))
+_GATE = tuple(f"analysis/regression_check/test_regression_{name}" for name in ("check", "costs"))
 # For each module, or all in a folder, the tests that must notice: the fast ones first. Names without a folder are
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {

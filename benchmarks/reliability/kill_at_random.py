@@ -169,12 +169,12 @@ class Trial:
             return True
         self._end_orphans()
         is_cut = sent == signal.SIGKILL and self._moments.random() < 0.5
-        spoilt = cut_power([folder, self._cache], self._moments) if is_cut else None
+        damaged = cut_power([folder, self._cache], self._moments) if is_cut else None
         if folder.is_dir():
             for name in false_seals(folder, self.expected):
                 self._tally.fault(f"accepted as complete after the kill of a {victim}: {name}")
             self._lock(folder)
-        self._tally.kill(victim, sent, spoilt)
+        self._tally.kill(victim, sent, damaged)
         return True
 
     def _end_orphans(self) -> None:

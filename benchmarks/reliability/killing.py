@@ -47,14 +47,14 @@ class Tally:
         lines.append(f"{self.name}: {line}")
         print(f"{kind} {lines[-1]}", flush=True)
 
-    def kill(self, victim: str, sent: signal.Signals, spoilt: int | None) -> None:
+    def kill(self, victim: str, sent: signal.Signals, damaged: int | None) -> None:
         """Count an effective kill; ``corrupted`` files if a power cut was simulated."""
         self.done["kills"] += 1
         self.done[f"of a {victim}"] += 1
         self.done[sent.name] += 1
-        if spoilt is not None:
+        if damaged is not None:
             self.done["power cuts"] += 1
-            self.done["files corrupted"] += spoilt
+            self.done["files corrupted"] += damaged
         if self.done["kills"] % 10 == 0:
             print(f"{self.name}: {dict(self.done)}", flush=True)
 
@@ -147,7 +147,7 @@ def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
     from su3d_bench.core.files.locks import beside
 
     since = time.time_ns() - LAST_SECOND_NS
-    spoilt = 0
+    damaged = 0
     for path in sorted(path for root in roots for path in root.rglob("*") if path.is_file()):
         if path.stat().st_mtime_ns < since:
             continue
@@ -156,7 +156,7 @@ def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
         at = moments.randrange(len(content) + 1)
         if way == "whole":
             continue
-        spoilt += 1
+        damaged += 1
         if way == "undone":  # the bytes partly reached the disk, the rename did not
             path.rename(beside(path))
         elif way == "cut":
@@ -166,4 +166,4 @@ def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
             path.write_bytes(content[:kept] + bytes(len(content) - kept))
         else:
             path.write_bytes(b"" if way == "empty" else bytes(len(content)))
-    return spoilt
+    return damaged

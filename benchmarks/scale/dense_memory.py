@@ -117,12 +117,12 @@ def reported(step: str) -> Iterator[dict[str, Any]]:
     print(json.dumps(line), flush=True)
 
 
-def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> None:
+def work(n_points: int, n_dimensions: int, feature_storage: str, folder: Path) -> None:
     """All steps in this process."""
     n_images = -(-n_points // SIDE_PX**2)
     config: Callable[..., ConceptFusionConfig] = ConceptFusionConfig
-    method = ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in=features_in))
-    warm_up(ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in="memory")))  # as in a run
+    method = ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, feature_storage=feature_storage))
+    warm_up(ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, feature_storage="memory")))  # as in a run
     method.start(SceneInfo("made", "wall", 2 * n_images, 1, "rendered-rooms"))
     with reported("start"):
         pass
@@ -141,12 +141,12 @@ def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> No
         found["features_bytes"] = prediction.features.nbytes
 
 
-def in_a_process(features_in: str, n_points: int, n_dimensions: int, folder: Path) -> list[dict[str, Any]]:
+def in_a_process(feature_storage: str, n_points: int, n_dimensions: int, folder: Path) -> list[dict[str, Any]]:
     """The report of each step, in order; the prediction stays in ``folder``."""
-    words = ["--points", str(n_points), "--dimensions", str(n_dimensions), "--features-in", features_in]
+    words = ["--points", str(n_points), "--dimensions", str(n_dimensions), "--features-in", feature_storage]
     command = [sys.executable, str(BENCHMARKS), "dense_memory", *words, "--folder", str(folder), "--here"]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    steps = [{"features_in": features_in} | json.loads(line) for line in done.stdout.splitlines()]
+    steps = [{"feature_storage": feature_storage} | json.loads(line) for line in done.stdout.splitlines()]
     print(*map(json.dumps, steps), sep="\n", flush=True)
     return steps
 
@@ -161,10 +161,10 @@ def main() -> None:
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.here:
-        work(arguments.points, arguments.dimensions, arguments.features_in[0], arguments.folder)
+        work(arguments.points, arguments.dimensions, arguments.feature_storage[0], arguments.folder)
         return
     told: dict[str, list[dict[str, Any]]] = {}
-    for where in arguments.features_in:
+    for where in arguments.feature_storage:
         with tempfile.TemporaryDirectory(prefix="dense-memory-") as made:
             told[where] = in_a_process(where, arguments.points, arguments.dimensions, arguments.folder or Path(made))
     if arguments.json:

@@ -27,7 +27,7 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.system.timing import MethodClock
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.runs.frame_loop import Feeding, ReadAhead
+from su3d_bench.runs.frame_loop import MethodFeed, ReadAhead
 
 N_FRAMES = 5578
 LENGTH_M, STEP_M = 20, 0.25
@@ -113,7 +113,7 @@ def main() -> None:
     arguments = parser.parse_args()
     frames = Pacing(arguments.frames)
     method = OpenSU3D()
-    feeding = Feeding("long", method, Faultless(frames, arguments.features), lambda event: None, MethodClock())
+    feeding = MethodFeed("long", method, Faultless(frames, arguments.features), lambda event: None, MethodClock())
     method.start(SceneInfo("made", "long", arguments.frames, 1, "rendered-rooms"))
     scratch_mib: dict[int, float] = {}
     start = time.perf_counter()

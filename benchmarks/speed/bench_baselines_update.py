@@ -111,7 +111,7 @@ def conceptgraphs(n_points: int) -> tuple[Method, Callable[[], None]]:
 
 def conceptfusion(n_points: int) -> tuple[Method, Callable[[], None]]:
     """Normals point away from the camera, as in its own views of a wall; the whole view is averaged in."""
-    method = ConceptFusion(ConceptFusionConfig(features_in="memory"))
+    method = ConceptFusion(ConceptFusionConfig(feature_storage="memory"))
     method.start(SCENE)
     points, _ = wall(n_points, 0.02)
     n = len(points)

@@ -33,7 +33,7 @@ from su3d_bench.runs.job import as_configured
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # ground-truth variant -> ground truth
-MendedJob = Mapping[str, CorrectedScene]  # protocol -> counts of one scene and method
+JobCounts = Mapping[str, CorrectedScene]  # protocol -> counts of one scene and method
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Explained:
             evaluated = look(rules, truth, prediction, self._inputs.encoder(rules, prediction, encoder))
             yield Matched(self, scene, rules, truth, prediction, evaluated)
 
-    def corrected(self, scene: str, evaluated: Mapping[str, EvaluatedScene]) -> MendedJob:
+    def corrected(self, scene: str, evaluated: Mapping[str, EvaluatedScene]) -> JobCounts:
         """The counts of ``scene``, checked against those of the run, and the counts with its errors corrected."""
         corrected = {name: one.corrected() for name, one in evaluated.items()}
         for name, counts in corrected.items():
@@ -284,7 +284,7 @@ def attribute(
 
 
 def attribution_of(
-    explained: Explained, corrected: Mapping[str, MendedJob], other: Side | None = None
+    explained: Explained, corrected: Mapping[str, JobCounts], other: Side | None = None
 ) -> RunAttribution:
     """The cost of the errors of all scenes; ``other`` is the side with ground-truth 2D masks."""
     side = Side(explained.run, explained.method)

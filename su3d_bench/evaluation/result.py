@@ -295,8 +295,8 @@ def _key(name: str) -> str:
     >>> _key("mIoU"), _key("top-3 mIoU"), _key("mF1-other")
     ('miou', 'top_3_miou', 'mf1_other')
     """
-    likeliest, gap, rest = name.rpartition(" ") if name.startswith("top-") else ("", "", name)
-    return likeliest.replace("-", "_") + gap.replace(" ", "_") + KEYS.get(rest, rest.lower().replace("-", "_"))
+    most_likely, gap, rest = name.rpartition(" ") if name.startswith("top-") else ("", "", name)
+    return most_likely.replace("-", "_") + gap.replace(" ", "_") + KEYS.get(rest, rest.lower().replace("-", "_"))
 
 
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def assign_objects(shared: Int64Array, sizes: Int64Array) -> Int64Array:
     A mask is assigned to the object that has half of its points, unless a second one has nearly as many; of several
     masks assigned to an object the one with most points counts, the first on ties.
 
-    >>> stand_for(np.array([[6, 4, 5], [3, 4, 0]]), np.array([10, 8, 10])).tolist()
+    >>> assign_objects(np.array([[6, 4, 5], [3, 4, 0]]), np.array([10, 8, 10])).tolist()
     [0, -1]
     """
     n_objects, n_masks = shared.shape

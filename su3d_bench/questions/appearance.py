@@ -47,8 +47,8 @@ class Sight:
     """``share``: the largest share of an image that an object fills; ``colour``: a word, empty if none fits.
 
     ``is_certain_colour``: whether it stays the same in slightly different light; ``possible_colours``: words for many
-    of its pixels in such light; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a side of
-    its box was seen only at the border of the images.
+    of its pixels in such light; ``tones`` and ``possible_tones``: dark or light, likewise. ``is_cut``: whether a side
+    of its box was seen only at the border of the images.
     """
 
     share: float

@@ -186,7 +186,7 @@ def voted_names(instances: Instances) -> RefinedNames | None:
         return None
     names = tuple(vote(top).name for top in top_names(instances, MAX_NAMES))
     left_out = exclusion_reasons(instances, names, FilterConfig())
-    return RefinedNames(names, f"by vote over the names of {MAX_NAMES} views, no language model", left_out)
+    return RefinedNames(names, f"a vote over the names of {MAX_NAMES} views, no language model", left_out)
 
 
 class NameRecord(BaseModel):

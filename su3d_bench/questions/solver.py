@@ -301,7 +301,7 @@ class Solver:
             others = {key: thing for key, thing in others.items() if not scene_map.is_room_surface(thing.name)}
         if not others:
             raise _Unsettled(f"the map has nothing else to compare with '{question.other.head}'")
-        self._note_several(references, question.other)
+        self._note_multiple_labels(references, question.other)
         ranked = sorted(
             (_nearest_pair((thing,), references) for thing in others.values()),
             key=lambda pair: ((-pair[0] if question.farthest else pair[0]), pair[1].id),
@@ -332,7 +332,7 @@ class Solver:
         a_m, a, reference = _nearest_pair(self._some(question.subject), references)
         b_m, b, _ = _nearest_pair(self._some(question.options[0]), references)
         is_so = a_m > b_m if question.farthest else a_m < b_m
-        self._note_several(references, question.other)
+        self._note_multiple_labels(references, question.other)
         away = f"{a.shown} is {a_m:.2f} m from {reference.shown}, {b.shown} {b_m:.2f} m, between centres"
         return f"{'yes' if is_so else 'no'}: {away}", (a, b), (reference,), is_so
 
@@ -342,8 +342,8 @@ class Solver:
         distance_m, a, b = _nearest_pair(first, second)
         if a.id == b.id:
             raise _Unsettled(f"'{_shown(question.subject)}' and '{_shown(question.other)}' are one object in the map")
-        self._note_several(first, question.subject)
-        self._note_several(second, question.other)
+        self._note_multiple_labels(first, question.subject)
+        self._note_multiple_labels(second, question.other)
         return f"{distance_m:.2f} m between the centres of {a.shown} and {b.shown}", (a, b), (), distance_m
 
     def _count(self, question: Question) -> _Solved:
@@ -399,7 +399,7 @@ class Solver:
         more = f" and {len(things) - MAX_LISTED} more" if len(things) > MAX_LISTED else ""
         return "; ".join(places[:MAX_LISTED]) + more, things, held, None
 
-    def _note_several(self, objects: Objects, phrase: Phrase) -> None:
+    def _note_multiple_labels(self, objects: Objects, phrase: Phrase) -> None:
         if len(objects) > 1:
             self._note(f"there are {len(objects)} of '{_shown(phrase)}'; the nearest one counts")
 

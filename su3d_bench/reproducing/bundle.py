@@ -318,8 +318,8 @@ def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]
 def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
     """Faults for all counts that differ from those of the map when it is scored again."""
     is_same_machine = run.record.processor == processor_digest()
-    anew = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
-    for scene, method, scores in anew:
+    rescored = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
+    for scene, method, scores in rescored:
         counts = run.folder.job(scene, method).counts
         kept = atomic.read_arrays(io.BytesIO(file_bytes(counts)))
         ours = atomic.read_arrays(io.BytesIO(pack_scores(scores)))

@@ -25,6 +25,7 @@ from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, F
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.recipe import Experiment, Recipe, method_of_row, methods_of
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run, read_update_times
+from su3d_bench.runs.job import GENERATED_ROOMS
 from su3d_bench.store.predictions import read_prediction
 
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
@@ -192,7 +193,7 @@ def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
 
 
 def _of_scenes(figure: Figure, row: Measured) -> Iterator[str]:
-    made = next((part for part in (row.caveat or "").split("; ") if part.startswith("made rooms")), None)
+    made = next((part for part in (row.caveat or "").split("; ") if part.startswith(GENERATED_ROOMS)), None)
     if made is not None:
         yield f"scenes: {counted(len(row.scenes), 'procedurally generated room')}, not {figure.dataset}'s scenes"
         return

@@ -128,8 +128,8 @@ def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need
         left = [other for other in variants if other not in missing]
         remark = f"{why}; without it there is no score under {', '.join(variants[variant])}"
         name = f"{run.dataset}/{scene}: {variant}"
-        brings = how if "su3d-bench datasets fetch" in why else ""  # third-party labels cannot be fetched
-        yield Need("truth", name, is_available=False, how=brings, is_required=not left, remark=remark)
+        gives = how if "su3d-bench datasets fetch" in why else ""  # third-party labels cannot be fetched
+        yield Need("truth", name, is_available=False, how=gives, is_required=not left, remark=remark)
 
 
 def _models(run: RecipeRun) -> Iterator[Need]:

@@ -84,6 +84,7 @@ def as_configured(
 
 # Perception settings that do not affect numbers, or whose effect is already in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
+GENERATED_ROOMS = "generated rooms in the layout of"  # prefix of their caveat
 REPLACE_HINT = "--replace overwrites it, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
@@ -265,6 +266,6 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
-    made = f"generated rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
+    made = f"{GENERATED_ROOMS} {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -63,11 +63,11 @@ def pairs_to_walk() -> Iterator[Any]:
     """All pairs; only the first of each dataset and one with many groups run outside proofs."""
     seen = set[Any]()
     for dataset, first, second in PAIRS:
-        brings: set[Any] = {dataset}
+        gives: set[Any] = {dataset}
         if not {True, False} <= seen:
-            brings.add(len(Mixtures(first, second).groups) > EXACT_STEPS)
-        yield pytest.param(dataset, first, second, marks=[] if brings - seen else pytest.mark.proof)
-        seen |= brings
+            gives.add(len(Mixtures(first, second).groups) > EXACT_STEPS)
+        yield pytest.param(dataset, first, second, marks=[] if gives - seen else pytest.mark.proof)
+        seen |= gives
 
 
 class NamingEncoder:

@@ -157,7 +157,7 @@ def test_ambiguous_class_numbers_need_a_protocol() -> None:
         ),
         ("import os; os.kill(os.getpid(), 9)", {}, "terminated by signal 9; it wrote nothing to stderr"),
         ("", {}, "it ended without an error but wrote nothing to {output}"),
-        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: in none of the known formats"),
+        ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: is in no known format"),
         ("import sys; open(sys.argv[1] + '/p.npz', 'wb').write(b'?')", {"format": "openmask3d"}, "{output}"),
     ],
     ids=["exit-code", "signal", "nothing", "unknown-format", "wrong-format"],

@@ -147,7 +147,7 @@ def test_pixel_without_mask_creates_a_zero_feature_that_dilutes_later_ones() -> 
 def test_feature_with_a_zero_channel_is_averaged_only_with_any_channel() -> None:
     updates = (wall(0), seen(0, (EVERYWHERE, E1))), (wall(1), seen(1, (EVERYWHERE, E2)))
     assert fused(*updates).finish().features[0].tolist() == [1.0, 0.0]
-    assert fused(*updates, valid_features="any-channel").finish().features[0].tolist() == [0.5, 0.5]
+    assert fused(*updates, valid_feature_rule="any-channel").finish().features[0].tolist() == [0.5, 0.5]
 
 
 # ---- products in half precision, as in gradslam

@@ -52,7 +52,7 @@ def made_proposals(points: np.ndarray, *masks: Sequence[int], scores: Sequence[f
 
 def choice(most: int, min_points: int, max_share: float, same_iou: float) -> ProposalConfig:
     return ProposalConfig(
-        surface_max=most, surface_min_points=min_points, surface_max_share=max_share, surface_same_iou=same_iou
+        surface_max=most, surface_min_points=min_points, surface_max_share=max_share, surface_duplicate_iou=same_iou
     )
 
 

@@ -89,7 +89,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"extra": np.zeros(1)}, r"captions, extra; expected image_size, masks"),
     ({"scores": np.array([0.9, 1.5])}, r"frame 40, region 1: score 1.5 is not in 0..1"),
     ({"scores": np.array([0.9])}, r"'masks' has shape \(2, 2400\); expected 2 axes and 1 rows"),
-    ({"boxes": np.array([[0, 0, 9, 9], [100, 50, 321, 90]])}, r"region 1: box .* outside the 160x120 image"),
+    ({"boxes": np.array([[0, 0, 9, 9], [100, 50, 321, 90]])}, r"region 1: box .* is not a box in the 160x120 image"),
     ({"image_size": np.array([680, 1200])}, r"image_size is \[680, 1200\], the frame has height 120 and width 160"),
     ({"masks": np.zeros((2, 2400), np.uint8)}, r"region 0: the mask is empty"),
     ({"names": np.array(["chair", " "])}, r"region 1: 'names' is an empty text"),

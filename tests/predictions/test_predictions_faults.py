@@ -32,7 +32,7 @@ from su3d_bench.store.predictions import prediction_arrays
         ("\x1b[31m" + "x" * 9000 + " 5 0.5", "cannot be read"),
         ("pred_mask/short.txt 5 0.5", "is of 2 points and 'pred_mask/a.txt' of 3;"),
         ("pred_mask/word.txt 5 0.5", ":2: 'one' is not a 64-bit integer"),
-        ("pred_mask/bad.json 5 0.5", "is not readable as JSON"),
+        ("pred_mask/bad.json 5 0.5", "is not valid JSON"),
         ("pred_mask/huge.json 5 0.5", "'length' is 1000000000000"),
         ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 in 3 points"),
     ],

@@ -134,7 +134,7 @@ def test_scenes_whose_names_differ_only_in_a_slash_have_separate_maps(capsys: py
         )
         == 2
     )
-    assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
+    assert "scene 'a/b': is not a valid file name" in capsys.readouterr().err
 
 
 def test_unscored_maps_are_summarised_instead_of_dashes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -27,9 +27,9 @@ def test_unwritable_kernel_cache_gives_a_warning_with_the_remedy(
 def test_kernel_folders_match_those_of_numba(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
         "from su3d_bench.numerics import clusters\n"
-        "from numba.core.caching import UserProvidedCacheLocator as told, InTreeCacheLocator as own\n"
+        "from numba.core.caching import UserProvidedCacheLocator as given, InTreeCacheLocator as own\n"
         "from numba.core.caching import UserWideCacheLocator as wide\n"
-        "print(*(one(lambda: 0, clusters.__file__).get_cache_path() for one in (told, own, wide)), sep='\\n')"
+        "print(*(one(lambda: 0, clusters.__file__).get_cache_path() for one in (given, own, wide)), sep='\\n')"
     )
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "told"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "wide"))

@@ -42,8 +42,8 @@ def in_the_box(index: int) -> tuple[Frame, Detections]:
     return Frame(index, 0.0, rgb, depth_m.astype(np.float32), pose(index), INTRINSICS), found
 
 
-def fused(features_in: Any) -> ConceptFusion:
-    method = ConceptFusion(ConceptFusionConfig(height=36, width=48, features_in=features_in))
+def fused(feature_storage: Any) -> ConceptFusion:
+    method = ConceptFusion(ConceptFusionConfig(height=36, width=48, feature_storage=feature_storage))
     method.start(SceneInfo("made", "box", 6, 1, "camera"))
     for index in range(6):
         method.update(*in_the_box(index), Timer())

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 
-from su3d_bench.analysis.attribution import Explained, MendedJob, attribution_of
+from su3d_bench.analysis.attribution import Explained, JobCounts, attribution_of
 from su3d_bench.analysis.page.gallery import SceneGallery
 from su3d_bench.analysis.page.maps import PageScene
 from su3d_bench.core import digests
@@ -53,7 +53,7 @@ class SceneContent:
     """The results of one scene; the errors of a job are a text if they could not be computed."""
 
     scene: str
-    errors: dict[Job, MendedJob | str] = field(default_factory=dict)
+    errors: dict[Job, JobCounts | str] = field(default_factory=dict)
     page: PageScene | None = None
     gallery: SceneGallery | None = None
 
@@ -145,7 +145,7 @@ def _fault(ask: Callable[[], Any]) -> str | None:
     return None
 
 
-def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, MendedJob | str]) -> dict[str, Any]:
+def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, JobCounts | str]) -> dict[str, Any]:
     """The errors of a method in the page's form; a text in place of errors becomes their ``reason``."""
     reasons = [explained] if isinstance(explained, str) else [one for one in of_scenes.values() if isinstance(one, str)]
     try:
@@ -157,7 +157,7 @@ def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, M
     return {"method": method, "protocols": [], "remarks": [], "reason": reasons[0]}
 
 
-def packed(corrected: MendedJob, rules_of: RulesOf) -> bytes:
+def packed(corrected: JobCounts, rules_of: RulesOf) -> bytes:
     """The counts of a scene under a method as the bytes of an npz file; ``rules_of`` returns a protocol's rules."""
     scores: dict[str, SceneScore] = {}
     nowhere = np.zeros(len(COVERAGE_RADII_M), np.int64)
@@ -171,7 +171,7 @@ def packed(corrected: MendedJob, rules_of: RulesOf) -> bytes:
     return pack_scores(scores)
 
 
-def unpacked(content: bytes, rules_of: RulesOf) -> MendedJob:
+def unpacked(content: bytes, rules_of: RulesOf) -> JobCounts:
     """The inverse of ``packed``."""
     corrected: dict[str, CorrectedScene] = {}
     scores: dict[str, dict[str, SceneScore]] = {}

@@ -258,7 +258,7 @@ class CoveredObjects:
     def main_object(self) -> Int64Array:
         """The object (K,) of which each instance covers most vertices, the lowest id on ties, 0 if it covers none.
 
-        >>> Covered(np.array([3, 7]), np.array([[0, 1], [4, 4], [0, 0]])).main_object.tolist()
+        >>> CoveredObjects(np.array([3, 7]), np.array([[0, 1], [4, 4], [0, 0]])).main_object.tolist()
         [7, 3, 0]
         """
         if not len(self.object_ids):

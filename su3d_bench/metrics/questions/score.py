@@ -356,7 +356,7 @@ def judge_merging(rules: MergeRules, covered: CoveredObjects) -> tuple[str, ...]
     """How each instance was merged; over-merged has priority, and an instance that covers nothing is neither.
 
     >>> rules = MergeRules(over_merged_share=0.25, under_merged_share=0.5)
-    >>> halves = Covered(np.array([1, 2]), np.array([[70, 0], [30, 0], [40, 60]]))
+    >>> halves = CoveredObjects(np.array([1, 2]), np.array([[70, 0], [30, 0], [40, 60]]))
     >>> judge_merging(rules, halves)
     ('well-merged', 'under-merged', 'over-merged')
     """

@@ -90,7 +90,7 @@ class SegmenterConfig(BaseModel):
 
     # objects
     join: JoinWeights = JoinWeights()
-    parts_caution: float = Field(default=1.5, ge=0)  # subtracted from the bias if parts are requested, not objects
+    part_penalty: float = Field(default=1.5, ge=0)  # subtracted from the bias if parts are requested, not objects
 
     # answer
     quality: QualityWeights = QualityWeights()

@@ -140,7 +140,7 @@ class RgbdSegmenter:
     def __init__(self, config: SegmenterConfig, level: Literal["objects", "parts"]) -> None:
         weights = config.join
         if level == "parts":
-            weights = weights.model_copy(update={"bias": weights.bias - config.parts_caution})
+            weights = weights.model_copy(update={"bias": weights.bias - config.part_penalty})
         self._config = config.model_copy(update={"join": weights})
         self._level = level
         self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest(*CODE))

@@ -245,7 +245,7 @@ class Server:
         except openai.APIStatusError as error:
             return self._refused_parameter(error)
         except openai.APITimeoutError:
-            raise _Failed(f"no answer within {self._config.timeout_s:g} s, {n_tries} tries", is_down=True) from None
+            raise _Failed(f"no answer within {self._config.timeout_s:g} s; attempts: {n_tries}", is_down=True) from None
         except _TooLarge as error:
             raise _Failed(f"the answer is {error}", is_down=False) from None
         except openai.OpenAIError as error:
@@ -254,7 +254,7 @@ class Server:
                 raise ModelMissing(
                     f"{self.name}: cannot connect ({reason}); start the server or set another --base-url"
                 ) from None
-            raise _Failed(f"the connection failed: {reason}; tried {n_tries} times", is_down=True) from None
+            raise _Failed(f"the connection failed: {reason}; attempts: {n_tries}", is_down=True) from None
         return content
 
     def _refused_parameter(self, error: Any) -> str:
@@ -279,7 +279,7 @@ class Server:
             if named is not None:
                 return named
         is_down = status == 429 or status >= 500
-        tried = f"; tried {self._config.max_retries + 1} times" if is_down else ""
+        tried = f"; attempts: {self._config.max_retries + 1}" if is_down else ""
         raise _Failed(f"status {status}: {message}{tried}", is_down=is_down) from None
 
     def _reply(self, request: ChatRequest, content: bytes, dropped: tuple[str, ...]) -> Reply:

@@ -90,7 +90,7 @@ def test_objects_are_sorted_by_file_name_as_in_the_original(tmp_path: Path) -> N
     [
         ("floors/0.json", "[]", "should be an object"),
         ("rooms/0_0.json", '{"room_height": [1], "room_zero_level": 0}', "room_height: "),
-        ("objects/0_0_0.json", None, "has no .json beside it"),
+        ("objects/0_0_0.json", None, "has no .json next to it"),
     ],
 )
 def test_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:

@@ -171,7 +171,7 @@ def test_replicassg_annotation_is_on_face_centres(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0; expected one"),
+        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries for room_0; expected one"),
         ("objects.json", '"id": "5"', '"id": "five"', "objects: 1.id: Input should be a valid integer"),
         ("objects.json", '"chair"', '"wall"', "a relation names object 1, which is not in the graph"),
         ("relationships.json", '"near"', "3", "relationships: 0.3: Input should be a valid string"),

@@ -79,7 +79,7 @@ def test_faces_of_a_box_are_one_object_but_several_parts() -> None:
     boxes = {LEFT: TWO_BOXES[LEFT]}
     frame, ids = view(boxes, {TABLE: GREY, LEFT: RED})
     assert best_iou(objects(frame), ids == LEFT) > 0.9
-    parts = RgbdSegmenter(SegmenterConfig(parts_caution=20), "parts").segment(frame)
+    parts = RgbdSegmenter(SegmenterConfig(part_penalty=20), "parts").segment(frame)
     n_on_box = sum((mask & (ids == LEFT)).sum() > 0.5 * mask.sum() for mask in parts.masks)
     assert n_on_box >= 2
 

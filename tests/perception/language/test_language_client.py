@@ -93,7 +93,7 @@ def test_transient_errors_are_retried(server: ChatServer, tmp_path: Path, troubl
         (Answered(usage=(10**30, 1)), "not a chat completion"),
         (Answered(raw=b" " * 3_000_000), "larger than 100,000 bytes"),
         (Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"}), "the answer is compressed"),
-        (Answered(wait_s=30), "no answer within 0.3 s; tried 1 times"),
+        (Answered(wait_s=30), "no answer within 0.3 s; attempts: 1"),
     ],
     ids=["refused", "redirect", "malformed", "nested", "html", "wrong-type", "usage", "huge", "compressed", "hung"],
 )
@@ -109,7 +109,7 @@ def test_invalid_response_is_a_request_failure(
 def test_permanent_failure_is_stored_and_retried_only_on_request(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: error(500, "down")
     failed = client(server, tmp_path).ask(ask("x"))
-    assert failed.failure == "status 500: down; tried 2 times"
+    assert failed.failure == "status 500: down; attempts: 2"
     server.answer = lambda body: Answered("up again")
     assert client(server, tmp_path).ask(ask("x")) == failed
     assert server.n_asked == 2

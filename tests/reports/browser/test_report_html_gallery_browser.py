@@ -142,7 +142,7 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
 
 
 @pytest.fixture
-def anew(browser: Chromium) -> Iterator[Chromium]:
+def reopened(browser: Chromium) -> Iterator[Chromium]:
     """The gallery without filters, masks sorted by AP."""
     choose(browser, "gallery", "Protocol", "rooms-instance")
     browser.run("document.querySelector('#gallery .toolbar > button:last-of-type').click()")
@@ -153,31 +153,31 @@ def anew(browser: Chromium) -> Iterator[Chromium]:
 
 @needs_chromium
 @pytest.mark.parametrize("kind", ["missed", "label"])
-def test_card_links_to_its_instance_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
-    choose(anew, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
-    choose(anew, "gallery", "Kind", kind)
+def test_card_links_to_its_instance_in_the_map_and_back(reopened: Chromium, page: Path, kind: str) -> None:
+    choose(reopened, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
+    choose(reopened, "gallery", "Kind", kind)
     told = next(card for card in cards(page.read_text()) if card["kind"] == kind)
-    anew.run("document.querySelector('#gallery .card .to-map').scrollIntoView({ block: 'center' })")
-    before = anew.run("scrollY")
-    anew.run("document.querySelector('#gallery .card .to-map').focus()")
-    anew.press("Enter")
+    reopened.run("document.querySelector('#gallery .card .to-map').scrollIntoView({ block: 'center' })")
+    before = reopened.run("scrollY")
+    reopened.run("document.querySelector('#gallery .card .to-map').focus()")
+    reopened.press("Enter")
     heading = "document.querySelector('#maps .detail h3')"
-    anew.until(f"{heading} !== null && !document.querySelector('#maps .panes[aria-busy]')")
-    anew.until("Math.abs(document.getElementById('maps').getBoundingClientRect().top) < 200")
+    reopened.until(f"{heading} !== null && !document.querySelector('#maps .panes[aria-busy]')")
+    reopened.until("Math.abs(document.getElementById('maps').getBoundingClientRect().top) < 200")
     shown = {
-        name: anew.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
+        name: reopened.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
         for name in ("Scene", "Map", "Compare with")
     }
     assert shown == {"Scene": told["scene"], "Map": told["method"], "Compare with": "ground truth"}
-    colour = anew.run(f"{SELECT.format(part='maps', label='Colour by')}.value")
+    colour = reopened.run(f"{SELECT.format(part='maps', label='Colour by')}.value")
     assert colour == ("class" if kind == "label" else "instance")
-    told_there = anew.run("document.querySelector('#maps .detail').innerText")
+    told_there = reopened.run("document.querySelector('#maps .detail').innerText")
     assert told["true"][0] in told_there
     if told["rows"]:
-        chosen = anew.run("document.querySelector('#maps .side tr[aria-selected=true]').innerText")
-        assert chosen.split()[0] == anew.run(f"{heading}.innerText")
+        chosen = reopened.run("document.querySelector('#maps .side tr[aria-selected=true]').innerText")
+        assert chosen.split()[0] == reopened.run(f"{heading}.innerText")
     else:
-        assert anew.run(f"{heading}.innerText") == f"Ground truth: {told['true'][0]}"
-    anew.run("history.back()")
-    anew.until("!location.hash.startsWith('#maps')")
-    anew.until(f"Math.abs(scrollY - {before}) < 5")
+        assert reopened.run(f"{heading}.innerText") == f"Ground truth: {told['true'][0]}"
+    reopened.run("history.back()")
+    reopened.until("!location.hash.startsWith('#maps')")
+    reopened.until(f"Math.abs(scrollY - {before}) < 5")

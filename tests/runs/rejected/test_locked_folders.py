@@ -20,7 +20,7 @@ def test_foreign_folder_is_rejected_and_left_unchanged(capsys: pytest.CaptureFix
     Path("out/.notes.tmp").write_text("theirs")
     assert run() == 2
     assert capsys.readouterr().err == (
-        "su3d-bench: out: contains '.notes.tmp' and is not a run folder; choose a new one with --out\n"
+        "su3d-bench: out: contains '.notes.tmp' and is not a run folder; choose another with --out\n"
     )
     assert [path.name for path in Path("out").iterdir()] == [".notes.tmp"]
 

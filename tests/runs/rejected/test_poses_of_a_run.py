@@ -37,7 +37,7 @@ def root(whole: Path, data_to_spoil: Callable[[Path], Path]) -> Path:
     return data_to_spoil(whole)
 
 
-def spoil(root: Path, change: Callable[[Float64Array], Float64Array], scene: str = "bathroom0") -> None:
+def damage(root: Path, change: Callable[[Float64Array], Float64Array], scene: str = "bathroom0") -> None:
     path = root / "Replica" / scene / "traj.txt"
     np.savetxt(path, change(np.loadtxt(path).reshape(-1, 4, 4)).reshape(-1, 16))
 
@@ -49,7 +49,7 @@ def inverted(matrices: Float64Array) -> Float64Array:
 def test_inverse_poses_stop_a_run_early_and_the_correct_convention_is_named(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(root, inverted)
+    damage(root, inverted)
     assert main(RUN.split()) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"su3d-bench: {CONTRADICTED}") and "% with the inverse poses" in line
@@ -60,7 +60,7 @@ def test_inverse_poses_stop_a_run_early_and_the_correct_convention_is_named(
 def test_accepted_poses_give_a_warning_in_table_log_and_record_also_on_resume(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(root, inverted)
+    damage(root, inverted)
     assert main([*RUN.split(), "--accept-poses"]) == 0
     table = capsys.readouterr().out
     assert f"- opensu3d: {CONTRADICTED.removeprefix('replica/bathroom0: ')}" in table and "(replica/bathroom0)" in table
@@ -76,7 +76,7 @@ def test_pose_error_counts_affected_scenes_and_generated_rooms_are_not_checked(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for scene in ("bathroom0", "office0"):
-        spoil(root, inverted, scene)
+        damage(root, inverted, scene)
     words = [word.replace("replica/bathroom0", "replica/*") for word in RUN.split()]
     assert main(words) == 2
     assert "(and 1 more of 2 scenes); --accept-poses" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from su3d_bench.cli.main import main
 MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --jobs 1 --quiet"
 SMALL = ["--set", "n_frames=4", "--set", "width=160", "--set", "height=120", "--set", "mesh_spacing_m=0.08"]
 RUN = "run --scenes replica/* --stride 2 --jobs 1 --protocols rooms-semantic --no-pictures"
-Spoil = Callable[[Path], Any]
+Damage = Callable[[Path], Any]
 
 
 @pytest.fixture(scope="module")
@@ -53,42 +53,42 @@ def remarks_of(err: str) -> list[str]:
     return [line for line in err.splitlines() if ": poses and depth could not be checked: " not in line]
 
 
-def remove(name: str) -> Spoil:
+def remove(name: str) -> Damage:
     return lambda root: (root / name).unlink()
 
 
-def pose(text: str) -> Spoil:
-    def spoil(root: Path) -> None:
+def pose(text: str) -> Damage:
+    def damage(root: Path) -> None:
         path = root / "Replica" / "bathroom0" / "traj.txt"
         lines = path.read_text().splitlines()
         path.write_text("\n".join([*lines[:2], text, *lines[3:]]) + "\n")
 
-    return spoil
+    return damage
 
 
-def edit_json(name: str, change: Callable[[Any], Any]) -> Spoil:
-    def spoil(root: Path) -> None:
+def edit_json(name: str, change: Callable[[Any], Any]) -> Damage:
+    def damage(root: Path) -> None:
         value = json.loads((root / name).read_text())
         change(value)
         (root / name).write_text(json.dumps(value))
 
-    return spoil
+    return damage
 
 
 INFO = "replica_v1/bathroom_0/habitat/info_semantic.json"
 
 
 @pytest.mark.parametrize(
-    ("spoil", "line"),
+    ("damage", "line"),
     [
         (remove("Replica/bathroom0/results/frame000002.jpg"), "results/frame000002.jpg is missing; copy results/"),
         (pose("nan " * 16), "traj.txt line 3: the pose has 'nan'; fix the trajectory or exclude the scene"),
     ],
 )  # fmt: skip
 def test_damaged_scene_is_a_one_line_error_and_does_not_affect_others(
-    spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
+    damage: Damage, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(root)
+    damage(root)
     assert main([*RUN.split(), "--out", "out", "--quiet"]) == 3
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 2
@@ -98,7 +98,7 @@ def test_damaged_scene_is_a_one_line_error_and_does_not_affect_others(
 
 
 @pytest.mark.parametrize(
-    ("spoil", "line"),
+    ("damage", "line"),
     [
         (
             edit_json(INFO, lambda info: info["objects"][3].update(class_id=777)),
@@ -111,9 +111,9 @@ def test_damaged_scene_is_a_one_line_error_and_does_not_affect_others(
     ],
 )
 def test_unknown_annotations_become_void_with_a_one_line_warning(
-    spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
+    damage: Damage, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(root)
+    damage(root)
     for _ in range(2):  # a resumed run repeats the warning
         assert main([*RUN.split(), "--out", "out"]) == 0
         remarks = remarks_of(capsys.readouterr().err)

@@ -32,7 +32,7 @@ def store() -> Any:
     return driver
 
 
-def brought(url: str, to: Path) -> Path:
+def mirrored(url: str, to: Path) -> Path:
     """A copy of all files in the store."""
     folder = RemoteFolder(url)
     folder.fetch(folder.files(), to)
@@ -42,7 +42,7 @@ def brought(url: str, to: Path) -> Path:
 def test_run_in_a_store_equals_a_run_in_a_folder(store: Any, tmp_path: Path) -> None:
     assert run(*TWO, out="local") == 0
     assert run(*TWO, out=URL) == 0
-    assert_equal_runs("local", brought(URL, tmp_path / "came"))
+    assert_equal_runs("local", mirrored(URL, tmp_path / "came"))
     (mirror,) = (tmp_path / "cache" / "runs").iterdir()
     small = {name for name in deterministic_files(mirror) if not name.endswith("prediction.npz")}
     assert small == {name for name in deterministic_files(Path("local")) if not name.endswith("prediction.npz")}
@@ -53,12 +53,12 @@ def test_run_in_a_store_resumes_without_the_local_mirror(
     store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(*TWO, out=URL) == 0
-    before = brought(URL, tmp_path / "before")
+    before = mirrored(URL, tmp_path / "before")
     shutil.rmtree(tmp_path / "cache")
     monkeypatch.setattr(scene_feeding, "write_prediction", None)
     monkeypatch.setattr(scene_run, "pack_scores", None)
     assert run(*TWO, out=URL) == 0
-    assert_equal_runs(before, brought(URL, tmp_path / "after"))
+    assert_equal_runs(before, mirrored(URL, tmp_path / "after"))
 
 
 def test_partially_sent_or_truncated_job_is_run_again(
@@ -79,7 +79,7 @@ def test_partially_sent_or_truncated_job_is_run_again(
     cut = "/bucket/runs/one/scenes/painted.a/collector/prediction.npz"
     store.pipe_file(cut, store.cat_file(cut)[:-100])
     assert run(*TWO, out=URL) == 0
-    assert_equal_runs("local", brought(URL, tmp_path / "came"))
+    assert_equal_runs("local", mirrored(URL, tmp_path / "came"))
 
 
 def test_run_in_a_store_is_extended_and_replaced_from_any_machine(
@@ -87,17 +87,17 @@ def test_run_in_a_store_is_extended_and_replaced_from_any_machine(
 ) -> None:
     assert run(*TWO, out="local") == 0
     assert run("--scenes", f"{PAINTED}/a", "--jobs", "1", out=URL) == 0
-    before = brought(URL, tmp_path / "before")
+    before = mirrored(URL, tmp_path / "before")
     for mirror in (tmp_path / "cache" / "runs").iterdir():
         shutil.rmtree(mirror)  # as on a machine that has never seen the run
     capsys.readouterr()
     assert run("--scenes", f"{PAINTED}/d", "--jobs", "1", out=URL) == 2
     assert "(scene painted/a is not requested now, scene painted/d is new); --extend adds" in capsys.readouterr().err
-    assert_equal_files(before, brought(URL, tmp_path / "refused"))
+    assert_equal_files(before, mirrored(URL, tmp_path / "refused"))
     assert main(["run", f"{PAINTED}/d", "--extend", "--jobs", "1", "--quiet", "--out", URL]) == 0
-    assert_equal_runs("local", brought(URL, tmp_path / "extended"))
+    assert_equal_runs("local", mirrored(URL, tmp_path / "extended"))
     assert run("--scenes", f"{PAINTED}/d", "--jobs", "1", "--replace", out=URL) == 0
-    left = brought(URL, tmp_path / "replaced")
+    left = mirrored(URL, tmp_path / "replaced")
     assert [path.name for path in (left / "scenes").iterdir()] == ["painted.d"]
 
 
