@@ -51,14 +51,14 @@ def copy_kernels(installed: Path) -> None:
 
 def main() -> int:
     with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(built_wheel(Path(folder))) as archive:
-        held = {name for name in archive.namelist() if ".dist-info/" not in name}
+        packaged = {name for name in archive.namelist() if ".dist-info/" not in name}
     expected = tracked()
-    for name in sorted(expected - held):
+    for name in sorted(expected - packaged):
         print(f"not in the wheel: {name}")
-    for name in sorted(held - expected):
+    for name in sorted(packaged - expected):
         print(f"in the wheel, but not tracked: {name}")
-    print(f"wheel: {len(held)} files, {len(expected)} tracked")
-    return int(expected != held)
+    print(f"wheel: {len(packaged)} files, {len(expected)} tracked")
+    return int(expected != packaged)
 
 
 if __name__ == "__main__":

@@ -140,14 +140,14 @@ def serve_rooms(server: FileServer, place: Place) -> list[dict[str, Any]]:
     return serve_replica(server, made)
 
 
-def expect(what: str, answer: tuple[int, str, str], code: int, said: str) -> None:
-    """Check that ``answer`` has ``code`` and ``said`` in its final line, without a traceback."""
+def expect(what: str, answer: tuple[int, str, str], code: int, expected: str) -> None:
+    """Check that ``answer`` has ``code`` and ``expected`` in its final line, without a traceback."""
     rc, out, err = answer
     lines = err.strip().splitlines()
     assert rc == code, f"{what}: code {rc} instead of {code}\n{out}\n{err}"
     assert "Traceback" not in err, err
-    assert said in (lines[-1] if code else out + err), f"{what}: {said!r} is missing\n{out}\n{err}"
-    print(f"{what}: {(lines[-1] if code else said)[:160]}", flush=True)
+    assert expected in (lines[-1] if code else out + err), f"{what}: {expected!r} is missing\n{out}\n{err}"
+    print(f"{what}: {(lines[-1] if code else expected)[:160]}", flush=True)
 
 
 def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tuple[int, str, str]]) -> None:

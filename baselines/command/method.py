@@ -259,15 +259,15 @@ class Command:
         container = f"su3d-{uuid.uuid4().hex[:16]}" if self.config.runner == "docker" else None
         places = {name: INSIDE[name] if container else str(path) for name, path in folders.items()}
         words = self._filled(places)
-        told = {variable_of(name): value for name, value in self._values(places).items()}
+        variables = {variable_of(name): value for name, value in self._values(places).items()}
         id_file = folders["frames"].parent / "container"
         id_file.unlink(missing_ok=True)
         if container is not None:
-            words = [*self._docker_words(container, id_file, folders, told), *words]
+            words = [*self._docker_words(container, id_file, folders, variables), *words]
         elif self.config.runner == "conda":
             kind = "--prefix" if "/" in self.config.environment else "--name"
             words = ["conda", "run", "--no-capture-output", kind, self.config.environment, *words]
-        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ} | told
+        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ} | variables
         logger.info("program: %s", printable(shlex.join(words)))
 
         done = run_program(
@@ -304,7 +304,7 @@ class Command:
         return [str(Path(w).absolute()) if (k or "/" in w) and is_file(Path(w)) else w for k, w in enumerate(words)]
 
     def _docker_words(
-        self, container: str, id_file: Path, folders: Mapping[str, Path], told: Mapping[str, str]
+        self, container: str, id_file: Path, folders: Mapping[str, Path], variables: Mapping[str, str]
     ) -> list[str]:
         mounts = [f"{folders[name]}:{INSIDE[name]}{':ro' if name == 'frames' else ''}" for name in INSIDE]
         mounts += [f"{mount}:ro" for mount in self.config.mounts]
@@ -316,7 +316,7 @@ class Command:
             words += ["--volume", mount]
         # The container has its own PATH and HOME.
         passed = [name for name in self.config.pass_variables if name in os.environ and name not in ENVIRONMENT]
-        for name in [*passed, *told]:
+        for name in [*passed, *variables]:
             words += ["--env", name]
         return [*words, self.config.image]
 

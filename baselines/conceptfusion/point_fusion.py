@@ -86,11 +86,11 @@ class FeatureTable:
         for start in range(0, len(order), BLOCK_ROWS):
             chosen = order[start : start + BLOCK_ROWS]
             of_point = point[chosen]
-            held, added = self._confidences[of_point], weights[chosen]
-            share: Float32Array = (added / (held + added)).astype(np.float32)[:, None]
+            stored, added = self._confidences[of_point], weights[chosen]
+            share: Float32Array = (added / (stored + added)).astype(np.float32)[:, None]
             before: Float32Array = table[of_point].astype(np.float32)
             table[of_point] = (np.float32(1) - share) * before + share * features[row[chosen]].astype(np.float32)
-            self._confidences[of_point] = held + added
+            self._confidences[of_point] = stored + added
             release_pages(table)
 
     def average_in_half(self, point: Int64Array, features: HalfArray, row: Int32Array, weights: Float64Array) -> None:
@@ -102,8 +102,8 @@ class FeatureTable:
         confidence and divided by the unrounded one. Source: fuse_with_map of gradslam at 59ca872.
         """
         table = self._mapped("r+")
-        held = self._confidences[: self._n].copy()
-        rounded = held.astype(np.float16)
+        stored = self._confidences[: self._n].copy()
+        rounded = stored.astype(np.float16)
         is_first = self._lengths is None
         lengths = np.ones(self._n) if self._lengths is None else self._lengths[: self._n]
         added = np.zeros(self._n)
@@ -111,7 +111,7 @@ class FeatureTable:
         source = np.full(self._n, -1, np.int64)
         source[point] = row
         if not is_first:
-            lengths = np.minimum(lengths * np.where(source < 0, rounded / held, 1.0), MAX_LENGTH)
+            lengths = np.minimum(lengths * np.where(source < 0, rounded / stored, 1.0), MAX_LENGTH)
         changed = np.arange(self._n) if is_first else np.sort(point)
         for start in range(0, len(changed), BLOCK_ROWS):
             chosen = changed[start : start + BLOCK_ROWS]
@@ -121,11 +121,11 @@ class FeatureTable:
             else:
                 before = table[chosen] * lengths[chosen, None].astype(np.float32)
                 total = before * rounded[chosen, None].astype(np.float32) + seen
-            mean = total / (held + added)[chosen, None].astype(np.float32)
+            mean = total / (stored + added)[chosen, None].astype(np.float32)
             lengths[chosen] = np.maximum(np.abs(mean).max(axis=1), 1.0)
             table[chosen] = mean / lengths[chosen, None].astype(np.float32)
             release_pages(table)
-        self._confidences[: self._n] = held + added
+        self._confidences[: self._n] = stored + added
         self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
@@ -304,10 +304,10 @@ class PointFusion:
         """Average the associated pixels into their points: p <- (c p + a q) / (c + a), c <- c + a; normals alike."""
         pixel = np.flatnonzero(matched != ABSENT)
         point, added = matched[pixel], view.alpha[pixel]
-        held = self._counts[point]
-        total = held + added
+        stored = self._counts[point]
+        total = stored + added
         for mean, seen in ((self._points, view.points), (self._normals, view.normals)):
-            mean[point] = (held[:, None] * mean[point] + added[:, None] * seen[pixel]) / total[:, None]
+            mean[point] = (stored[:, None] * mean[point] + added[:, None] * seen[pixel]) / total[:, None]
         self._counts[point] = total
 
     def insert(self, view: View, matched: Int64Array) -> Int64Array:

@@ -70,8 +70,8 @@ def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
     start = np.cumsum(size) - size
     kept = []
     for k in range(len(proposals)):
-        held = np.bincount(segments[proposals.mask(k)], minlength=len(size))
-        whole = np.flatnonzero(2 * held > size)
+        inside = np.bincount(segments[proposals.mask(k)], minlength=len(size))
+        whole = np.flatnonzero(2 * inside > size)
         kept.append(np.sort(np.concatenate([order[:0], *(order[start[s] : start[s] + size[s]] for s in whole)])))
     masks = Masks.of_sets(kept)
     return replace(proposals, indptr=masks.indptr, indices=masks.indices)

@@ -1,7 +1,7 @@
 """Compiled nearest-neighbour search in a grid; imported only when clouds are matched, because numba loads slowly.
 
 Points are in buckets of one or several cells of side ``cell``: bucket b contains the points
-``order[starts[b]:starts[b + 1]]``, ascending, their coordinates side by side in ``held``.
+``order[starts[b]:starts[b + 1]]``, ascending, their coordinates side by side in ``members``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _cell(x, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fill(points, cell, starts, order, held):  # type: ignore[no-untyped-def]
+def fill(points, cell, starts, order, members):  # type: ignore[no-untyped-def]
     """Sorts ``points`` into the buckets; ``starts`` is zero and one longer than the buckets, a power of two."""
     n_buckets = len(starts) - 1
     bucket = np.empty(len(points), np.int64)
@@ -46,7 +46,7 @@ def fill(points, cell, starts, order, held):  # type: ignore[no-untyped-def]
         place = cursor[bucket[i]]
         cursor[bucket[i]] += 1
         order[place] = i
-        held[place] = points[i]
+        members[place] = points[i]
 
 
 @njit(cache=True, inline="always")
@@ -61,7 +61,7 @@ def _gap(x, c, own, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def nearest(queries, cap, cell, starts, order, held, lower, upper, index, squared):  # type: ignore[no-untyped-def]
+def nearest(queries, cap, cell, starts, order, members, lower, upper, index, squared):  # type: ignore[no-untyped-def]
     """Writes the nearest point of each query and its squared distance (float32, summed x, y, z), the lowest index in
     a tie; -1 if none is within ``cap``, up to rounding.
 
@@ -98,9 +98,9 @@ def nearest(queries, cap, cell, starts, order, held, lower, upper, index, square
                             continue
                         b = _bucket(cx, cy, cz, n_buckets)
                         for place in range(starts[b], starts[b + 1]):
-                            dx = queries[i, 0] - held[place, 0]
-                            dy = queries[i, 1] - held[place, 1]
-                            dz = queries[i, 2] - held[place, 2]
+                            dx = queries[i, 0] - members[place, 0]
+                            dy = queries[i, 1] - members[place, 1]
+                            dz = queries[i, 2] - members[place, 2]
                             distance = dx * dx + dy * dy + dz * dz
                             if distance < best or (distance == best and order[place] < index[i]):
                                 best = distance

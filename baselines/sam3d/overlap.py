@@ -125,10 +125,10 @@ def nearest_points(
 
         wanted, given = _float32(queries), _float32(points)
         starts = np.zeros((1 << (len(given) - 1).bit_length()) + 1, np.int64)
-        order, held = np.empty(len(given), np.int64), np.empty_like(given)
-        kernels.fill(given, cell_m, starts, order, held)
+        order, members = np.empty(len(given), np.int64), np.empty_like(given)
+        kernels.fill(given, cell_m, starts, order, members)
         lower, upper = given.min(axis=0).astype(np.float64), given.max(axis=0).astype(np.float64)
-        kernels.nearest(wanted, cap_m, cell_m, starts, order, held, lower, upper, index, squared)
+        kernels.nearest(wanted, cap_m, cell_m, starts, order, members, lower, upper, index, squared)
     return index, np.sqrt(squared)
 
 
@@ -271,8 +271,8 @@ def numbered(cloud: GroupedCloud) -> GroupedCloud:
 
 
 def _with_views_of_present(cloud: GroupedCloud) -> GroupedCloud:
-    held = _is_present(cloud.group, int(cloud.view_group.max(initial=-1)) + 1)[cloud.view_group]
-    return replace(cloud, view_group=cloud.view_group[held], views=cloud.views[held])
+    members = _is_present(cloud.group, int(cloud.view_group.max(initial=-1)) + 1)[cloud.view_group]
+    return replace(cloud, view_group=cloud.view_group[members], views=cloud.views[members])
 
 
 def _sizes(group: Int64Array) -> Int64Array:

@@ -98,9 +98,16 @@ def _time(seconds: float) -> str:
 def measured_sections(folder: Path) -> Iterator[str]:
     """One table per JSON file that ``write_measured`` left in ``folder``, in alphabetical order."""
     for path in sorted(folder.glob("*.json")):
-        told = json.loads(path.read_text(encoding="utf-8"))
-        notes = [" ".join(told["notes"]), ""] if told["notes"] else []
-        lines = [f"## {told['title']}", "", f"`{told['command']}`", "", *aligned([told["columns"], *told["rows"]]), ""]
+        report = json.loads(path.read_text(encoding="utf-8"))
+        notes = [" ".join(report["notes"]), ""] if report["notes"] else []
+        lines = [
+            f"## {report['title']}",
+            "",
+            f"`{report['command']}`",
+            "",
+            *aligned([report["columns"], *report["rows"]]),
+            "",
+        ]
         yield "\n".join([*lines, *notes])
 
 

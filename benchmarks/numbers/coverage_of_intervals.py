@@ -211,15 +211,15 @@ REASONS: Mapping[str, str] = {
 class Tally:
     """Number of intervals and of those that contain the true value, by kind of interval."""
 
-    held: dict[str, int]
+    covered: dict[str, int]
     n: dict[str, int]
 
     def add(self, kind: str, interval: Interval | None, truth: float) -> None:
         self.n[kind] = self.n.get(kind, 0) + 1
-        self.held[kind] = self.held.get(kind, 0) + (interval is not None and interval[0] <= truth <= interval[1])
+        self.covered[kind] = self.covered.get(kind, 0) + (interval is not None and interval[0] <= truth <= interval[1])
 
     def per_cent(self, kind: str) -> float | None:
-        return 100.0 * self.held[kind] / self.n[kind] if self.n.get(kind) else None
+        return 100.0 * self.covered[kind] / self.n[kind] if self.n.get(kind) else None
 
 
 JACKKNIFE, PSEUDO, BOOTSTRAP = "jackknife", "around the mean of pseudo-values", "percentile bootstrap"
@@ -331,8 +331,8 @@ def wilson(rate: float, n: int) -> float:
     """Coverage of the interval of a share at ``rate``, over all possible observations."""
     from scipy.stats import binom
 
-    held = [(interval := share_interval(k / n, n)) and interval[0] <= rate <= interval[1] for k in range(n + 1)]
-    return float(binom.pmf(np.arange(n + 1), n, rate) @ np.array(held, np.float64))
+    covered = [(interval := share_interval(k / n, n)) and interval[0] <= rate <= interval[1] for k in range(n + 1)]
+    return float(binom.pmf(np.arange(n + 1), n, rate) @ np.array(covered, np.float64))
 
 
 def change(rng: np.random.Generator, n: int, n_simulations: int) -> float:

@@ -84,10 +84,10 @@ def load(
     sys.path[:0] = [str(root) for root in roots]
     for name in absent:
         _stand_in(name)
-    for name, held in replaced.items():
+    for name, original in replaced.items():
         _stand_in(name)
         sys.modules[name] = _StandIn(name)
-        vars(sys.modules[name]).update(held)
+        vars(sys.modules[name]).update(original)
     before, sys.argv = sys.argv, [str(file), *words]
     try:
         spec = importlib.util.spec_from_file_location(f"original_{file.stem}", file)

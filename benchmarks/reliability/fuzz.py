@@ -48,16 +48,16 @@ class Tally:
     def n_inputs(self) -> int:
         return self.n_read + self.n_refused + len(self.faults)
 
-    def add(self, told: dict[str, Any]) -> None:
-        if told["fault"] is not None:
-            self.faults.append({"index": told["index"], "file": told["file"], "fault": told["fault"]})
-        elif told["is_read"]:
+    def add(self, outcomes: dict[str, Any]) -> None:
+        if outcomes["fault"] is not None:
+            self.faults.append({"index": outcomes["index"], "file": outcomes["file"], "fault": outcomes["fault"]})
+        elif outcomes["is_read"]:
             self.n_read += 1
         else:
             self.n_refused += 1
-        if told["seconds"] > self.slowest_s:
-            self.slowest_s, self.slowest_index = told["seconds"], told["index"]
-        self.max_grown_bytes = max(self.max_grown_bytes, told["grown_bytes"])
+        if outcomes["seconds"] > self.slowest_s:
+            self.slowest_s, self.slowest_index = outcomes["seconds"], outcomes["index"]
+        self.max_grown_bytes = max(self.max_grown_bytes, outcomes["grown_bytes"])
 
 
 def work() -> None:
@@ -80,8 +80,8 @@ def work() -> None:
                 sample.read()
                 for index in range(order["first"], order["end"]):
                     one = sample.input(order["seed"], index)
-                    told = {"index": index, "file": one.file, **vars(sample.meet(one))}
-                    print(json.dumps(told), file=output, flush=True)
+                    outcomes = {"index": index, "file": one.file, **vars(sample.meet(one))}
+                    print(json.dumps(outcomes), file=output, flush=True)
             os.chdir("/")
 
 
@@ -103,7 +103,7 @@ class Worker:
             self._lines.put(line)
         self._lines.put(None)
 
-    def told(self, name: str, seed: int, first: int, end: int) -> Iterator[dict[str, Any]]:
+    def outcomes(self, name: str, seed: int, first: int, end: int) -> Iterator[dict[str, Any]]:
         """Results of each input; ends early if the process dies or hangs."""
         assert self._process.stdin is not None
         print(
@@ -142,8 +142,8 @@ class Crew:
         tally = Tally(name)
         while first < end and time.monotonic() < ends:
             self._worker = self._worker or Worker()
-            for told in self._worker.told(name, seed, first, end):
-                tally.add(told)
+            for outcomes in self._worker.outcomes(name, seed, first, end):
+                tally.add(outcomes)
                 first += 1
                 if time.monotonic() > ends:
                     break

@@ -51,9 +51,9 @@ def slowed(folder: Path) -> Path:
             writer.writeheader()
             writer.writerows(rows)
         done = path.with_name("done.json")
-        sealed = json.loads(done.read_text())
-        sealed["steps"]["predict"]["files"][path.name] = digest_file(path)
-        done.write_text(json.dumps(sealed))
+        record = json.loads(done.read_text())
+        record["steps"]["predict"]["files"][path.name] = digest_file(path)
+        done.write_text(json.dumps(record))
     return folder
 
 

@@ -163,21 +163,21 @@ def main() -> None:
     if arguments.here:
         work(arguments.points, arguments.dimensions, arguments.feature_storage[0], arguments.folder)
         return
-    told: dict[str, list[dict[str, Any]]] = {}
+    series: dict[str, list[dict[str, Any]]] = {}
     for where in arguments.feature_storage:
         with tempfile.TemporaryDirectory(prefix="dense-memory-") as made:
-            told[where] = in_a_process(where, arguments.points, arguments.dimensions, arguments.folder or Path(made))
+            series[where] = in_a_process(where, arguments.points, arguments.dimensions, arguments.folder or Path(made))
     if arguments.json:
-        columns = ["step", *(f"{what}, {WHERE[word]}" for word in told for what in ("resident, MiB", "seconds"))]
+        columns = ["step", *(f"{what}, {WHERE[word]}" for word in series for what in ("resident, MiB", "seconds"))]
         rows = [
             [
                 steps[0]["step"],
                 *(cell for one in steps for cell in (f"{one['peak_bytes'] / 2**20:.0f}", str(one["seconds"]))),
             ]
-            for steps in zip(*told.values(), strict=True)
+            for steps in zip(*series.values(), strict=True)
         ]
         n_points, n_bytes = (
-            next(iter(told.values()))[step][key] for step, key in ((1, "n_points"), (3, "features_bytes"))
+            next(iter(series.values()))[step][key] for step, key in ((1, "n_points"), (3, "features_bytes"))
         )
         title = f"A dense map of {n_points:,} points with {arguments.dimensions} features each"
         notes = [f"The features take {n_bytes / 2**20:.0f} MiB in half precision on disk."]

@@ -145,8 +145,8 @@ def cost_sentence(found: Mapping[str, Sequence[str]], against: str) -> str:
     >>> cost_sentence({"grows": ["a", "b"], "constant per update": ["c"]}, POINTS)
     'Time per update over map points: grows for a and b; constant for c'
     """
-    said = {"grows": "grows for", "constant per update": "constant for", "not settled": "growth undetermined for"}
-    parts = [f"{words} {_listed(found[kind])}" for kind, words in said.items() if kind in found]
+    verbs = {"grows": "grows for", "constant per update": "constant for", "not settled": "growth undetermined for"}
+    parts = [f"{words} {_listed(found[kind])}" for kind, words in verbs.items() if kind in found]
     with_what = "Time per update over map points" if against == POINTS else "Time per update over updates"
     if not parts:
         return f"{with_what}: growth unknown (too few updates or too similar sizes)"
@@ -255,8 +255,8 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
 
     Medians over the scenes.
     """
-    told = {column for of_method in times for scene in of_method for column in scene.columns}
-    drawn = [("map_bytes", POINTS)] * ("map_bytes" in told) + [("rss_bytes", UPDATES)]
+    timed = {column for of_method in times for scene in of_method for column in scene.columns}
+    drawn = [("map_bytes", POINTS)] * ("map_bytes" in timed) + [("rss_bytes", UPDATES)]
     figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), len(drawn))
     for axes, (column, against) in zip(panels, drawn, strict=True):
         most: dict[str, float] = {}

@@ -44,9 +44,9 @@ def _protocol_parts(compared: Mapping[str, Any], seeds: Sequence[Sequence[int]])
 
 
 def _of_seeds(seeds: Sequence[Sequence[int]]) -> str:
-    told = [f"{side} over {counted(len(of_side), 'seed')}" for side, of_side in zip("AB", seeds, strict=True)]
+    lines = [f"{side} over {counted(len(of_side), 'seed')}" for side, of_side in zip("AB", seeds, strict=True)]
     return (
-        f"each scene's value is the mean of {' and of '.join(told)}; {SEEDS}: standard deviation of a run's value due "
+        f"each scene's value is the mean of {' and of '.join(lines)}; {SEEDS}: standard deviation of a run's value due "
         "to the seed, in percentage points. Test and interval are over scenes and ignore seed effects common to "
         "all scenes; su3d-bench report power includes them"
     )

@@ -181,8 +181,8 @@ def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> T
 def _refined_by(part: Measured) -> str:
     """Return the source of label n': a vote, or a model's name."""
     who = [source.partition(" of ")[0] for source in remarks_starting(part.warnings, REFINED_BY)]
-    said = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
-    return " and ".join(dict.fromkeys(printable(one, 100) for one in said))
+    credits = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
+    return " and ".join(dict.fromkeys(printable(one, 100) for one in credits))
 
 
 def _own(cell: Cell, layout: JudgedLayout) -> Cell:

@@ -46,9 +46,9 @@ def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
     return [f"MIXED CONFIDENCES: {_listing(whose)}: average precisions are not comparable"]
 
 
-def _rows_by(said: Mapping[str, str | None]) -> dict[str, list[str]]:
+def _rows_by(values: Mapping[str, str | None]) -> dict[str, list[str]]:
     whose: dict[str, list[str]] = {}
-    for row, what in said.items():
+    for row, what in values.items():
         if what is not None:
             whose.setdefault(what, []).append(row)
     return whose

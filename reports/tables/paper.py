@@ -415,7 +415,7 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     """Return the notes on measured rows: missing scenes, partial runs, changed settings, perception, confidences."""
     notes: dict[str, list[str]] = {}
     for row, label in zip(rows, labels, strict=True):
-        said = [
+        parts = [
             f"PARTIAL: only the first {counted(row.limit, 'frame')} of each scene" if row.limit else "",
             f"with {some(row.changed, 8)}" if row.changed else "",
             f"INCOMPLETE: failed on {some(row.failed, 4)}" if row.failed else "",
@@ -424,7 +424,7 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
             f"perception {row.profile}{f', encoder {row.encoder}' if row.encoder else ''}" if row.profile else "",
             *(f"{RELATIVE}{one}" for one in remarks_starting(row.warnings, RELATIVE)),
         ]
-        for what in filter(None, said):
+        for what in filter(None, parts):
             notes.setdefault(what, []).append(label)
     everyone = len(rows)
     return [

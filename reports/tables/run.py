@@ -37,10 +37,10 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
             continue
         found = _COUNTED.fullmatch(sentence)
         groups.setdefault(sentence if found is None else _in_plural(found["what"]), []).append((scene, sentence, found))
-    return [(_said(key, group), [scene for scene, _, _ in group if scene]) for key, group in groups.items()]
+    return [(_sentence(key, group), [scene for scene, _, _ in group if scene]) for key, group in groups.items()]
 
 
-def _said(key: str, group: Sequence[tuple[str, str, re.Match[str] | None]]) -> str:
+def _sentence(key: str, group: Sequence[tuple[str, str, re.Match[str] | None]]) -> str:
     counts = [found for _, _, found in group if found is not None]
     if len(group) == 1 or not counts:
         return group[0][1]
@@ -163,8 +163,10 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
     rows_of: dict[str, list[Mapping[str, Any]]] = {}
     for result in metrics["results"]:
         rows_of.setdefault(str(result["protocol"]), []).append(result)
-    told = [rows for rows in rows_of.values() if any(row["result"] is not None or row["failed"] for row in rows)]
-    parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in told]
+    with_results = [
+        rows for rows in rows_of.values() if any(row["result"] is not None or row["failed"] for row in rows)
+    ]
+    parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in with_results]
     if not parts:
         parts = [Prose(("no protocol applies to these scenes",))]
     return [*parts, *([found_table(found)] if found else [])]

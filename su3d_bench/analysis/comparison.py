@@ -231,7 +231,7 @@ def _remarks_of_scenes(
             )
         warnings = () if record is None or record.result is None else record.result.warnings
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
-            lines += [f"{side.name}: {start}{printable(said, 200)}" for said in remarks_starting(warnings, start)]
+            lines += [f"{side.name}: {start}{printable(remark, 200)}" for remark in remarks_starting(warnings, start)]
     if every[0].run.rules(protocol).digest != every[0].run.protocols[protocol].digest:
         lines.append(f"the installed rules of {protocol} differ from those that scored both runs (same version)")
     return lines

@@ -281,7 +281,7 @@ def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
     if any(entry.is_ceiling for entry in board):
         notes.append("Rows that use ground truth are listed last and not ranked.")
     notes += confidence_notes({f"{entry.method} of {entry.run}": entry.confidences for entry in rivals})
-    notes += [f"Labels: {said}." for said in {entry.labels: None for entry in rivals if entry.labels}]
+    notes += [f"Labels: {note}." for note in {entry.labels: None for entry in rivals if entry.labels}]
     if has_ranks:
         notes.append(
             f"Rank: simultaneous 95 % interval of the rank by {first.headline[0]}, from sign-flip tests of the means "

@@ -37,12 +37,12 @@ MAX_CALIBRATION = 1e12  # calibration workloads: many years
 MIN_SHARE = 0.05
 MIN_COST_LIMIT = 1.0
 
-Part = Literal["start", "updates", "finish", "whole"]
+Part = Literal["start", "updates", "finish", "total"]
 SHOWN: Mapping[Part, str] = {
     "start": f"start and first {WARM_UP} updates",
     "updates": f"updates after the first {WARM_UP}",
     "finish": "finish",
-    "whole": "all stages",
+    "total": "all stages",
 }
 
 
@@ -50,7 +50,7 @@ class Cost(BaseModel):
     """Times of a method summed over all scenes, each in units of its scene's calibration workload.
 
     ``start``: setup and the first ``WARM_UP`` updates; ``updates``: the others, as their median times their number;
-    ``finish``: every map and what follows; ``whole``: everything, without medians.
+    ``finish``: every map and what follows; ``total``: everything, without medians.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -58,7 +58,7 @@ class Cost(BaseModel):
     start: float = Field(ge=0, le=MAX_CALIBRATION, allow_inf_nan=False)
     updates: float = Field(ge=0, le=MAX_CALIBRATION, allow_inf_nan=False)
     finish: float = Field(ge=0, le=MAX_CALIBRATION, allow_inf_nan=False)
-    whole: float = Field(gt=0, le=MAX_CALIBRATION, allow_inf_nan=False)
+    total: float = Field(gt=0, le=MAX_CALIBRATION, allow_inf_nan=False)
 
     @classmethod
     def middle(cls, costs: list[Cost]) -> Cost:
@@ -88,7 +88,7 @@ def _of_scene(times: UpdateTimes, most_calibration_ms: float) -> dict[Part, floa
         "start": times.start_ms + ms[:WARM_UP].sum(),
         "updates": np.median(steady) * len(steady),
         "finish": finish_ms,
-        "whole": times.start_ms + ms.sum() + finish_ms,
+        "total": times.start_ms + ms.sum() + finish_ms,
     }
     return {part: float(value) / unit_ms for part, value in parts.items()}
 
@@ -135,7 +135,7 @@ def compare_costs(
         for part, shown in SHOWN.items():
             was, cost = getattr(before, part), getattr(now, part)
             numbers.append(Compared(where, shown, was, cost, times=limit))
-            least = MIN_COST_LIMIT if part == "whole" else max(MIN_COST_LIMIT, MIN_SHARE * before.whole)
+            least = MIN_COST_LIMIT if part == "total" else max(MIN_COST_LIMIT, MIN_SHARE * before.total)
             if cost > limit * was and cost - was > least:
                 times = f"takes {cost / was:.2f} times as long as" if was else "takes time, but none in"
                 text = f"{times} the reference; at most {limit:g} times as long is allowed"

@@ -56,7 +56,7 @@ JPEG_QUALITY = 80
 CAMERA_M = 0.4  # distance of the image plane from the camera in the 3D view
 INSTALL = "pip install 'su3d-bench[rerun]'"
 COLUMNS = dict(zip(("n_instances", "n_points", "total_ms"), CURVES, strict=True))  # column of updates -> curve
-Tell = Callable[[int, int], None]
+Progress = Callable[[int, int], None]
 
 
 def rerun_sdk() -> Any:
@@ -298,8 +298,8 @@ class SceneTimeline:
         self.remarks = self._reader.remarks
         self.n_frames = self.n_maps = 0
 
-    def write(self, recording: Recording, tell: Tell = lambda n_done, n: None) -> None:
-        """Write everything to ``recording`` in order of time; ``tell`` is called with the number of frames done."""
+    def write(self, recording: Recording, progress: Progress = lambda n_done, n: None) -> None:
+        """Write everything to ``recording`` in order of time; ``progress`` is called with the number of frames done."""
         frames = self._frames()
         rules = shown_rules(self._run)
         truth = None if rules is None else self._reader.truth(rules)
@@ -316,7 +316,7 @@ class SceneTimeline:
         curves = {method: self._curves(method) for method in maps}
         first_s = None
         for done, index in enumerate(frames):
-            tell(done, len(frames))
+            progress(done, len(frames))
             frame = self._frame(index)
             if frame is None:
                 continue

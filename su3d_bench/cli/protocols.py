@@ -65,8 +65,8 @@ def call_list(arguments: argparse.Namespace) -> None:
     for rules, stated in rows:
         lines.append(f"{rules.name:<{width}}  {rules.summary}")
         if stated is not None:
-            told = "; ".join(f"{name}: {text}" for name, text in stated.facts.items())
-            lines += [f"    {line}" for line in wrap(told, 116, break_on_hyphens=False)]
+            fact_text = "; ".join(f"{name}: {text}" for name, text in stated.facts.items())
+            lines += [f"    {line}" for line in wrap(fact_text, 116, break_on_hyphens=False)]
     answer_either(arguments, values, *lines)
 
 

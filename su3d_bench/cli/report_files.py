@@ -108,8 +108,8 @@ def call_rerun(arguments: argparse.Namespace) -> None:
     make_folder(arguments.out.parent)
     with output.progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
         for one in timelines:
-            tell = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
-            one.write(Recording(sdk, one.scene, methods, stream), tell)
+            on_progress = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
+            one.write(Recording(sdk, one.scene, methods, stream), on_progress)
         check_not_empty(timelines, run.name)
     for one in timelines:
         remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)

@@ -211,8 +211,8 @@ def _drafts(
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
-    said = (relative_remark(encoder) or "") if "retrieval" in sources else ""
-    return drafts_of, {"retrieval": said, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
+    note = (relative_remark(encoder) or "") if "retrieval" in sources else ""
+    return drafts_of, {"retrieval": note, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
 
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:

@@ -169,8 +169,8 @@ class SafeStream(io.TextIOBase):
 
 def terminal_width() -> int | None:
     """The width of stdout in characters: ``COLUMNS``, otherwise that of its terminal; None if it is not a terminal."""
-    said = os.environ.get("COLUMNS", "")[:6]
-    if not sys.stdout.isatty() and not (said.isdecimal() and int(said)):
+    width_text = os.environ.get("COLUMNS", "")[:6]
+    if not sys.stdout.isatty() and not (width_text.isdecimal() and int(width_text)):
         return None
     return max(shutil.get_terminal_size().columns, MIN_WIDTH)
 

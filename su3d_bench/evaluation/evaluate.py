@@ -89,8 +89,8 @@ def warnings_of(result: Evaluation) -> list[str]:
     reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
         reasons.setdefault(reason, []).append(name)
-    told = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_INTENDED)}
-    return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in told.items()]
+    relevant = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_INTENDED)}
+    return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in relevant.items()]
 
 
 def _open_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:

@@ -243,12 +243,12 @@ def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Pred
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
     """The score of the ground truth through the same steps; None if it has no instances."""
-    told = visible_truth(rules, truth)
-    if not told.instance.any():
+    visible = visible_truth(rules, truth)
+    if not visible.instance.any():
         return None
     method_class = registry.load("method", "oracle")
     oracle = method_class(method_class.Config())
-    oracle.receive_ground_truth(told)
+    oracle.receive_ground_truth(visible)
     return score_scene(rules, truth, oracle.finish(), None)
 
 

@@ -78,7 +78,7 @@ def checked(path: Path, stated: Expected) -> tuple[str, str | None]:
         ("git's SHA-1", git_blob, "published:", stated.git_blob),
         ("SHA-256", found, "first download:", stated.recorded),
     )
-    wrong = (f"{name} {value}, {said} {fact}" for name, value, said, fact in facts if fact not in (None, value))
+    wrong = (f"{name} {value}, {origin} {fact}" for name, value, origin, fact in facts if fact not in (None, value))
     return found, next(wrong, None)
 
 
@@ -320,8 +320,8 @@ def _names(source: Source, stated: Any) -> list[str]:
         parts = [[name.strip() for name in part.split("+")] for part in requirement.split("|")]
         there = next((names for names in parts if all(name in stated for name in names)), None)
         if there is None:
-            said = requirement.replace(" | ", " or ").replace(" + ", " and ")
-            raise DataError(f"hub repository {source.hub.repository}: has no {said}; give another hub with --mirror")
+            origin = requirement.replace(" | ", " or ").replace(" + ", " and ")
+            raise DataError(f"hub repository {source.hub.repository}: has no {origin}; give another hub with --mirror")
         chosen += there
     settings = [*chosen[1:], *(name for name in source.hub.optional if name in stated)]
     return [*dict.fromkeys(name for name in settings if name != chosen[0]), chosen[0]]

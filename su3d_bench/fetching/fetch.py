@@ -221,8 +221,8 @@ def check_space(planned: Planned, files: Sequence[Download]) -> None:
     sizes = [file.n_bytes for file in files]
     total = sum(size for size in sizes if size is not None) if None not in sizes else planned.source.n_bytes or 0
     places = [planned.state / file.name for file in files]
-    held = sum(size_of(place) or size_of(part_of(place)) for place in places)
-    needed = total - held + (total if planned.source.archive == "zip" else 0)
+    n_present = sum(size_of(place) or size_of(part_of(place)) for place in places)
+    needed = total - n_present + (total if planned.source.archive == "zip" else 0)
     check_room(planned.root, needed, planned.source.name)
 
 
@@ -266,8 +266,8 @@ def _unpack(planned: Planned, watch: Progress) -> tuple[Path, list[str]]:
     try:
         if source.archive == "zip":
             room = sum(size for name, size in members(archives[0]) if _rendered(PurePosixPath(name)) is not None)
-            held = sum(size_of(path) for path in folder.rglob("*"))
-            check_room(planned.root, room - held, f"{source.name}, unpacked,")
+            n_present = sum(size_of(path) for path in folder.rglob("*"))
+            check_room(planned.root, room - n_present, f"{source.name}, unpacked,")
             n, top = unpack_zip(archives[0], folder, _rendered, watch), RENDER
         else:
             n, top = unpack_tar_gz(archives, folder, _annotated, watch), ORIGINAL

@@ -150,13 +150,13 @@ def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None
     if result.is_file():
         return
     command = [sys.executable, str(script.absolute()), "-o", str(folder.absolute()), *words]
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as output:
         try:
-            done = subprocess.run(command, input=KEYS, stdout=said, stderr=subprocess.STDOUT, cwd=folder, check=False)
+            done = subprocess.run(command, input=KEYS, stdout=output, stderr=subprocess.STDOUT, cwd=folder, check=False)
         except OSError as error:
             raise StoreError(f"{script}: cannot be run: {error.strerror or error}") from error
-        said.seek(max(0, said.tell() - LAST_WORDS))
-        lines = [line for line in said.read().decode(errors="replace").splitlines() if line.strip()]
+        output.seek(max(0, output.tell() - LAST_WORDS))
+        lines = [line for line in output.read().decode(errors="replace").splitlines() if line.strip()]
     if done.returncode != 0 or not result.is_file() or not result.stat().st_size:
         last = printable(lines[-1], 200) if lines else "nothing"
         raise DataError(

@@ -44,9 +44,9 @@ class AnswerRow:
 
 def read_answers(path: Path) -> list[AnswerRow]:
     """All rows of a CSV file or XLSX workbook, in order; ``DataError`` if it is not an answers file."""
-    told = [name for name in ANSWER_COLUMNS if name != "annotator"]
+    required = [name for name in ANSWER_COLUMNS if name != "annotator"]
     rows = rows_of_file(path, ANSWER_COLUMNS)
-    return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in told)]
+    return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in required)]
 
 
 def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:

@@ -141,12 +141,12 @@ def _draft(question: AuditedQuestion, source: TruthSource) -> Draft:
     """The ids of the answer objects and reference objects to draw."""
     row_of = {instance: row for row, instance in enumerate(source.instances(question.scene).ids.tolist())}
     draft = Draft(kind="questions", scene=question.scene, methods=("",), instance_ids=(-1,))
-    right, held = ([thing.id for thing in things] for things in (question.right, question.held))
-    names = {number: f"#{number}" for number in (*right, *held)}
-    return with_answer(draft, question.text, question.answer, (right, held), names, row_of)
+    right, references = ([thing.id for thing in things] for things in (question.right, question.references))
+    names = {number: f"#{number}" for number in (*right, *references)}
+    return with_answer(draft, question.text, question.answer, (right, references), names, row_of)
 
 
 def _lines(question: AuditedQuestion) -> tuple[str, ...]:
-    held, others = (", ".join(thing.shown for thing in things) for things in (question.held, question.others))
-    lines = (("answer", question.answer), ("compared with", held), ("no answer", others))
+    references, others = (", ".join(one.shown for one in things) for things in (question.references, question.others))
+    lines = (("answer", question.answer), ("compared with", references), ("no answer", others))
     return tuple(f"{name}: {words}" for name, words in lines if words)

@@ -303,8 +303,8 @@ def _annotation_judge(
     def judge(row: int, names: Sequence[str]) -> Mapping[str, str]:
         if int(main[row]) not in known.object_ids:
             return {}
-        said = zip(LABELS, names, strict=False)
-        labels = {what: judged(known.is_called(name, int(main[row]))) for what, name in said}
+        labelled = zip(LABELS, names, strict=False)
+        labels = {what: judged(known.is_called(name, int(main[row]))) for what, name in labelled}
         return {**labels, "merging": merges[row]}
 
     return judge
@@ -361,7 +361,7 @@ def reasoning_drafts(
         for one, answer in zip(asked, ask(a_map, [one.text for one in asked]), strict=True):
             rows = [row_of[object_id] for object_id in answer.object_ids]
             instance_id = id_of(instances, rows[0]) if len(rows) == 1 else -1
-            shown, names = without_ids(told(answer), a_map, (*answer.object_ids, *answer.reference_ids))
+            shown, names = without_ids(reply(answer), a_map, (*answer.object_ids, *answer.reference_ids))
             key = one.text.encode() + b"\0" + shown.encode() + mask_digest(instances, rows)
             if key in groups:
                 groups[key] = also(groups[key], method, instance_id)
@@ -418,7 +418,7 @@ def with_answer(
     )
 
 
-def told(answer: Answer) -> str:
+def reply(answer: Answer) -> str:
     """The answer as shown to annotators, without the name of the language model in failure reasons.
 
     Suggestions of other words of the map are removed too.
@@ -449,26 +449,27 @@ def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Co
     found = [question for question in ground_truths.questions_of(dataset, name) if question.id not in left_out]
     drafts = []
 
-    def add(asked: str, told: str, made_id: str, kind: str, answers: Sequence[int], held: Sequence[int] = ()) -> None:
-        told, names = without_ids(told, objects, [number for number in (*answers, *held) if number in objects.ids])
+    def add(asked: str, reply: str, key: str, kind: str, answers: Sequence[int], related: Sequence[int] = ()) -> None:
+        reply, names = without_ids(reply, objects, [number for number in (*answers, *related) if number in objects.ids])
         draft = Draft(
             kind="questions",
             scene=scene,
             methods=(kind, ANY_KIND),  # no method answers: results are grouped by kind
             instance_ids=(answers[0] if len(answers) == 1 else -1,) * 2,
-            text="\n".join(printable(line, MAX_TEXT) for line in (asked, f"Answer: {told}")),
+            text="\n".join(printable(line, MAX_TEXT) for line in (asked, f"Answer: {reply}")),
             asks=tuple(ask.name for ask in ASKS["questions"]),
-            question_id=made_id,
+            question_id=key,
             question_kind=kind,
         )
-        drafts.append(with_answer(draft, asked, told, (answers, held), names, row_of))
+        drafts.append(with_answer(draft, asked, reply, (answers, related), names, row_of))
 
     for question in chosen(found, per_kind):
-        told = ", ".join(objects.by_id(k).shown for k in question.answers or () if k in objects.ids)
-        add(f"Find: {question.text}", told, question.id, question.kind, question.answers or ())
+        reply = ", ".join(objects.by_id(k).shown for k in question.answers or () if k in objects.ids)
+        add(f"Find: {question.text}", reply, question.id, question.kind, question.answers or ())
     for made in generate_questions(objects, n_each=per_kind):
-        made_id, answer = question_id(scene, REASONING, made.text), made.answer
-        if made_id not in left_out:
-            held = [thing.id for thing in reference_objects(made, objects)]
-            add(made.text, "no" if answer.value is False else answer.text, made_id, made.kind, answer.object_ids, held)
+        key, answer = question_id(scene, REASONING, made.text), made.answer
+        if key not in left_out:
+            reply, related = answer.text, [thing.id for thing in reference_objects(made, objects)]
+            reply = "no" if answer.value is False else reply
+            add(made.text, reply, key, made.kind, answer.object_ids, related)
     return drafts

@@ -421,11 +421,11 @@ def review_items_csv(looks: Sequence[ReviewItem]) -> str:
     rows = [REVIEW_COLUMNS]
     for one in looks:
         listed = ", ".join(one.methods), one.text, ", ".join(one.pictures)
-        rows.append((one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, *listed))
+        rows.append((one.item_id, one.ask, one.reason, _review_reason(one), one.automatic, one.scene, *listed))
     return csv_lines(rows)
 
 
-def _said(look: ReviewItem) -> str:
+def _review_reason(look: ReviewItem) -> str:
     return "; ".join(f"{name}: {answer}" for name, answer in look.answers.items())
 
 
@@ -437,7 +437,7 @@ def review_items_page(looks: Sequence[ReviewItem], pictures: str, sheet_id: str)
 def _entry(look: ReviewItem) -> Entry:
     truth = f"; ground truth: {look.automatic}" if look.automatic else ""
     head = f"{look.item_id}, {look.scene}, {', '.join(look.methods)}"
-    return Entry(head, look.text, (f"{look.reason}, {look.ask}: {_said(look)}{truth}",), look.pictures)
+    return Entry(head, look.text, (f"{look.reason}, {look.ask}: {_review_reason(look)}{truth}",), look.pictures)
 
 
 def disputed_csv(key: Key, looks: Iterable[ReviewItem]) -> str:

@@ -101,9 +101,9 @@ class Relations:
 
     def links(self) -> Iterator[Link]:
         """Every relation except "near", by subject and object."""
-        held = {name: self.of(name) for name in RELATIONS if name != "near"}
-        for a, b in np.argwhere(np.any(list(held.values()), axis=0)).tolist():
-            for name, matrix in held.items():
+        relations = {name: self.of(name) for name in RELATIONS if name != "near"}
+        for a, b in np.argwhere(np.any(list(relations.values()), axis=0)).tolist():
+            for name, matrix in relations.items():
                 if matrix[a, b]:
                     yield Link(a, name, b)
 

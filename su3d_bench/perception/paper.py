@@ -31,18 +31,18 @@ def paper_deviations(
     config: PaperConfig, networks: Networks, encoder: Encoder, captioner: Captioner | None
 ) -> list[str]:
     """The differences from OpenSU3D's paper, one clause each; empty if there are none."""
-    said = [networks.tagger.caveat] if networks.tagger.caveat else []
+    deviations = [networks.tagger.caveat] if networks.tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
-        said.append(f"masks: {config.segmenter} replaces the paper's {PAPER_SEGMENTER}")
+        deviations.append(f"masks: {config.segmenter} replaces the paper's {PAPER_SEGMENTER}")
     if others := _non_default_settings(config.grounded):
-        said.append(f"named masks: {', '.join(others)} differ from OpenSU3D's settings")
+        deviations.append(f"named masks: {', '.join(others)} differ from OpenSU3D's settings")
     if encoder.name != MODELS[PAPER_ENCODER].known_as:
-        said.append(f"features: {encoder.name} replaces the paper's {PAPER_ENCODER}")
+        deviations.append(f"features: {encoder.name} replaces the paper's {PAPER_ENCODER}")
     if captioner is None:
-        said.append("names and captions: the tagger's names and a template replace the paper's vision model")
+        deviations.append("names and captions: the tagger's names and a template replace the paper's vision model")
     elif captioner.vision_model != PAPER_VISION_MODEL:
-        said.append(f"names and captions: {captioner.vision_model} replaces the paper's {PAPER_VISION_MODEL}")
-    return said
+        deviations.append(f"names and captions: {captioner.vision_model} replaces the paper's {PAPER_VISION_MODEL}")
+    return deviations
 
 
 def _non_default_settings(config: GroundedConfig) -> list[str]:

@@ -356,6 +356,6 @@ def write_opensun3d(answer: LabelledMasks, scene: str, folder: Path) -> tuple[st
     remarks = write_list(answer, np.zeros(len(answer.class_ids), np.int64), scene, folder, None, form)
     n_written = int((answer.masks.sizes > 0).sum())
     if n_written < MIN_MASKS:
-        said = f"has {n_written or 'no'} mask{'s' * (n_written != 1)}"
-        remarks = (*remarks, f"{said}: the challenge's own script fails on a list of fewer than {MIN_MASKS}")
+        count = f"has {n_written or 'no'} mask{'s' * (n_written != 1)}"
+        remarks = (*remarks, f"{count}: the challenge's own script fails on a list of fewer than {MIN_MASKS}")
     return tuple(remarks)

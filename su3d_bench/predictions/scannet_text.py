@@ -99,14 +99,14 @@ def _is_list(line: str) -> bool:
 def scannet_masks(place: Path, scene: str, numbering: Numbering = "id") -> Parsed:
     lines = read_list(place)
     pairs = last_line_of_each_mask_file([line.file for line in lines])
-    said = [lines[first]._replace(label=lines[last].label, score=lines[last].score) for first, last in pairs]
-    numbers = np.array([line.label for line in said], np.int32)
+    entries = [lines[first]._replace(label=lines[last].label, score=lines[last].score) for first, last in pairs]
+    numbers = np.array([line.label for line in entries], np.int32)
     n_more = len(lines) - len(pairs)
     remark = (
         f"{n_more} lines repeat a mask file: class and confidence of its last line are used, at the position of its "
         "first, as in the official evaluator"
     )
-    return _masks(place, said, [remark] * bool(n_more), class_numbers=numbers, numbering=numbering)
+    return _masks(place, entries, [remark] * bool(n_more), class_numbers=numbers, numbering=numbering)
 
 
 def scannetpp_masks(place: Path, scene: str) -> Parsed:

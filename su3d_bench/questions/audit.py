@@ -36,7 +36,7 @@ class AuditedQuestion:
     text: str
     answer: str
     right: Things
-    held: Things
+    references: Things
     others: Things
     room: SceneMap
 
@@ -50,26 +50,26 @@ def audited_questions(
     for query in questions_of(dataset, scene):
         if query.answers is not None:
             right = _of_ids(objects, query.answers)
-            held = _without(_related(query, right, objects), right)
-            others = _without(_called_as(right, objects), (*right, *held))
+            references = _without(_related(query, right, objects), right)
+            others = _without(_called_as(right, objects), (*right, *references))
             words = _listed(query.answers, objects)
-            yield AuditedQuestion(address, query.kind, query.text, words, right, held, others, objects)
+            yield AuditedQuestion(address, query.kind, query.text, words, right, references, others, objects)
     for question in generate_questions(objects, n_each=n_each, seed=seed):
         mentioned = _mentioned(question.text, objects)
         right = _of_ids(objects, question.answer.object_ids)
-        held = reference_objects(question, objects)
+        references = reference_objects(question, objects)
         called = (*_called_as(right, objects), *(thing for things in mentioned for thing in things))
-        others = _without(called, (*right, *held))
+        others = _without(called, (*right, *references))
         words = _in_words(question.answer, objects)
-        yield AuditedQuestion(address, question.kind, question.text, words, right, held, others, objects)
+        yield AuditedQuestion(address, question.kind, question.text, words, right, references, others, objects)
 
 
 def reference_objects(question: GeneratedQuestion, objects: SceneMap) -> Things:
     """The reference objects of an answer; for negative answers, the object at the end of the text."""
-    held = _of_ids(objects, question.answer.reference_ids)
-    if not held and question.answer.value is False and (mentioned := _mentioned(question.text, objects)):
-        held = mentioned[-1]
-    return _without(held, _of_ids(objects, question.answer.object_ids))
+    references = _of_ids(objects, question.answer.reference_ids)
+    if not references and question.answer.value is False and (mentioned := _mentioned(question.text, objects)):
+        references = mentioned[-1]
+    return _without(references, _of_ids(objects, question.answer.object_ids))
 
 
 def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list[AuditedQuestion]:
@@ -141,8 +141,8 @@ def _related(query: Question, right: Things, objects: SceneMap) -> Things:
         _, found, other = query.text.partition(f" {relation} ")
         named = [thing for thing in objects.objects if found and other in (thing.name, with_article(thing.name))]
         if named:
-            held = [one for one in named if any(objects.holds(relation, thing, one) for thing in right)]
-            return tuple(held or named)
+            references = [one for one in named if any(objects.holds(relation, thing, one) for thing in right)]
+            return tuple(references or named)
     return ()
 
 

@@ -200,9 +200,9 @@ class _Drafts:
             pairs = [(thing, reference) for thing in self._all if thing is not reference]
             if not all(self._scene.is_usual(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
                 continue
-            held = [pair for pair in pairs if self._holds(relation, *pair)]
-            if held and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
-                share = 1 / math.comb(len(pairs), len(held))
+            related = [pair for pair in pairs if self._holds(relation, *pair)]
+            if related and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
+                share = 1 / math.comb(len(pairs), len(related))
                 yield _Draft(f"What is {relation} the {reference.name}?", share, share)
 
     def _is(self, relation: Relation) -> Iterator[_Draft]:

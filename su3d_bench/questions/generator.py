@@ -220,10 +220,10 @@ def _relations(objects: SceneMap) -> Iterator[_Asked]:
     for relation in RELATIONS:
         if relation == "near":
             continue
-        held, doubtful = objects.relations.of(relation), objects.doubtful[relation]
+        related, doubtful = objects.relations.of(relation), objects.doubtful[relation]
         if relation == "in":
-            held = held & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
-        for a, b in np.argwhere(held | doubtful).tolist():
+            related = related & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
+        for a, b in np.argwhere(related | doubtful).tolist():
             subject, other = things[a], things[b]
             text = f"{subject.name} {relation} {with_article(other.name)}"
             if subject.name != other.name and objects.is_usual(relation, subject, other):
@@ -250,5 +250,5 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
 
 def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:
     """Whether nothing can be between the two, because they are next to each other or one is on or in the other."""
-    held = any(objects.holds(name, *pair) for name in ("on", "in") for pair in ((a, b), (b, a)))
-    return held or objects.holds("next to", a, b)
+    related = any(objects.holds(name, *pair) for name in ("on", "in") for pair in ((a, b), (b, a)))
+    return related or objects.holds("next to", a, b)

@@ -213,9 +213,9 @@ def noun_objects(noun: str, scene: SceneMap, nearest: NearestName | None = None)
     for n_adjectives in range(min(MAX_ADJECTIVES, len(noun_words) - 1) + 1):
         adjectives, rest = noun_words[:n_adjectives], noun_words[n_adjectives:]
         named = _named(rest, scene.objects)
-        held = tuple(thing for thing in named if _has(thing, adjectives))
-        if held:
-            return NounMatch(held)
+        described = tuple(thing for thing in named if _has(thing, adjectives))
+        if described:
+            return NounMatch(described)
     if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
         # a map may have the single objects, or one object for all
         return noun_objects(" ".join(noun_words[2:]), scene, nearest)

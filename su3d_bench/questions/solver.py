@@ -225,8 +225,8 @@ class Solver:
             text, objects, references, value = solve(question)
         except _Unsettled as reason:
             return undecided(str(reason), tuple(self._notes))
-        ids, held = (tuple(thing.id for thing in things) for things in (objects, references))
-        return Answer(text, ids, held, value, question.kind, notes=tuple(self._notes))
+        ids, related = (tuple(thing.id for thing in things) for things in (objects, references))
+        return Answer(text, ids, related, value, question.kind, notes=tuple(self._notes))
 
     def _note(self, note: str) -> None:
         self._notes[note] = None
@@ -243,13 +243,13 @@ class Solver:
             return meant.objects, ()
         others = [self._some(other) for other in phrase.others]
         kept: list[MapObject] = []
-        held: dict[int, MapObject] = {}
+        related: dict[int, MapObject] = {}
         for thing in meant.objects:
             witnesses = self._supporting_objects(thing, phrase.relation, others)
             if witnesses:
                 kept.append(thing)
-                held |= {other.id: other for other in witnesses}
-        return tuple(kept), tuple(held.values())
+                related |= {other.id: other for other in witnesses}
+        return tuple(kept), tuple(related.values())
 
     def _some(self, phrase: Phrase) -> Objects:
         objects, _ = self._objects(phrase)
@@ -281,8 +281,8 @@ class Solver:
             a, b = (thing, other) if relation == "left of" else (other, thing)
             return is_left_of(a.centroid, b.centroid, self._eye)
         if relation == "with":
-            held = any(self._scene.holds(name, other, thing) for name in ("on", "in"))
-            return held or self._scene.holds("next to", thing, other)
+            related = any(self._scene.holds(name, other, thing) for name in ("on", "in"))
+            return related or self._scene.holds("next to", thing, other)
         assert relation != "between", "between has two others"
         return self._scene.holds(relation, thing, other)
 
@@ -347,15 +347,15 @@ class Solver:
         return f"{distance_m:.2f} m between the centres of {a.shown} and {b.shown}", (a, b), (), distance_m
 
     def _count(self, question: Question) -> _Solved:
-        things, held = self._found_or_none(question.subject)
+        things, related = self._found_or_none(question.subject)
         text = f"{len(things)}: {_listed(things)}" if things else f"0: {self._has_no(_shown(question.subject))}"
-        return text, things, held, len(things)
+        return text, things, related, len(things)
 
     def _exists(self, question: Question) -> _Solved:
-        things, held = self._found_or_none(question.subject)
+        things, related = self._found_or_none(question.subject)
         if not things:
             return f"no: {self._has_no(_shown(question.subject))}", (), (), False
-        return f"yes: {_listed(things)}", things, held, True
+        return f"yes: {_listed(things)}", things, related, True
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
         """As ``_objects``, but empty for a noun that the map does not have, which answers the question."""
@@ -367,19 +367,21 @@ class Solver:
         assert question.relation is not None
         others = question.options or ((question.other,) if question.other else ())
         phrase = Phrase(question.subject.head, question.relation, others)
-        things, held = self._objects(phrase)
+        things, related = self._objects(phrase)
         if not things:
             return f"no: no {_shown(phrase)}", self._some(question.subject), (), False
-        return f"yes: {_listed(things)} {question.relation} {_listed(held)}", things, held, True
+        return f"yes: {_listed(things)} {question.relation} {_listed(related)}", things, related, True
 
     def _list(self, question: Question) -> _Solved:
-        things, held = self._objects(question.subject)
+        things, related = self._objects(question.subject)
         if question.subject.relation in ("left of", "right of"):
-            things = tuple(thing for thing in things if any(self._scene.holds("near", thing, other) for other in held))
+            things = tuple(
+                thing for thing in things if any(self._scene.holds("near", thing, other) for other in related)
+            )
             self._note(f"no farther than {NEAR_M:g} m from it")
         if not things:
             return f"nothing: {self._has_no(_shown(question.subject))}", (), (), None
-        return _listed(things), things, held, None
+        return _listed(things), things, related, None
 
     def _size(self, question: Question) -> _Solved:
         assert question.size is not None
@@ -392,12 +394,12 @@ class Solver:
         return f"{best.shown}: {measure(best):.3g} {unit}{rest}", (best,), (), None
 
     def _where(self, question: Question) -> _Solved:
-        things, held = self._objects(question.subject)
+        things, related = self._objects(question.subject)
         if not things:
             raise _Unsettled(self._has_no(_shown(question.subject)))
         places = [f"{thing.shown} at ({', '.join(f'{value:.2f}' for value in thing.centroid)}) m" for thing in things]
         more = f" and {len(things) - MAX_LISTED} more" if len(things) > MAX_LISTED else ""
-        return "; ".join(places[:MAX_LISTED]) + more, things, held, None
+        return "; ".join(places[:MAX_LISTED]) + more, things, related, None
 
     def _note_multiple_labels(self, objects: Objects, phrase: Phrase) -> None:
         if len(objects) > 1:

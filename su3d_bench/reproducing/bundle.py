@@ -101,8 +101,8 @@ def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None
     bad = next((name for name in names if not is_safe(name)), None)
     if bad is not None:
         raise StoreError(f"'{printable(bad, 100)}': this run name is not valid on other systems; rename its folder")
-    said = {"trained_on": printable(trained_on, MAX_REMARK_CHARACTERS)} if trained_on else {}
-    _write(place, whole, {}, {"recipe": "", **said})
+    remark = {"trained_on": printable(trained_on, MAX_REMARK_CHARACTERS)} if trained_on else {}
+    _write(place, whole, {}, {"recipe": "", **remark})
 
 
 def _write(place: Path, runs: Sequence[Path], temporary_path: Mapping[str, Path], about: Mapping[str, str]) -> None:
@@ -246,8 +246,8 @@ def _unpack_one(
 ) -> None:
     """Check a member against its entry and write it; ``into`` None: only check."""
     if info.file_size != entry.n_bytes:
-        said = f"has {info.file_size} bytes, but {entry.n_bytes} in its manifest"
-        raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
+        remark = f"has {info.file_size} bytes, but {entry.n_bytes} in its manifest"
+        raise StoreError(f"{where}: {printable(info.filename, 120)} {remark}")
     atomic.check_member(info, allowance)
     place = Path(os.devnull)
     if into is not None:

@@ -94,7 +94,7 @@ class Results:
         """
         made = {name: run.settings for name, run in self.runs.items() if _ENCODER in run.settings}
         wanted = experiment.encoder, experiment.stride
-        others = {name for name, said in made.items() if (said[_ENCODER], said.get(("stride",), 0)) != wanted}
+        others = {name for name, extra in made.items() if (extra[_ENCODER], extra.get(("stride",), 0)) != wanted}
         if len(others) in (0, len(made)):
             return self
         folders = tuple(folder for folder in self.folders if str(folder) not in others)
@@ -188,8 +188,8 @@ def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
         return
     theirs, ours = (load_protocol(name).as_json for name in (figure.protocol, row.protocol))
     keys = [key for key in dict.fromkeys([*theirs, *ours]) if key not in _NAMES and theirs.get(key) != ours.get(key)]
-    said = f" (other {', '.join(keys[:MAX_RULES])}{' and more' if len(keys) > MAX_RULES else ''})" if keys else ""
-    yield f"protocol rule: {row.protocol} instead of {figure.protocol}{said}"
+    extra = f" (other {', '.join(keys[:MAX_RULES])}{' and more' if len(keys) > MAX_RULES else ''})" if keys else ""
+    yield f"protocol rule: {row.protocol} instead of {figure.protocol}{extra}"
 
 
 def _of_scenes(figure: Figure, row: Measured) -> Iterator[str]:
@@ -270,11 +270,11 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
     rows = []
     for key in dict.fromkeys((cell.source, cell.row, cell.method, cell.dataset) for cell in cells):
         mine = {cell.metric: cell for cell in cells if (cell.source, cell.row, cell.method, cell.dataset) == key}
-        said = tuple(dict.fromkeys(line for cell in mine.values() for line in _said(cell)))
-        mark = marks.setdefault(said, f"[{len(marks) + 1}]")
+        extra = tuple(dict.fromkeys(line for cell in mine.values() for line in _notes_of(cell)))
+        mark = marks.setdefault(extra, f"[{len(marks) + 1}]")
         shown = tuple(text for metric in metrics for text in _shown(mine.get(metric)))
         rows.append(TableRow(f"{key[1]} on {key[3]} {mark}", tuple(map(Cell, shown))))
-    notes = [f"{mark} {'; '.join(said)}" for said, mark in marks.items()]
+    notes = [f"{mark} {'; '.join(extra)}" for extra, mark in marks.items()]
     n = len(cells)
     n_measured = sum(cell.measured is not None for cell in cells)
     n_within = sum(cell.is_within for cell in cells)
@@ -294,7 +294,7 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
     )
 
 
-def _said(cell: Compared) -> list[str]:
+def _notes_of(cell: Compared) -> list[str]:
     if cell.measured is None:
         return [f"not measured: {cell.incompatibility}"]
     what = list(cell.causes) or ["no known differences: protocol, encoder, proposals and stride are the paper's"]

@@ -185,7 +185,7 @@ def preflight_tables(known: Preflight) -> list[Table]:
     rows = [["what", "name", "available", "bytes", "how to get it"]]
     rows += [[need.kind, need.name, _state(need), _bytes(need), need.how or "-"] for need in known.needs]
     remarks = [f"{need.name}: {need.remark}" for need in known.needs if need.remark and not need.is_available]
-    return [text_table("needs", rows, heading="Requirements", caption=f": {_said(known)}", notes=remarks)]
+    return [text_table("needs", rows, heading="Requirements", caption=f": {_lines(known)}", notes=remarks)]
 
 
 def _state(need: Need) -> str:
@@ -198,7 +198,7 @@ def _bytes(need: Need) -> str:
     )
 
 
-def _said(known: Preflight) -> str:
+def _lines(known: Preflight) -> str:
     missing = known.missing
     n_bytes = sum(need.n_bytes or 0.0 for need in missing if need.kind in ("model", "scene"))
     if not missing:
@@ -208,7 +208,7 @@ def _said(known: Preflight) -> str:
 
 def summary(known: Preflight) -> Iterator[str]:
     """The preflight in a few lines."""
-    yield f"preflight: {_said(known)[:-1]}"
+    yield f"preflight: {_lines(known)[:-1]}"
     for need in known.needs:
         if not need.is_available:
             yield f"  missing: {need.kind} {need.name}" + (f" ({need.remark})" if need.remark else "")

@@ -89,10 +89,10 @@ class Experiment(BaseModel):
                 raise ConfigError(
                     f"experiment {self.name}: figures have no '{printable(unknown, 60)}'{suggest(unknown, known)}"
                 )
-            figures = [one for one in published() if all(getattr(one, key) == said for key, said in choice.items())]
+            figures = [one for one in published() if all(getattr(one, key) == want for key, want in choice.items())]
             if not figures:
-                said = ", ".join(f"{key} = {value}" for key, value in choice.items())
-                raise ConfigError(f"experiment {self.name}: published.toml has no figure with {printable(said, 200)}")
+                text = ", ".join(f"{key} = {value}" for key, value in choice.items())
+                raise ConfigError(f"experiment {self.name}: published.toml has no figure with {printable(text, 200)}")
             found += [figure for figure in figures if figure not in found]
         return found
 

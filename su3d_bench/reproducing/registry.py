@@ -36,10 +36,10 @@ def command_of(run: FinishedRun, method: str) -> str:
     """
     if method in run.external:
         return printable(_evaluation(run, method), MAX_CHARACTERS)
-    held = existing_run(run.folder.path)
-    if held is None or not held.is_known:
+    present = existing_run(run.folder.path)
+    if present is None or not present.is_known:
         return UNKNOWN
-    asked = held.requested
+    asked = present.requested
     words = ["su3d-bench", "run", *_flags(asked, run, method), *_settings(asked, method)]
     return printable(shlex.join(words), MAX_CHARACTERS)
 
@@ -255,9 +255,9 @@ def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iter
 N_DIGITS = 12  # shown digits of a digest
 
 
-def conflict_with(row: Row, held: Sequence[Row]) -> str | None:
-    """Why ``row`` cannot be added to a registry with the rows ``held``, and what to do; None if it can."""
-    return next((f"{row.what}: {fault}" for other in held for fault in _faults_beside(row, other)), None)
+def conflict_with(row: Row, present: Sequence[Row]) -> str | None:
+    """Why ``row`` cannot be added to a registry with the rows ``present``, and what to do; None if it can."""
+    return next((f"{row.what}: {fault}" for other in present for fault in _faults_beside(row, other)), None)
 
 
 def _faults_beside(row: Row, other: Row) -> Iterator[str]:
@@ -431,7 +431,7 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
 
 def _beside(rows: Sequence[Row], others: Sequence[Path], digest: str) -> Iterator[str]:
     """Why the rows of a bundle of this digest conflict with each other or with the bundles ``others``."""
-    held: list[Row] = []
+    present: list[Row] = []
     for other in others:
         mine, refused = _read(other)
         if refused:
@@ -443,11 +443,11 @@ def _beside(rows: Sequence[Row], others: Sequence[Path], digest: str) -> Iterato
         if mine and mine[0].bundle.sha256 == digest:
             yield f"is already in the registry as {mine[0].bundle.name}{SUFFIX}"
             return
-        held += mine
+        present += mine
     for row in rows:
-        if reason := conflict_with(row, held):
+        if reason := conflict_with(row, present):
             yield reason
-        held.append(row)
+        present.append(row)
 
 
 def _is_same_file(one: Path, other: Path) -> bool:
@@ -494,6 +494,6 @@ def lines_of(found: Added) -> list[str]:
         how = "identical to the last bit" if found.is_to_the_bit else "identical integers, values within 1e-9"
         scores = f"{counted(found.n_scores, 'score')} recomputed, {how}"
         return [f"{found.bundle}: in the registry as {found.place}: {counted(found.n_rows, 'row')}; {scores}"]
-    told = [f"{found.bundle}: rejected: {reason}" for reason in found.reasons[:MAX_NAMED]]
-    more = len(found.reasons) - len(told)
-    return [*told, *([f"{found.bundle}: rejected: and {counted(more, 'reason')} more"] if more else [])]
+    messages = [f"{found.bundle}: rejected: {reason}" for reason in found.reasons[:MAX_NAMED]]
+    more = len(found.reasons) - len(messages)
+    return [*messages, *([f"{found.bundle}: rejected: and {counted(more, 'reason')} more"] if more else [])]

@@ -111,39 +111,39 @@ def _as_first_requested(entry: Setting, lines: Sequence[str]) -> Setting:
     return replace(entry, source=remark.strip()) if mark else entry
 
 
-def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
-    """The request of ``held`` merged with the present one; ``where`` is the run's folder or its URL."""
-    if held is None or not held.is_known:
+def extended(asked: Settings, existing: ExistingRun | None, where: str) -> Settings:
+    """The request of ``existing`` merged with the present one; ``where`` is the run's folder or its URL."""
+    if existing is None or not existing.is_known:
         raise ConfigError(f"--extend: {printable(where, 300)} has no complete run.toml; omit --extend to start a run")
     joined = []
     for name in JOINED:
         given = [entry for entry in asked.entries if entry.path == (name,)]
         if given and isinstance(given[-1].value, list | tuple):
-            before = held.protocols if name == "protocols" else held.asked(name)
+            before = existing.protocols if name == "protocols" else existing.asked(name)
             both = list(dict.fromkeys([*before, *map(str, given[-1].value)]))
             joined.append(replace(given[-1], value=both))
     names = {entry.path[0] for entry in joined}
-    old = [entry for entry in held.settings.entries if entry.path[0] not in {*names, *CALL_SETTINGS}]
+    old = [entry for entry in existing.settings.entries if entry.path[0] not in {*names, *CALL_SETTINGS}]
     new = [entry for entry in asked.entries if entry.path[0] not in names]
     return Settings((*old, *new, *joined))
 
 
-def differences(held: ExistingRun, now: Request) -> tuple[list[str], list[str]]:
+def differences(existing: ExistingRun, now: Request) -> tuple[list[str], list[str]]:
     """Clauses on the names and on the values in which the request of the run in a folder differs from ``now``.
 
     Empty if the same command was given again; requests that differ only in names may be merged in one run.
     """
     names: list[str] = []
-    if held.record is None and not held.is_known:
+    if existing.record is None and not existing.is_known:
         return names, []
     for noun, name in (("scene", "scenes"), ("method", "methods"), ("protocol", "protocols")):
-        before = held.asked(name) if held.record is None else _names(held.record, name)
-        after = getattr(now, name) if held.record is not None else tuple(map(str, now.values[(name,)]))
+        before = existing.asked(name) if existing.record is None else _names(existing.record, name)
+        after = getattr(now, name) if existing.record is not None else tuple(map(str, now.values[(name,)]))
         if gone := [one for one in before if one not in after]:
             names.append(f"{_some(noun, gone)} not requested now")
         if new := [one for one in after if one not in before]:
             names.append(f"{_some(noun, new)} new")
-    return names, _changed_values(held, now) if held.is_known else []
+    return names, _changed_values(existing, now) if existing.is_known else []
 
 
 def _names(record: RunRecord, name: str) -> tuple[str, ...]:
@@ -156,9 +156,9 @@ def _some(noun: str, names: Sequence[str]) -> str:
     return f"{noun} {shown_names} is" if len(names) == 1 else f"{noun}s {shown_names} are"
 
 
-def _changed_values(held: ExistingRun, now: Request) -> list[str]:
+def _changed_values(existing: ExistingRun, now: Request) -> list[str]:
     """``seed was 0, now 1`` for every value that differs and affects numbers."""
-    old, new = held.values, now.values
+    old, new = existing.values, now.values
     parts = {path[:2] for path in old if len(path) > 2} & {path[:2] for path in new if len(path) > 2}
     clauses = []
     for path in dict.fromkeys([*new, *old]):
@@ -166,7 +166,7 @@ def _changed_values(held: ExistingRun, now: Request) -> list[str]:
             continue
         if path[0] in ("method", "dataset") and (path[:2] not in parts or path[2:] == ("stride",)):
             continue
-        if not _counts(path, new) or _is_same(path, old.get(path), new.get(path), held):
+        if not _counts(path, new) or _is_same(path, old.get(path), new.get(path), existing):
             continue
         clauses.append(
             f"{printable('.'.join(path), 120)} was {_shown(path, old.get(path))}, now {_shown(path, new.get(path))}"
@@ -183,11 +183,11 @@ def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
     return not ".".join(path).startswith(NOT_IN_KEY)
 
 
-def _is_same(path: KeyPath, before: Any, after: Any, held: ExistingRun) -> bool:
+def _is_same(path: KeyPath, before: Any, after: Any, existing: ExistingRun) -> bool:
     if path == ("anytime",):
         return sorted(set(before or ())) == sorted(set(after or ()))
     if path == ("profile",) and "auto" in (before, after):  # which resolved to the named one
-        came_out = None if held.record is None else held.record.profile
+        came_out = None if existing.record is None else existing.record.profile
         return before == after or came_out in (before, after)
     return bool(_plain(before) == _plain(after))
 
@@ -206,9 +206,9 @@ def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
     return values.get(("stride",)) or values.get(("method", method, "stride"), 1)
 
 
-def check_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
+def check_request(existing: ExistingRun, now: Request, into: Into, where: str) -> None:
     """A ``StoreError`` if the run at ``where`` differs from ``now``: it names the differences and the options."""
-    names, values = differences(held, now)
+    names, values = differences(existing, now)
     if into == "extend":  # new names are the purpose of an extension
         names = [clause for clause in names if not clause.endswith(" new")]
     if into == "replace" or not (names or values):

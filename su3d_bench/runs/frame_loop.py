@@ -21,7 +21,7 @@ from su3d_bench.core.safe_output import one_line, plain_text
 from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors import Event, Report
-from su3d_bench.runs.plugins import told
+from su3d_bench.runs.plugins import attribute_of
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.records import updates_text
 
@@ -217,8 +217,8 @@ class MethodFeed:
             method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3
         own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
-        of_method: Row = {name: int(told(method, name)) for name in SIZES if hasattr(method, name)}
-        of_method |= told(method, "losses", {})
+        of_method: Row = {name: int(attribute_of(method, name)) for name in SIZES if hasattr(method, name)}
+        of_method |= attribute_of(method, "losses", {})
         of_method |= {"rss_bytes": memory_bytes()}
         of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
         # Values measured here take precedence over values of the method with the same name.
@@ -231,7 +231,7 @@ class MethodFeed:
             prediction = self._method.finish()
         spent = self._clock.take("finish")
         write_prediction(path, prediction)
-        costs = told(self._method, "finish_costs", {})
+        costs = attribute_of(self._method, "finish_costs", {})
         own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
         self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 

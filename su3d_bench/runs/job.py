@@ -23,7 +23,7 @@ from su3d_bench.metrics.semantic.panoptic import visible_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
-from su3d_bench.runs.plugins import checked_dataset, checked_method, made, settings_model, told
+from su3d_bench.runs.plugins import attribute_of, checked_dataset, checked_method, made, settings_model
 from su3d_bench.store.records import CompletionRecord
 from su3d_bench.store.run_folder import JobFolder
 
@@ -74,10 +74,10 @@ def as_configured(
         truth = truth.by_first_synonym()
     if not isinstance(method, UsesGroundTruth) or not isinstance(truth, GroundTruth):
         return prediction
-    told = visible_truth(rules, truth)
-    if told is truth and truth.labels == first():
+    visible = visible_truth(rules, truth)
+    if visible is truth and truth.labels == first():
         return prediction
-    method.receive_ground_truth(told)
+    method.receive_ground_truth(visible)
     recomputed: Prediction = method.finish()
     return recomputed
 
@@ -162,7 +162,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
-    key |= {f"input.{name}": digest for name, digest in told(method, "inputs", {}).items()}
+    key |= {f"input.{name}": digest for name, digest in attribute_of(method, "inputs", {}).items()}
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
         if digest := custom_code_key(target):
             key[f"code.{kind}"] = digest
@@ -260,7 +260,7 @@ class JobInputs:
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
     """The note shown with every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = told(method, "caveat", None)
+    own = attribute_of(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
     is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)

@@ -180,11 +180,11 @@ def checked_method(method: Any) -> Any:
     """``method``; the return values of a user-defined one are checked from now on."""
     if is_built_in(type(method)):
         return method
-    told(method, "needs")
+    attribute_of(method, "needs")
     return _watched(method, "method")
 
 
-def told(method: Any, name: str, without: Any = None) -> Any:
+def attribute_of(method: Any, name: str, without: Any = None) -> Any:
     """The property ``name`` of a method; ``without`` if it has none."""
     value = getattr(method, name, without)
     if not is_built_in(type(method)) and hasattr(method, name):

@@ -55,9 +55,9 @@ def _remarks(job: SceneJob) -> Remarks:
     try:
         reading = [part for part in job.methods if build_method(part).needs.frames]
         for part in reading:
-            said = RunFolder(job.folder).job(job.scene, part.name).remarks("predict").get(REMARK)
-            if said is not None:
-                return tuple(map(str, said)), False
+            remark = RunFolder(job.folder).job(job.scene, part.name).remarks("predict").get(REMARK)
+            if remark is not None:
+                return tuple(map(str, remark)), False
         dataset = build_dataset(job.dataset, job.data_root)
         if not reading or getattr(dataset, "renders_frames", False):
             return NOTHING

@@ -33,27 +33,27 @@ class FinishedScenes:
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
         """The outcomes of a scene, the one of the ceiling last; None if a worker is needed, even to report an error."""
         folders = [RunFolder(job.folder).job(job.scene, part.name) for part in job.parts]
-        completed = [folder.completion_records() for folder in folders]
-        if any("predict" not in completion or "score" not in completion for completion in completed):
+        steps = [folder.completion_records() for folder in folders]
+        if any("predict" not in completion or "score" not in completion for completion in steps):
             return None
         try:
             with silent():
-                outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, completed, strict=True)]
+                outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, steps, strict=True)]
         except Exception:  # noqa: BLE001 - a plug-in may raise anything; the worker reports it
             return None
         return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 
     def _outcome(
-        self, job: SceneJob, part: Part, folder: JobFolder, completed: Mapping[str, CompletionRecord]
+        self, job: SceneJob, part: Part, folder: JobFolder, steps: Mapping[str, CompletionRecord]
     ) -> MethodOutcome | None:
         inputs = self.inputs(job, part)
         if inputs is None:
             return None
         key = inputs.predict_key()
-        is_done = folder.is_whole(completed["predict"], key)
-        if not is_done or not inputs.is_scored(folder, completed["score"], inputs.score_key(key, folder)):
+        is_done = folder.is_whole(steps["predict"], key)
+        if not is_done or not inputs.is_scored(folder, steps["score"], inputs.score_key(key, folder)):
             return None
-        return inputs.outcome(completed["score"].remarks, was_resumed=True)
+        return inputs.outcome(steps["score"].remarks, was_resumed=True)
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """The inputs that determine the numbers of a job; None if only a worker can determine them."""

@@ -140,8 +140,8 @@ def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str 
     if rules.confidence != "prediction":
         what = "1 for every instance" if rules.confidence == "ones" else "similarity to the query"
         return f"{what}, by the protocol"
-    said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
-    are_equal = EVERY_SCENE in said or said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
+    named = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
+    are_equal = EVERY_SCENE in named or named >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
     return "the same for all instances of a scene" if are_equal else COMPUTED_BY_METHOD
 
 

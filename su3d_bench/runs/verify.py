@@ -28,11 +28,11 @@ def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
     return run.rules(protocol, to_the_letter=True)
 
 
-def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
-    """The first value of ``said`` that differs from the counts or is missing; None if all follow from the counts."""
-    if set(said.scenes) != set(counted.scenes):
-        return f"it has {len(said.scenes)} scenes, the counts {len(counted.scenes)}"
-    record, numbers = plain(said), counted.to_json()
+def contradiction(stated: NumbersRecord, counted: ProtocolResult) -> str | None:
+    """The first value of ``stated`` that differs from the counts or is missing; None if all follow from the counts."""
+    if set(stated.scenes) != set(counted.scenes):
+        return f"it has {len(stated.scenes)} scenes, the counts {len(counted.scenes)}"
+    record, numbers = plain(stated), counted.to_json()
     for table in CHECKED_FIELDS:
         known = dict(flatten(numbers[table]))
         for where, value in flatten(record[table]):
@@ -40,15 +40,16 @@ def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
                 shown = _shown(known[where]) if where in known else "nothing"
                 return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
     for name in counted.headline:
-        rows = {"metrics": said.metrics, **{f"per_scene.{scene}": said.per_scene.get(scene) for scene in said.scenes}}
+        of_scenes = {f"per_scene.{scene}": stated.per_scene.get(scene) for scene in stated.scenes}
+        rows = {"metrics": stated.metrics, **of_scenes}
         lacking = next((where for where, row in rows.items() if row is None or name not in row), None)
         if lacking is not None:
             return f"{lacking} has no {name}"
     return None
 
 
-def _agree(said: float | None, known: float | None) -> bool:
-    return said is known if said is None or known is None else abs(said - known) <= ROUNDING
+def _agree(stated: float | None, known: float | None) -> bool:
+    return stated is known if stated is None or known is None else abs(stated - known) <= ROUNDING
 
 
 def _shown(value: float | None) -> str:

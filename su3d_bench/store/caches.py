@@ -27,9 +27,9 @@ def kernel_folders() -> tuple[Path, ...]:
 
     As in numba.core.caching, Numba 0.68.
     """
-    told = os.environ.get("NUMBA_CACHE_DIR")
+    configured = os.environ.get("NUMBA_CACHE_DIR")
     own = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "numba").expanduser()
-    return (*([Path(told)] if told else []), PACKAGE_ROOT / "numerics" / "__pycache__", own)
+    return (*([Path(configured)] if configured else []), PACKAGE_ROOT / "numerics" / "__pycache__", own)
 
 
 def cache_warning() -> str | None:
@@ -107,13 +107,13 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
 
     Folders stay, because a run may be about to write there; files locked by a running process stay too.
     """
-    top, held = root / kind.name, dict[str, bool]()
+    top, state = root / kind.name, dict[str, bool]()
     n_files = n_bytes = 0
     for entry in cache_entries(root, kind):
         run = entry.name.partition("/")[0]
-        if kind.name == "runs" and run not in held:
-            held[run] = is_locked(top / run)
-        if entry.written >= before or held.get(run, False):
+        if kind.name == "runs" and run not in state:
+            state[run] = is_locked(top / run)
+        if entry.written >= before or state.get(run, False):
             continue
         remove_file(top / entry.name)
         n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes

@@ -262,12 +262,12 @@ class JobFolder:
         Fields in ``known_later`` are not compared.
         """
         completion = self.completion_records().get(step)
-        sealed = {} if completion is None else completion.key
-        if not sealed or (key.items() <= sealed.items() and sealed.keys() - key.keys() <= set(known_later)):
+        key_before = {} if completion is None else completion.key
+        if not key_before or (key.items() <= key_before.items() and key_before.keys() - key.keys() <= set(known_later)):
             return None
-        for name in [*key, *(name for name in sealed if name not in key)]:
-            if name not in known_later and sealed.get(name) != key.get(name):
-                return f"{name} was {sealed.get(name, 'not set')}, now {key.get(name, 'not set')}"
+        for name in [*key, *(name for name in key_before if name not in key)]:
+            if name not in known_later and key_before.get(name) != key.get(name):
+                return f"{name} was {key_before.get(name, 'not set')}, now {key.get(name, 'not set')}"
         return None
 
     def is_done(self, step: str, key: Mapping[str, str]) -> bool:

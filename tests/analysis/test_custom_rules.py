@@ -89,8 +89,8 @@ CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 def test_changed_rules_in_run_json_are_an_error(change: str, made: Path, tmp_path: Path) -> None:
     shutil.copytree(made / "first", tmp_path / "run")
     record = json.loads((tmp_path / "run/run.json").read_text())
-    make, said = CHANGES[change]
+    make, printed = CHANGES[change]
     make(record["protocols"][1])
     (tmp_path / "run/run.json").write_text(json.dumps(record))
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=printed):
         read_run(tmp_path / "run").rules("mine-instance")

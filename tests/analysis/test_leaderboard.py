@@ -59,10 +59,10 @@ def test_rank_intervals_overlap_with_only_two_scenes(runs: Path, capsys: pytest.
 def test_ranks_come_from_scene_values_and_ceilings_have_none(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     board = leaderboard(runs).boards[0]
     far = [replace(one, of_scenes=tuple((one.values[0] or 0) + k / 100 for k in range(8))) for one in board]
-    told = [replace(far[0], is_ceiling=True, method="oracle")]
-    assert [one.ranks for one in ranked((*far, *told))] == [(1, 1), (2, 2), None]
+    answer = [replace(far[0], is_ceiling=True, method="oracle")]
+    assert [one.ranks for one in ranked((*far, *answer))] == [(1, 1), (2, 2), None]
     monkeypatch.setattr(su3d_bench.analysis.leaderboard, "MAX_RANKED", 1)
-    assert [one.ranks for one in ranked((*far, *told))] == [None] * 3
+    assert [one.ranks for one in ranked((*far, *answer))] == [None] * 3
 
 
 REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {

@@ -179,9 +179,9 @@ def test_steps_between_two_protocols_sum_to_the_difference_of_their_numbers(
     walk = RuleStepper.of(first, second, str(folder)).walk()
     is_exact = len(walk.steps) <= EXACT_STEPS
     assert walk.n_orders == (None if is_exact else N_ORDERS)
-    for rules, said in ((first, walk.start), (second, walk.end)):
+    for rules, printed in ((first, walk.start), (second, walk.end)):
         known = alone(rules, folder)
-        assert {name: known[name] for name in said} == pytest.approx(said, abs=1e-12)
+        assert {name: known[name] for name in printed} == pytest.approx(printed, abs=1e-12)
     for name in walk.start:
         parts = [step.adds[name] for step in walk.steps]
         assert math.fsum(part.share for part in parts) == pytest.approx(walk.end[name] - walk.start[name], abs=1e-12)

@@ -83,7 +83,7 @@ def test_rows_of_points_add_up_to_the_confusion_matrix_and_the_causes_of_the_run
         true = [row for row in rows if (row.method, row.kind) == (method, "true")]
         n_wrong = sum(row.n_points - (row.n_right or 0) for row in true)
         assert n_wrong == sum(cause.n for cause in explained.causes.values())
-        assert {row.error for row in true} - {""} <= {cause for cause, told in explained.causes.items() if told.n}
+        assert {row.error for row in true} - {""} <= {cause for cause, result in explained.causes.items() if result.n}
     lost = [row for row in rows if row.method == "collector" and row.kind == "true" and not row.n_right]
     assert lost and all(row.error and not row.is_hit_25 for row in lost)
     perfect = [row for row in rows if row.method == "oracle"]
@@ -120,8 +120,8 @@ def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
 def test_points_have_rows_by_predicted_name_and_by_true_object() -> None:
     rows = scored_by_hand([0] * 4 + [0, 1, 1, -1, 0, 0])
     names = ("kind", "instance", "row", "class_name", "name", "n_points", "n_right", "matched", "is_hit_50")
-    told = [tuple(getattr(row, name) for name in names) for row in rows]
-    assert told == [
+    result = [tuple(getattr(row, name) for name in names) for row in rows]
+    assert result == [
         ("predicted", 70, 0, "chair", "a", 4, 4, 4, True),
         ("predicted", 70, 0, "lamp", "a", 1, 0, 4, False),
         ("predicted", 80, 1, "lamp", "b", 2, 1, None, False),  # IoU 1/3 with the lamp points, which have no number
@@ -150,8 +150,8 @@ def test_samples_command_has_one_row_per_instance(
     assert [row["best_iou"] for row in written] == [repr(row.best_iou) for row in rows]
     assert json.loads((tmp_path / "rows.json").read_text())[0]["scene"] == "painted/a"
     assert main(["report", "samples", str(run), "--methods", "oracle", "--scenes", "painted/b"]) == 0
-    told = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert {(row["method"], row["scene"]) for row in told} == {("oracle", "painted/b")}
+    result = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert {(row["method"], row["scene"]) for row in result} == {("oracle", "painted/b")}
 
 
 def test_parquet_has_the_same_rows_and_column_descriptions(run: Path, tmp_path: Path) -> None:

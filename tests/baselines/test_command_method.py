@@ -181,10 +181,10 @@ def test_only_allowed_variables_reach_the_program(
     one = method(tmp_path, text, pass_variables=("MY_MODEL",))
     one.finish()
     one.close()
-    told = next(record.getMessage() for record in caplog.records if record.getMessage().startswith("stdout"))
-    assert "MY_MODEL" in told
-    assert "SECRET_TOKEN" not in told
-    assert "PATH" not in told
+    result = next(record.getMessage() for record in caplog.records if record.getMessage().startswith("stdout"))
+    assert "MY_MODEL" in result
+    assert "SECRET_TOKEN" not in result
+    assert "PATH" not in result
 
 
 def test_placeholders_are_filled_without_a_shell(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -317,8 +317,8 @@ np.savez(sys.argv[1] + "/prediction.npz", kind="Partition", points=points, insta
     words += ["--protocols", "rooms-semantic", "--out", str(out), "--jobs", "1"]
     words += ["--set", f'command.command=["{sys.executable}", "{path}", "{{output}}"]']
     assert main(words) == 0, capsys.readouterr().err
-    told = json.loads((out / "metrics.json").read_text())
-    assert told["results"][0]["method"] == "command"
+    result = json.loads((out / "metrics.json").read_text())
+    assert result["results"][0]["method"] == "command"
     job = out / "scenes" / "painted.a" / "command"
     assert "stderr: hello from the program" in (job / "log.txt").read_text()
     assert "peak memory" in (job / "log.txt").read_text()

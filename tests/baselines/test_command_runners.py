@@ -91,8 +91,9 @@ def test_docker_gets_read_only_frames_and_no_network(tmp_path: Path, monkeypatch
     volumes = [words[i + 1] for i, word in enumerate(words) if word == "--volume"]
     assert volumes[0].endswith("/frames:/su3d/frames:ro")
     assert volumes[3] == "/data/weights:/weights:ro"
-    told = [words[i + 1] for i, word in enumerate(words) if word == "--env"]
-    assert told == ["MY_MODEL", *(f"SU3D_{name}" for name in ("FRAMES", "OUTPUT", "WORK", "SCENE", "DATASET", "SEED"))]
+    result = [words[i + 1] for i, word in enumerate(words) if word == "--env"]
+    known = [f"SU3D_{name}" for name in ("FRAMES", "OUTPUT", "WORK", "SCENE", "DATASET", "SEED")]
+    assert result == ["MY_MODEL", *known]
     assert words[words.index("--network") + 1] == "none"
     assert words[words.index("--user") + 1] == f"{os.getuid()}:{os.getgid()}"
     assert words[words.index("--gpus") + 1] == "all"

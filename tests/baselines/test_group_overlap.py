@@ -56,9 +56,9 @@ def patch(n_x: int, n_y: int, x: int = 0, y: int = 0) -> Float64Array:
 def nearest_by_brute_force(queries: Float64Array, points: Float64Array, radius_m: float) -> list[tuple[int, int]]:
     """Pairs by brute force in float32; the first in a tie, the radius itself is too far."""
     pairs = []
-    held = points.astype(np.float32)
+    contents = points.astype(np.float32)
     for i, query in enumerate(queries.astype(np.float32)):
-        offset = query - held
+        offset = query - contents
         squared = offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1] + offset[:, 2] * offset[:, 2]
         best = int(np.argmin(squared))
         if np.sqrt(squared[best]) < np.float32(radius_m):

@@ -83,18 +83,18 @@ def llm(server: ChatServer, *more: str) -> list[str]:
 
 def test_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "ask", SCENE, "Which sink is closer to bed?"]) == 0
-    said = capsys.readouterr()
-    assert said.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
+    printed = capsys.readouterr()
+    assert printed.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
     picture = job.pictures / "ask-which-sink-is-closer-to-bed.png"
-    assert f"picture: {picture}" in said.err
+    assert f"picture: {picture}" in printed.err
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_undetermined_answer_is_reported_and_not_drawn(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "ask", SCENE, "I am cold, what should I do?", "--out", "x.png"]) == 0
-    said = capsys.readouterr()
-    assert said.out.startswith("I cannot settle this: ")
-    assert "x.png: not drawn" in said.err
+    printed = capsys.readouterr()
+    assert printed.out.startswith("I cannot settle this: ")
+    assert "x.png: not drawn" in printed.err
     assert not Path("x.png").exists()
 
 
@@ -162,9 +162,9 @@ def test_invalid_input_is_a_one_line_error(
     job: JobFolder, capsys: pytest.CaptureFixture[str], words: str, line: str
 ) -> None:
     assert main(shlex.split(words)) == 2
-    said = capsys.readouterr().err
-    assert line in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert line in printed
+    assert printed.count("\n") == 1
 
 
 def test_missing_api_key_is_a_one_line_error(
@@ -178,13 +178,13 @@ def test_missing_api_key_is_a_one_line_error(
 @pytest.mark.usefixtures("undrawn")
 def test_ask_uses_refined_labels_by_vote(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["runs", "refine", "runs/made"]) == 0
-    said = capsys.readouterr().out
-    assert "rooms/made: 4 instances, 2 names changed" in said
-    assert "10  bed -> sofa" in said
-    assert "30  sink -> basin" in said
+    printed = capsys.readouterr().out
+    assert "rooms/made: 4 instances, 2 names changed" in printed
+    assert "10  bed -> sofa" in printed
+    assert "30  sink -> basin" in printed
     assert main(["query", "ask", SCENE, "Where is the sofa?", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["object_ids"], told["names"]) == ([10], "labels n' by vote")
+    result = json.loads(capsys.readouterr().out)
+    assert (result["object_ids"], result["names"]) == ([10], "labels n' by vote")
     assert main(["query", "ask", SCENE, "Where is the sofa?", "--names", "label"]) == 0
     assert "I cannot settle this" in capsys.readouterr().out
 
@@ -195,9 +195,9 @@ def test_refined_labels_by_a_model_are_requested_once(
     server.answer = lambda body: Answered("I'm sorry." if "basin" in body["messages"][1]["content"] else "furniture")
     words = ["runs", "refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
     assert main(words) == 0
-    said = capsys.readouterr()
-    assert "10  bed -> furniture" in said.out
-    assert "label n unchanged for 1 instance: the model refused" in said.err
+    printed = capsys.readouterr()
+    assert "10  bed -> furniture" in printed.out
+    assert "label n unchanged for 1 instance: the model refused" in printed.err
     records = (job.path / "refined_names.json").read_bytes()
     assert server.n_asked == 4
     assert main([*words, "--offline"]) == 0
@@ -213,9 +213,9 @@ def test_background_by_refined_label_is_excluded(
     assert main(words) == 0
     assert "30  excluded: 'tile wall' is background" in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "How many things are there?", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
-    assert told["names"] == "labels n' by tiny, without 1 excluded instance"
+    result = json.loads(capsys.readouterr().out)
+    assert (result["value"], result["object_ids"]) == (3, [10, 20, 40])
+    assert result["names"] == "labels n' by tiny, without 1 excluded instance"
     assert main([*words, "--background-names", "bed"]) == 0
     assert "excluded" not in capsys.readouterr().out
     assert main([*words, "--max-map-fraction", "0.05", "--json"]) == 0

@@ -46,7 +46,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return root
 
 
-def held(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
+def contents(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
     capsys.readouterr()
     assert main(["dev", "cache", "list", "--json"]) == 0
     return {row["kind"]: row["n_files"] for row in json.loads(capsys.readouterr().out)["kinds"]}
@@ -54,7 +54,7 @@ def held(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
 
 def test_cache_list_counts_every_kind_of_entry(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tuple(caches.KINDS) == KIND_NAMES
-    assert held(capsys) == {"perception": 1, "model-digests": 1, "runs": 2, "replies": 1}
+    assert contents(capsys) == {"perception": 1, "model-digests": 1, "runs": 2, "replies": 1}
     assert main(["dev", "cache", "list"]) == 0
     text = capsys.readouterr().out
     assert str(cache) in text
@@ -66,15 +66,15 @@ def test_cache_list_counts_every_kind_of_entry(cache: Path, capsys: pytest.Captu
 
 
 def test_clear_removes_cache_files_and_replies_only_by_name(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = held(capsys)
+    before = contents(capsys)
     assert main(["dev", "cache", "clear", "all", "--dry-run"]) == 0
     assert "perception: 1 file, 0.0 MB would be removed" in capsys.readouterr().out
-    assert held(capsys) == before
+    assert contents(capsys) == before
     assert main(["dev", "cache", "clear", "all"]) == 0
     assert "to remove them: su3d-bench dev cache clear replies" in capsys.readouterr().err
-    assert held(capsys) == {"perception": 0, "model-digests": 0, "runs": 0, "replies": 1}
+    assert contents(capsys) == {"perception": 0, "model-digests": 0, "runs": 0, "replies": 1}
     assert main(["dev", "cache", "clear", "replies"]) == 0
-    assert sum(held(capsys).values()) == 0
+    assert sum(contents(capsys).values()) == 0
     assert sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*") if path.is_file()) == sorted(FOREIGN)
 
 
@@ -104,7 +104,7 @@ def test_older_than_removes_only_old_files(cache: Path, capsys: pytest.CaptureFi
     assert main(["dev", "cache", "clear", "perception", "--older-than", "30"]) == 0
     assert capsys.readouterr().out == "perception: 1 file, 0.0 MB removed\n"
     assert not old.exists()
-    assert held(capsys)["perception"] == 1
+    assert contents(capsys)["perception"] == 1
     assert main(["dev", "cache", "clear", "perception", "--older-than", "-1"]) == 2
     assert "--older-than -1: expected a number of days" in capsys.readouterr().err
 
@@ -112,4 +112,4 @@ def test_older_than_removes_only_old_files(cache: Path, capsys: pytest.CaptureFi
 def test_locked_run_is_not_cleared(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunFolder(mirror_of("s3://bucket/run", cache)).locked():
         assert main(["dev", "cache", "clear", "runs"]) == 0
-    assert held(capsys)["runs"] == 2
+    assert contents(capsys)["runs"] == 2

@@ -34,7 +34,7 @@ def written(what: str, as_it_is: str, wrong: str) -> str:
     return text
 
 
-def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+def answer(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The only line on stderr of a call with exit code 2."""
     capsys.readouterr()
     assert main(words) == 2
@@ -64,10 +64,10 @@ METHODS = {
 
 @pytest.mark.parametrize("mistake", METHODS)
 def test_mistake_in_a_method_is_a_one_line_error(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
-    as_it_is, wrong, said = METHODS[mistake]
+    as_it_is, wrong, printed = METHODS[mistake]
     written("method", as_it_is, wrong)
-    line = told(["methods", "check", METHOD], capsys)
-    assert said in line
+    line = answer(["methods", "check", METHOD], capsys)
+    assert printed in line
     assert re.search(r"my_method\.py:\d+: ", line)
 
 
@@ -105,20 +105,20 @@ DATASETS = {
 
 @pytest.mark.parametrize("mistake", DATASETS)
 def test_mistake_in_a_dataset_is_a_one_line_error(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
-    as_it_is, wrong, said = DATASETS[mistake]
+    as_it_is, wrong, printed = DATASETS[mistake]
     written("dataset", as_it_is, wrong)
-    line = told(["datasets", "check", DATASET, "--quick"], capsys)
-    assert said in line
+    line = answer(["datasets", "check", DATASET, "--quick"], capsys)
+    assert printed in line
     assert re.search(r"my_dataset\.py:\d+: ", line)
 
 
 def test_run_reports_mistakes_in_a_dataset(capsys: pytest.CaptureFixture[str]) -> None:
-    as_it_is, wrong, said = DATASETS["unknown classes"]
+    as_it_is, wrong, printed = DATASETS["unknown classes"]
     written("dataset", as_it_is, wrong)
     words = ["run", "--scenes", DATASET, "--profile", "oracle", "--protocols", "rooms-instance", "--limit", "1"]
     assert main([*words, "--methods", "oracle", "opensu3d", "--jobs", "1", "--out", "out", "--no-pictures"]) in (2, 3)
     error = capsys.readouterr().err
-    assert said in error and re.search(r"my_dataset\.py:\d+: ", error)
+    assert printed in error and re.search(r"my_dataset\.py:\d+: ", error)
 
 
 def test_missing_file_of_a_dataset_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,7 +150,7 @@ def test_run_of_a_changed_file_is_not_resumed(capsys: pytest.CaptureFixture[str]
     Path("my_method.py").write_text(
         text.replace("least_points: int = 20", "least_points: int = 21").replace("< 0.5", "< 0.6")
     )
-    assert "contains a different run" in told(words, capsys)
+    assert "contains a different run" in answer(words, capsys)
 
 
 def test_custom_dataset_is_scored_under_all_fitting_protocols(capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,8 +168,8 @@ def test_ground_truth_without_a_fitting_protocol_is_reported(capsys: pytest.Capt
     Path("my_dataset.py").write_text(text.replace('"replica"', '"mine"'))
     words = ["run", "--scenes", DATASET, "--methods", "opensu3d", "--limit", "1", "--jobs", "1", "--no-pictures"]
     assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
-    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; create a custom one"
-    assert said in capsys.readouterr().err
+    printed = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; create a custom one"
+    assert printed in capsys.readouterr().err
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -220,10 +220,10 @@ def test_method_template_runs_on_the_built_in_rooms() -> None:
     ],
 )
 def test_new_overwrites_nothing_and_checks_the_suffix(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    words: list[str], printed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("there.py").write_text("mine")
     assert main(words) == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert Path("there.py").read_text() == "mine"
     assert len(list(Path().iterdir())) == 1

@@ -91,10 +91,10 @@ def test_finished_run_is_unchanged(slip: str, capsys: pytest.CaptureFixture[str]
     before = files_of("runs/demo")
     assert len(before) > 10
     assert main(shlex.split(words)) == code, capsys.readouterr().err
-    said = capsys.readouterr().err.splitlines()
+    printed = capsys.readouterr().err.splitlines()
     assert files_of("runs/demo") == before
-    assert not line or any(each.startswith(line) for each in (said if code == 0 else said[-1:])), said
-    assert code != 2 or len(said) == 1, said
+    assert not line or any(each.startswith(line) for each in (printed if code == 0 else printed[-1:])), printed
+    assert code != 2 or len(printed) == 1, printed
 
 
 def test_interrupted_extension_leaves_the_run_finished_and_can_be_resumed(

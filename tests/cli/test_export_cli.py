@@ -61,8 +61,8 @@ def test_run_is_exported_for_scannet(run_folder: str, capsys: pytest.CaptureFixt
     words = ["runs", "export", run_folder, "--to", "scannet", "--protocol", "rooms-instance"]
     capsys.readouterr()
     assert main([*words, "--method", "collector", "--out", "collector", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [row["scene"] for row in told["scenes"]] == ["painted/a", "painted/b"]
+    result = json.loads(capsys.readouterr().out)
+    assert [row["scene"] for row in result["scenes"]] == ["painted/a", "painted/b"]
     assert main([*words, "--method", "oracle", "--out", "oracle", "--scenes", "painted/b"]) == 0
     assert sorted(file.name for file in Path("oracle").glob("*.txt")) == ["b.txt"]
     found = read_text(Path("oracle"), "b")

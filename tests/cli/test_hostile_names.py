@@ -98,8 +98,8 @@ def poisoned_texts(run: Path) -> tuple[str, str]:
         if isinstance(value, dict):
             return {name: poison(item, name) for name, item in value.items()}
         if isinstance(value, list):
-            said = [HOSTILE, f"{SCENE}: {HOSTILE}"] if key == "warnings" else []
-            return [poison(item, key) for item in value] + said
+            message = [HOSTILE, f"{SCENE}: {HOSTILE}"] if key == "warnings" else []
+            return [poison(item, key) for item in value] + message
         return HOSTILE if key in ("hardware", "caveat", "encoder", "profile", "confidences", "python") else value
 
     for name in ("run.json", "metrics.json"):
@@ -230,12 +230,12 @@ def test_control_characters_and_markup_are_escaped(
         for words in cases:
             filled = [re.sub("RUN|SCENE|METHOD", lambda match: place[match[0]], word) for word in words]
             code = main([*verb.split(), *filled])
-            said = capsys.readouterr()
+            message = capsys.readouterr()
             where = f"{verb} {words}"[:120]
-            found = [*faults_of(said.out, is_commanding="--github" in words), *faults_of(said.err)]
+            found = [*faults_of(message.out, is_commanding="--github" in words), *faults_of(message.err)]
             faults += [f"{where}: printed {fault}" for fault in found]
             if code not in (0, 1, 2, 3):
-                faults.append(f"{where}: ended with {code}: {said.err}")
+                faults.append(f"{where}: ended with {code}: {message.err}")
     for file in (one for one in Path().rglob("*") if one.is_file() and one.suffix in (*TEXTS, ".markdown", ".latex")):
         if file.parts[0] == "out" or file.name == "log.txt" or file.parts[0].startswith("made"):
             faults += [f"{file}: {fault}" for fault in faults_of_file(file)]

@@ -18,7 +18,7 @@ SYSTEMS = (
 )
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+def result(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     capsys.readouterr()
     assert main(["methods", *words]) == 0
     return capsys.readouterr().out
@@ -27,7 +27,7 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_every_method_has_source_licence_needs_and_status(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    rows = {row["name"]: row for row in json.loads(told(capsys, "list", "--json"))}
+    rows = {row["name"]: row for row in json.loads(result(capsys, "list", "--json"))}
     assert tuple(rows)[: len(SYSTEMS)] == SYSTEMS
     for name in SYSTEMS:
         row = rows[name]
@@ -36,11 +36,11 @@ def test_every_method_has_source_licence_needs_and_status(
 
 
 def test_methods_show_lists_settings_and_published_results(capsys: pytest.CaptureFixture[str]) -> None:
-    text = told(capsys, "show", "conceptgraphs-detector")
+    text = result(capsys, "show", "conceptgraphs-detector")
     assert "[method.conceptgraphs-detector]" in text
     assert "# mAcc 38.72, F-mIoU 35.82: ConceptGraphs (Gu et al.), Table II" in text
     assert "# published results; set-ups differ, so they may not be comparable" in text
-    value = json.loads(told(capsys, "show", "conceptgraphs-detector", "--json"))
+    value = json.loads(result(capsys, "show", "conceptgraphs-detector", "--json"))
     assert len(value["published"]) == len(figures_of(method="conceptgraphs-detector"))
     assert value["settings"]
 
@@ -48,7 +48,7 @@ def test_methods_show_lists_settings_and_published_results(capsys: pytest.Captur
 def test_shown_settings_are_a_valid_configuration_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from su3d_bench.core.config import read_file
 
-    (tmp_path / "mine.toml").write_text(told(capsys, "show", "opensu3d"))
+    (tmp_path / "mine.toml").write_text(result(capsys, "show", "opensu3d"))
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
 
 

@@ -89,11 +89,11 @@ def test_check_reports_faults_with_exit_code_1(found: Path, capsys: pytest.Captu
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
     ],
 )
-def test_invalid_request_is_a_one_line_error(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_request_is_a_one_line_error(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err
+    assert line in err
     assert len(err.splitlines()) == 1
 
 

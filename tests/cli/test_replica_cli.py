@@ -25,9 +25,9 @@ def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def fault(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     """The one-line error of an invalid request."""
     assert main(words) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1
-    return said.err
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.count("\n") == 1
+    return printed.err
 
 
 def test_list_shows_datasets_folders_scenes_and_how_to_get_missing_ones(
@@ -64,9 +64,9 @@ def test_generated_room_is_a_replica_scene_and_repeating_the_command_does_nothin
 ) -> None:
     words = [*MAKE, "--layout", "replica", "--out", "made"]
     assert main(words) == 0
-    said = capsys.readouterr()
-    assert said.out.split() == ["bathroom0", "generated", "replica/bathroom0"]
-    assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in said.err
+    printed = capsys.readouterr()
+    assert printed.out.split() == ["bathroom0", "generated", "replica/bathroom0"]
+    assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in printed.err
     assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scenes"] == [

@@ -89,10 +89,10 @@ def test_remove_asks_for_confirmation_on_a_terminal(
 ) -> None:
     monkeypatch.setattr(sys, "stdin", Terminal(reply))
     assert main(["runs", "remove", "runs/one"]) == 0
-    said = capsys.readouterr()
-    assert said.err.startswith("runs/one: complete, 0.")
-    assert "MB, painted/a by collector\nremove permanently?" in said.err
-    assert said.out.startswith("nothing was removed" if is_there else "removed runs/one: complete")
+    printed = capsys.readouterr()
+    assert printed.err.startswith("runs/one: complete, 0.")
+    assert "MB, painted/a by collector\nremove permanently?" in printed.err
+    assert printed.out.startswith("nothing was removed" if is_there else "removed runs/one: complete")
     assert Path("runs/one").exists() == is_there
     assert sorted(os.listdir("runs")) == (["one", "two"] if is_there else ["two"])
 

@@ -61,8 +61,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("mistake", WRONG)
 def test_invalid_values_are_reported_by_name(mistake: str) -> None:
-    changed, said = WRONG[mistake]
+    changed, printed = WRONG[mistake]
     words: dict[str, Any] = {"points": POINTS, "masks": SETS, **changed}
     with pytest.raises(PredictionError) as error:
         Instances.of(words.pop("points"), words.pop("masks"), **words)
-    assert said in str(error.value)
+    assert printed in str(error.value)

@@ -30,12 +30,12 @@ def test_commands_at_line_starts_are_escaped(text: str) -> None:
 
 
 def test_unencodable_characters_are_escaped() -> None:
-    held = io.BytesIO()
-    stream = io.TextIOWrapper(held, encoding="ascii")
+    contents = io.BytesIO()
+    stream = io.TextIOWrapper(contents, encoding="ascii")
     door = SafeStream(stream)
     print("naïve", file=door)
     door.flush()
-    assert held.getvalue() == b"na\\xefve\n"
+    assert contents.getvalue() == b"na\\xefve\n"
 
 
 def test_escaped_json_reads_back_unchanged() -> None:
@@ -51,9 +51,9 @@ def test_logs_and_prints_of_libraries_are_escaped(capsys: pytest.CaptureFixture[
         print(HOSTILE, file=sys.stderr)
         print(HOSTILE)
         logging.lastResort.handle(logging.makeLogRecord({"msg": HOSTILE, "levelno": 30}))  # type: ignore[union-attr]
-    said = capsys.readouterr()
-    assert said.out.count("stop-commands") == 1 and said.err.count("stop-commands") == 2
-    assert not ACTS.search(said.out + said.err)
+    printed = capsys.readouterr()
+    assert printed.out.count("stop-commands") == 1 and printed.err.count("stop-commands") == 2
+    assert not ACTS.search(printed.out + printed.err)
 
 
 def test_writes_at_interpreter_exit_are_dropped(

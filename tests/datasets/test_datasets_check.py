@@ -72,8 +72,8 @@ def test_every_damaged_file_is_named(root: Path) -> None:
     (results / "frame000001.jpg").write_bytes((results / "frame000001.jpg").read_bytes()[:200])
     (results / "depth000004.png").write_bytes(b"no image")
     (results / "depth000006.png").write_bytes(b"")
-    said = " ".join(texts(look(root)))
-    assert all(name in said for name in ("frame000001.jpg", "depth000004.png", "depth000006.png"))
+    printed = " ".join(texts(look(root)))
+    assert all(name in printed for name in ("frame000001.jpg", "depth000004.png", "depth000006.png"))
     assert len(texts(look(root))) == 3
     assert look(root).n_read == N_FRAMES - 3
 
@@ -84,8 +84,8 @@ def test_wrong_depth_scale_is_an_error_with_a_suggested_factor(root: Path) -> No
     table["camera"]["scale"] = 1000.0
     path.write_text(json.dumps(table))
     found = look(root)
-    (said,) = [one.text for one in found.findings if one.check == "frame-of-reference"]
-    assert "with depth times 0.1526" in said
+    (printed,) = [one.text for one in found.findings if one.check == "frame-of-reference"]
+    assert "with depth times 0.1526" in printed
     table["camera"]["scale"] = 6.5535
     path.write_text(json.dumps(table))
     assert "depth-scale" in checks(look(root))
@@ -96,11 +96,11 @@ def test_cameras_outside_the_mesh_are_an_error(root: Path) -> None:
     for matrix in moved:
         matrix[:3, 3] += (50.0, 0.0, 0.0)
     write_poses(root / "Replica/room0", moved)
-    said = [one.text for one in look(root).findings if one.check == "frame-of-reference"]
-    assert said[0].startswith(
+    printed = [one.text for one in look(root).findings if one.check == "frame-of-reference"]
+    assert printed[0].startswith(
         "8 of 8 cameras lie outside the ground truth's box by more than 1 m, first frame 0 at (51.5"
     )
-    assert "only 0.0%" in said[1] and "the clouds do not overlap" in said[1]
+    assert "only 0.0%" in printed[1] and "the clouds do not overlap" in printed[1]
 
 
 def test_generated_rooms_have_no_findings(tmp_path: Path) -> None:

@@ -93,5 +93,7 @@ def test_command_writes_the_picture_and_prints_counts(capsys: pytest.CaptureFixt
 )
 def test_each_wrong_request_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["datasets", "show", *words]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1, said.err
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.startswith(f"su3d-bench: {message}") and printed.err.count("\n") == 1, (
+        printed.err
+    )

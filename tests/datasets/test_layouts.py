@@ -125,5 +125,5 @@ def test_command_makes_each_layout_and_repeating_it_does_nothing(
         {"scene": ROOM, "status": "already present", "address": address}
     ]
     assert main([*words, "--set", "n_frames=3"]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert printed.out == "" and printed.err.count("\n") == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluated_text import CHAIR, TABLE, document, feature_scene, numbers, said, scene, write_texts, write_truth
+from evaluated_text import CHAIR, TABLE, document, feature_scene, numbers, printed, scene, write_texts, write_truth
 from prediction_files import write_maskclustering, write_open3dis, write_scannet_text
 
 from su3d_bench.core.errors import ConfigError, PredictionError
@@ -127,7 +127,7 @@ def test_instance_numbers_that_restart_with_each_class_stay_separate_objects_as_
         assert not [line for line in found["warnings"] if "restart with each class" in line]
     melted = numbers(tmp_path, "class-agnostic-maskclustering")
     assert melted["metrics"]["ap50"] == 0.0
-    assert "so 2 of 3 objects merge with another" in said(melted, "scene0001_00: instance numbers restart")
+    assert "so 2 of 3 objects merge with another" in printed(melted, "scene0001_00: instance numbers restart")
 
 
 def test_features_need_the_protocols_encoder_or_a_text_feature_file(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_features_need_the_protocols_encoder_or_a_text_feature_file(tmp_path: Pa
     write_texts(tmp_path / "texts.npz", names, {"chair": 3, "table": 9})
     found = numbers(tmp_path, text_features=tmp_path / "texts.npz")
     assert found["metrics"]["ap"] == 1.0  # the mask without a feature is classified as wall, which is not scored
-    assert said(found, "labels come from the encoder 'of texts.npz', the protocol's is 'ViT-L-14-336")
+    assert printed(found, "labels come from the encoder 'of texts.npz', the protocol's is 'ViT-L-14-336")
     write_texts(tmp_path / "texts.npz", names, {"chair": 3, "table": 9}, encoder="ViT-L-14-336/openai")
     named = numbers(tmp_path, text_features=tmp_path / "texts.npz")
     assert named["metrics"] == found["metrics"]
@@ -164,7 +164,7 @@ def test_missing_scenes_are_skipped_with_a_warning_under_the_original_protocol(t
     found = numbers(tmp_path)
     assert found["metrics"]["ap"] == 1.0
     assert found["skipped_scenes"] == ["scene0001_01", "scene0002_00"]
-    assert said(found, "2 of 3 scenes have no prediction and are skipped, as in the original evaluator")
+    assert printed(found, "2 of 3 scenes have no prediction and are skipped, as in the original evaluator")
 
 
 def test_custom_protocol_counts_missing_scenes(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
-from evaluated_text import CHAIR, TABLE, numbers, said, scene, write_truth
+from evaluated_text import CHAIR, TABLE, numbers, printed, scene, write_truth
 from prediction_files import write_scannet_text
 
 from su3d_bench.core.errors import PredictionError
@@ -32,13 +32,13 @@ def test_empty_duplicate_and_foreign_masks_give_warnings_with_their_index(tmp_pa
     write_scannet_text(tmp_path / "pred", scene(masks, [5, 5, 5, 5, 1]))
     found = numbers(tmp_path)
     where = "scene0001_00: "
-    assert said(found, f"{where}1 empty mask, the first is mask 1 (masks/scene0001_00_1.txt)")
-    assert said(found, f"{where}1 pair of identical masks, the first is 0 (masks/scene0001_00_0.txt) and 2 (")
-    assert said(found, f"{where}2 pairs of near-duplicates, the first is 0 (masks/scene0001_00_0.txt) and 3 (")
-    assert "1 of class 1 (wall); the first is mask 4" in said(
+    assert printed(found, f"{where}1 empty mask, the first is mask 1 (masks/scene0001_00_1.txt)")
+    assert printed(found, f"{where}1 pair of identical masks, the first is 0 (masks/scene0001_00_0.txt) and 2 (")
+    assert printed(found, f"{where}2 pairs of near-duplicates, the first is 0 (masks/scene0001_00_0.txt) and 3 (")
+    assert "1 of class 1 (wall); the first is mask 4" in printed(
         found, f"{where}1 of 5 masks has a class that is not scored"
     )
-    assert said(found, "all confidences are 1")
+    assert printed(found, "all confidences are 1")
     assert found["duplicates"] == {"near": 3, "identical": 1}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated_text import said, write_texts
+from evaluated_text import printed, write_texts
 from painted_runs import PAINTED, painted_run
 from test_openlex3d_original import SAMPLED, metres, of_dataset, write_labels, write_objects
 
@@ -37,7 +37,7 @@ def test_oracle_scores_one_and_scenes_missing_from_a_run_count_as_missed(tmp_pat
     assert lost["rooms-instance"]["metrics"]["ap"] == 0.5  # half of the recall, precision 1
     assert lost["rooms-instance"]["missed_scenes"] == ["b"]
     assert lost["rooms-semantic"]["metrics"]["macc"] < 1
-    assert said(lost["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
+    assert printed(lost["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
     for name in ("prediction.npz", "."):  # each has only its scene, a folder of scenes has all
         assert found(run / "scenes/painted.a/oracle" / name)["rooms-instance"]["metrics"]["ap"] == 1.0
 
@@ -87,7 +87,7 @@ def test_openlex3d_queries_are_scored_against_its_release(tmp_path: Path, monkey
     one = found["protocols"]["openlex3d-queries"]
     assert one["per_scene"]["room0"]["ap25"] > 0
     assert one["ceiling"] is None
-    assert said(one, "the ground-truth ceiling is unknown: masks grow by the threshold")
+    assert printed(one, "the ground-truth ceiling is unknown: masks grow by the threshold")
     assert found["not_scored"]["replica-openmask3d"] == "is not meant for the labels of OpenLex3D"
     assert "visible" in found["not_scored"]["openlex3d-topn"]  # the cloud of visible points is not in this folder
     (tmp_path / "lex/replica/room0" / VISIBLE_NAME).write_text(header + tail)

@@ -224,8 +224,8 @@ def test_text_feature_file_names_features_and_is_needed_for_attribution(
     assert result.encoder == "theirs/v1" and result.result is not None
     explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
-    told = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
-    assert "made by encoder theirs/v1" in told and "only texts encoded by it can be compared with them" in told
+    reply = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
+    assert "made by encoder theirs/v1" in reply and "only texts encoded by it can be compared with them" in reply
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
     assert "texts.npz: is not the text features file used to score runs/mine" in answered(
         capsys, "report", "attribution", "runs/mine", code=2

@@ -59,9 +59,9 @@ def test_mask_has_several_labels_only_with_a_different_label() -> None:
     ],
 )
 def test_each_kind_of_protocol_states_its_number_of_labels(
-    name: str, by_features: bool, are_several: bool, said: str | None
+    name: str, by_features: bool, are_several: bool, printed: str | None
 ) -> None:
-    assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
+    assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == printed
 
 
 def test_masks_with_several_labels_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -115,9 +115,9 @@ def test_redirects_are_followed_only_to_allowed_hosts(server: FileServer, tmp_pa
         (Served(b"", redirect=f"/{NAME}"), "redirect"),
     ],
 )
-def test_each_server_refusal_is_a_one_line_error(server: FileServer, tmp_path: Path, served: Served, said: str) -> None:
+def test_each_server_refusal_is_a_one_line_error(server: FileServer, tmp_path: Path, served: Served, text: str) -> None:
     server.files[f"/{NAME}"] = served
-    with pytest.raises(DataError, match=said) as raised:
+    with pytest.raises(DataError, match=text) as raised:
         fetched(server, tmp_path / NAME, n_bytes=None, hosts=("127.0.0.1", "example.org"))
     assert "\n" not in str(raised.value) and not list(tmp_path.iterdir())
 

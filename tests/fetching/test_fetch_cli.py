@@ -38,8 +38,8 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServ
 def called(words: Sequence[object], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
     capsys.readouterr()
     code = main([str(word) for word in words])
-    said = capsys.readouterr()
-    return code, said.out, said.err
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
 
 
 def sam(server: FileServer, tmp_path: Path, content: bytes = b"weights" * 500) -> Path:
@@ -102,15 +102,15 @@ def test_damaged_download_is_never_used_as_a_model_and_is_resumed(
         (Served(content, redirect=f"{server.other_host}/store"), "host 'localhost' is not allowed for it"),
         (Served(content + b"grown"), "the file has changed"),
     ]
-    for served, said in cases:
+    for served, printed in cases:
         server.files[f"/{SAM}"] = served
         code, out, err = called([*words, "--quiet"], capsys)
-        assert (code, out, len(err.splitlines())) == (2, "", 1) and said in err
+        assert (code, out, len(err.splitlines())) == (2, "", 1) and printed in err
         assert not place.exists() and not (tmp_path / "models/sam-vit-h").exists()
     server.files[f"/{SAM}"] = Served(content)
-    held = hold_folder(place.parent)
+    contents = hold_folder(place.parent)
     assert "another process is fetching it" in called(words, capsys)[2]
-    os.close(held)
+    os.close(contents)
     assert called(words, capsys)[0] == 0
     assert (tmp_path / "models/sam-vit-h" / SAM).read_bytes() == content
 
@@ -310,7 +310,7 @@ def test_error_without_script_or_link_explains_terms(server: FileServer, capsys:
     code, _, err = called(["datasets", "fetch", "scannet"], capsys)
     assert code == 2 and "ScanNet_TOS.pdf and send it to scannet@googlegroups.com" in err
     assert len(err.splitlines()) == 1
-    for words, said in [
+    for words, printed in [
         (["datasets", "fetch", "scannet", "scene0"], "unknown scan 'scene0'"),
         (["datasets", "fetch", "scannet", "--script", "none.py", "--accept", "scannet"], "no such file; give"),
         (
@@ -319,7 +319,7 @@ def test_error_without_script_or_link_explains_terms(server: FileServer, capsys:
         ),
     ]:
         code, _, err = called(words, capsys)
-        assert code == 2 and said in err, err
+        assert code == 2 and printed in err, err
 
 
 def test_damaged_table_or_record_is_a_one_line_error(

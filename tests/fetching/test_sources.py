@@ -46,6 +46,6 @@ def test_every_fact_has_a_reference_and_every_file_uses_https() -> None:
         ("https://hf.co.example.org/a", "is not allowed for it"),
     ],
 )
-def test_unsafe_address_is_rejected(address: str, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_unsafe_address_is_rejected(address: str, printed: str) -> None:
+    with pytest.raises(ValueError, match=printed):
         check_address(address, ["huggingface.co", "*.hf.co"])

@@ -74,8 +74,8 @@ def test_only_wanted_members_are_unpacked(tmp_path: Path, form: str) -> None:
         (["."], "a file without a name"),
     ],
 )
-def test_member_outside_the_folder_is_an_error(tmp_path: Path, form: str, names: list[str], said: str) -> None:
-    with pytest.raises(DataError, match=said):
+def test_member_outside_the_folder_is_an_error(tmp_path: Path, form: str, names: list[str], printed: str) -> None:
+    with pytest.raises(DataError, match=printed):
         unpacked(packed(tmp_path, form, [(name, b"x") for name in names]), tmp_path / "out")
     assert not (tmp_path / "out.txt").exists()
 

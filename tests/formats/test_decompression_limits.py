@@ -122,9 +122,9 @@ def test_torch_archive_with_a_pickle_bomb_is_rejected(tmp_path: Path) -> None:
         (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # memoised again and again
     ],
 )
-def test_gzipped_pickle_bomb_is_rejected(tmp_path: Path, first: bytes, n: int, byte: int, told: str) -> None:
+def test_gzipped_pickle_bomb_is_rejected(tmp_path: Path, first: bytes, n: int, byte: int, result: str) -> None:
     path = kept(tmp_path, "a.pkl.gz", gzip_of(first, n, byte, b"."))
-    assert told in refused(lambda: read_pickle_file(path), PredictionError)
+    assert result in refused(lambda: read_pickle_file(path), PredictionError)
 
 
 def a_map_of_one_cloud(n_objects: int) -> bytes:
@@ -144,8 +144,8 @@ def test_objects_that_share_one_cloud_count_once_per_reference(tmp_path: Path) -
     path.write_bytes(gzip.compress(a_map_of_one_cloud(3), 1))
     assert len(READERS["conceptgraphs"].read(path, "pcd_x").content.points) == 300_000  # type: ignore[union-attr]
     path.write_bytes(gzip.compress(a_map_of_one_cloud(2_000), 1))
-    said = refused(lambda: READERS["conceptgraphs"].read(path, "pcd_x"), PredictionError)
-    assert "unpacks to more than" in said
+    printed = refused(lambda: READERS["conceptgraphs"].read(path, "pcd_x"), PredictionError)
+    assert "unpacks to more than" in printed
 
 
 @pytest.mark.parametrize(
@@ -172,8 +172,8 @@ def test_run_length_masks_have_a_total_limit(n: int, tmp_path: Path) -> None:
     for k in range(8):
         (tmp_path / f"{k}.json").write_text(f'{{"length": 100000000, "counts": "1 {MAX_MEMBERS // 4}"}}')
     (tmp_path / "scene0001_00.txt").write_text("".join(f"{k}.json 3 1.0\n" for k in range(8)))
-    said = refused(lambda: READERS["scannet-text"].read(tmp_path, "scene0001_00"), PredictionError)
-    assert "points in total" in said
+    printed = refused(lambda: READERS["scannet-text"].read(tmp_path, "scene0001_00"), PredictionError)
+    assert "points in total" in printed
 
 
 def test_member_is_read_completely_and_its_checksum_is_verified(tmp_path: Path) -> None:

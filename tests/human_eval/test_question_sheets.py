@@ -67,9 +67,9 @@ def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource)
     assert max(Counter(one.question_kind for one in drafts).values()) == 2
     assert {one.question_kind for one in made} == {"instance", "property by name"}
     true = generate_questions(painted_objects(), n_each=2)
-    told = ["no" if one.answer.value is False else re.sub(r" #\d+", "", one.answer.text) for one in true]
+    result = ["no" if one.answer.value is False else re.sub(r" #\d+", "", one.answer.text) for one in true]
     assert [one.text for one in reasoned] == [
-        f"{one.text}\nAnswer: {words}" for one, words in zip(true, told, strict=True)
+        f"{one.text}\nAnswer: {words}" for one, words in zip(true, result, strict=True)
     ]
     assert len({one.question_id for one in drafts}) == len(drafts)
     for text, one in asked.items():
@@ -87,10 +87,10 @@ def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource)
 def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--annotators", "2", "--overlap", "1", "--out", "out", "--json"]) == 0
-    (told,) = json.loads(capsys.readouterr().out)["sets"]
+    (result,) = json.loads(capsys.readouterr().out)["sets"]
     sheet, key = read_sheet(Path("out/sheet.json")), read_key(Path("out-key/key.json"))
     check_key(sheet, key)
-    assert told["kind"] == sheet.kind == "questions" and told["n_questions"] == 3 * len(sheet.items)
+    assert result["kind"] == sheet.kind == "questions" and result["n_questions"] == 3 * len(sheet.items)
     assert [len(share.item_ids) for share in sheet.annotators] == [len(sheet.items)] * 2
     assert key.methods[-1] == ANY_KIND and set(key.methods[:-1]) == {one.question_kind for one in key.items}
     page = Path("out/annotator-1/sheet.html").read_text()
@@ -121,12 +121,12 @@ ANN = ((RIGHT,) * 3, (RIGHT, ARGUABLE, RIGHT), (RIGHT, RIGHT, WRONG), (RIGHT,) *
 BOB = ((RIGHT,) * 3, (RIGHT, ARGUABLE, RIGHT), (RIGHT, RIGHT, WRONG), (ARGUABLE, RIGHT, WRONG))
 
 
-def judgements(sheet: Sheet, **said: Sequence[tuple[str, str, str]]) -> list[Judgement]:
+def judgements(sheet: Sheet, **printed: Sequence[tuple[str, str, str]]) -> list[Judgement]:
     return [
         Judgement(item.id, who, ask, answer)
         for k, item in enumerate(sheet.items)
         for place, ask in enumerate(PARTS)
-        for who, of_items in said.items()
+        for who, of_items in printed.items()
         for answer in [of_items[k][place]]
     ]
 

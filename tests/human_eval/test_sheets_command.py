@@ -40,7 +40,7 @@ def server(chat: ChatServer) -> ChatServer:
     return chat
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, Any]]:
+def result(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, Any]]:
     capsys.readouterr()
     assert main(["sheets", "make", "run", "--json", *words]) == 0
     found: list[dict[str, Any]] = json.loads(capsys.readouterr().out)["sets"]
@@ -53,9 +53,9 @@ def asked(server: ChatServer, *more: str) -> list[str]:
 
 
 def test_each_kind_has_a_folder_equal_to_a_single_kind_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    both = told(capsys, "--kind", "annotation", "reasoning", "--per-kind", "2", "--out", "all", "--jobs", "1")
+    both = result(capsys, "--kind", "annotation", "reasoning", "--per-kind", "2", "--out", "all", "--jobs", "1")
     assert [one["kind"] for one in both] == ["annotation", "reasoning"]
-    (alone,) = told(capsys, "--kind", "annotation", "--per-kind", "2", "--out", "alone")
+    (alone,) = result(capsys, "--kind", "annotation", "--per-kind", "2", "--out", "alone")
     for name in ("sheet.json", "annotator-1/sheet.csv", "annotator-1/sheet.html", "annotator-1/sheet.xlsx"):
         assert (folder / "all" / "annotation" / name).read_bytes() == (folder / "alone" / name).read_bytes()
     assert alone["sheet_id"] == both[0]["sheet_id"] == read_key(folder / "all-key" / "annotation" / "key.json").sheet_id
@@ -68,12 +68,12 @@ def test_each_kind_has_a_folder_equal_to_a_single_kind_run(folder: Path, capsys:
 def test_language_model_replies_to_reasoning_sheets_are_stored(
     folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (first,) = told(capsys, *asked(server))
+    (first,) = result(capsys, *asked(server))
     sheet, key = read_sheet(folder / "out" / "sheet.json"), read_key(folder / "out-key" / "key.json")
     assert {one.text for one in sheet.items} == {f"{QUESTION}\nAnswer: There is 1 chair."}
     assert key.answered_by == "tiny" and "tiny" not in (folder / "out" / "annotator-1" / "sheet.html").read_text()
     assert sorted(name for one in key.items for name in one.methods) == sorted(METHODS)
     n_asked = server.n_asked
     assert 1 <= n_asked <= len(METHODS)  # equal maps are asked about once
-    (again,) = told(capsys, *asked(server, "--offline"))
+    (again,) = result(capsys, *asked(server, "--offline"))
     assert again["sheet_id"] == first["sheet_id"] and server.n_asked == n_asked

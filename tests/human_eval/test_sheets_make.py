@@ -131,12 +131,12 @@ def test_answers_shared_by_maps_are_judged_once(painted_source: RunSource) -> No
         ("object #5", "object"),
     ],
 )  # fmt: skip
-def test_answers_contain_no_map_ids(text: str, told: str) -> None:
+def test_answers_contain_no_map_ids(text: str, result: str) -> None:
     box = np.array([[0, 0, 0], [1, 1, 1.0]])
     named = {60: "lamp", 102761000071: "lamp", 26: "sofa", 5: ""}
     scene = SceneMap(tuple(MapObject(number, name, "", box[0], box) for number, name in named.items()))
     found, names = without_ids(text, scene, [26])
-    assert found == told and names[26] == "sofa"
+    assert found == result and names[26] == "sofa"
 
 
 def test_sheets_are_created_from_the_command_line(
@@ -147,14 +147,14 @@ def test_sheets_are_created_from_the_command_line(
     see_painted(monkeypatch)
     words = ["sheets", "make", "run", "--kind", "retrieval", "--out", "out"]
     assert main([*words, "--questions", "queries.csv", "--annotators", "2", "--json"]) == 0
-    (told,) = json.loads(capsys.readouterr().out)["sets"]
+    (result,) = json.loads(capsys.readouterr().out)["sets"]
     sheet: Sheet = read_sheet(painted_folder / "out" / "sheet.json")
     key = read_key(painted_folder / "out-key" / "key.json")
-    assert told["sheet_id"] == sheet.id == key.sheet_id
+    assert result["sheet_id"] == sheet.id == key.sheet_id
     made_as = read_run(painted_folder / "run")
     assert (key.profile, key.encoder, key.limit) == (made_as.record.profile, made_as.record.encoder, made_as.limit)
     assert key.profile and set(key.changed) == {one for one in key.methods if made_as.changed(one)} and not key.remarks
-    assert told["n_items"] == len(sheet.items) == len(key.items) >= 4
+    assert result["n_items"] == len(sheet.items) == len(key.items) >= 4
     assert {kind for one in key.items for kind in [one.question_kind]} == {
         "instance", "property", "relative", "affordance"}  # fmt: skip
     assert all((painted_folder / "out" / "pictures" / item.pictures[0]).is_file() for item in sheet.items)

@@ -101,9 +101,9 @@ def test_scenes_drawn_in_parallel_give_the_pictures_in_order(painted_source: Run
         replace(one, scene="painted/a", methods=("collector",), rows=(k,))
         for k, one in enumerate(drafts_of("retrieval", TEXTS[:3]))
     ]
-    told: list[tuple[int, int]] = []
-    drawn = draw_all(painted_source, drafts, 1, lambda *counts: told.append(counts))
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    result: list[tuple[int, int]] = []
+    drawn = draw_all(painted_source, drafts, 1, lambda *counts: result.append(counts))
+    assert result == [(1, 3), (2, 3), (3, 3)]
     assert drawn == [Artist(painted_source).draw(one) for one in drafts]
     unit = SceneDrafts(painted_source.opener, {0: drafts[0]})
     (in_process,) = run_processes(draw_scene, [unit], lambda event: None, jobs=2, lost=_lost)

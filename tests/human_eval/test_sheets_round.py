@@ -86,9 +86,9 @@ def test_annotator_answers_are_scored_end_to_end(kind: Any, tmp_path: Path, caps
     ]
     capsys.readouterr()
     assert main(["sheets", "score", *map(str, files[:2]), "--key", str(apart), "--json"]) == 0
-    told = capsys.readouterr()
-    found = json.loads(told.out)
-    assert "no answers from annotator-3" in told.err and found["silent"] == ["annotator-3"]
+    result = capsys.readouterr()
+    found = json.loads(result.out)
+    assert "no answers from annotator-3" in result.err and found["silent"] == ["annotator-3"]
     values = {(one["judge"], one["metric"]): (one["value"], one["n_items"]) for one in found["cells"]}
     metrics = {metric for _, metric in values}
     assert found["n_judged"] == 24  # the 12 shared by all, and 6 of each of two annotators

@@ -134,9 +134,9 @@ def test_ground_truth_scores_below_one_for_two_object_queries_only_in_openlex3d(
 
 
 def test_queries_state_why_there_is_no_ceiling() -> None:
-    said = {name: metric_of(rules).ceiling_remark for name, rules in PROTOCOLS.items()}
-    assert "masks grow by the threshold" in str(said["openlex3d-queries"])
-    assert "the ranking of perfect masks depends on the encoder" in str(said["query-ap"])
+    printed = {name: metric_of(rules).ceiling_remark for name, rules in PROTOCOLS.items()}
+    assert "masks grow by the threshold" in str(printed["openlex3d-queries"])
+    assert "the ranking of perfect masks depends on the encoder" in str(printed["query-ap"])
 
 
 def test_mask_matches_only_objects_of_its_own_query() -> None:

@@ -96,8 +96,8 @@ def chairs(masks: list[np.ndarray], *scores: float) -> Instances:
 
 def test_constant_confidences_give_a_warning_if_they_count() -> None:
     alike = chairs(CHAIRS, 0.25, 0.25)
-    told = warnings_of("rooms-instance", alike)
-    assert told == "rooms/a: all confidences are 0.25: AP per class is recall x (1 + precision) / 2"
+    answer = warnings_of("rooms-instance", alike)
+    assert answer == "rooms/a: all confidences are 0.25: AP per class is recall x (1 + precision) / 2"
     assert warnings_of("rooms-instance", chairs(CHAIRS, 0.25, 0.5)) == ""
     assert warnings_of("rooms-instance", chairs(CHAIRS[:1])) == ""  # a single one has no order
     assert warnings_of("replica-openmask3d", alike) == ""
@@ -108,16 +108,16 @@ def test_constant_confidences_give_a_warning_if_they_count() -> None:
 def test_duplicates_give_a_warning() -> None:
     of_one = CHAIRS[0]
     small = [of_one[:99], of_one[50:], of_one[50:], of_one[:99]]  # two of 100 points, and two that do not count
-    told = warnings_of("rooms-instance", chairs(small))
-    assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
+    answer = warnings_of("rooms-instance", chairs(small))
+    assert answer.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
     assert "3 pairs of predictions overlap with" in warnings_of("rooms-instance", chairs([of_one] * 3))
 
 
 def test_different_encoder_gives_one_warning_for_all_scenes() -> None:
     rules = load_protocol("replica-mesh-ex6")
-    told = combine(rules, dict.fromkeys("abc", score_scene(rules, room(), UNLABELLED, ENCODER))).warnings
-    assert len(told) == 1
-    assert "labels come from the encoder 'one-hot', the protocol's is 'ViT-H-14/laion2b_s32b_b79k'" in told[0]
+    answer = combine(rules, dict.fromkeys("abc", score_scene(rules, room(), UNLABELLED, ENCODER))).warnings
+    assert len(answer) == 1
+    assert "labels come from the encoder 'one-hot', the protocol's is 'ViT-H-14/laion2b_s32b_b79k'" in answer[0]
     assert warnings_of("rooms-semantic", UNLABELLED, ENCODER) == ""
 
 
@@ -219,9 +219,9 @@ UNFIT: list[tuple[str, Instances, Encoder | None, str]] = [
 
 @pytest.mark.parametrize(("name", "prediction", "encoder", "said"), UNFIT)
 def test_prediction_without_names_or_with_non_finite_values_is_refused(
-    name: str, prediction: Instances, encoder: Encoder | None, said: str
+    name: str, prediction: Instances, encoder: Encoder | None, printed: str
 ) -> None:
-    with pytest.raises(PredictionError, match=said):
+    with pytest.raises(PredictionError, match=printed):
         score_scene(load_protocol(name), room(), prediction, encoder)
 
 

@@ -42,8 +42,8 @@ def test_fractions_on_the_page_add_up_to_its_sum() -> None:
     ap = sum(map(by_hand, of_ap), Fraction(0)) / len(of_ap)
     assert f"= {by_hand(0.5)} = {100 * float(by_hand(0.5)):.1f} %" in PAGE
     assert f"= {ap} = {100 * float(ap):.1f} %" in PAGE
-    told = " / ".join(f"{50 * float(value):.1f}" for value in (ap, by_hand(0.5), by_hand(0.25)))
-    assert told in PAGE  # half of the chair's, because the table's is 0
+    result = " / ".join(f"{50 * float(value):.1f}" for value in (ap, by_hand(0.5), by_hand(0.25)))
+    assert result in PAGE  # half of the chair's, because the table's is 0
 
 
 def test_every_module_named_on_the_page_exists() -> None:

@@ -101,10 +101,10 @@ def test_each_relation_rule_on_both_sides_of_its_threshold(
 
 
 def test_object_is_in_a_container_but_on_a_shelf() -> None:
-    holder, held = box(0, 0, 0, 0.5, 0.5, 0.4), box(0.1, 0.1, 0.1, 0.2, 0.2, 0.6)
-    assert holds("in", held, holder, name="basket") and not holds("on", held, holder, name="basket")
-    assert holds("on", held, holder, name="shelf") and not holds("in", held, holder, name="shelf")
-    assert not holds("in", moved(held, x=0.31), holder, name="basket")  # 0.45 of it inside
+    holder, contents = box(0, 0, 0, 0.5, 0.5, 0.4), box(0.1, 0.1, 0.1, 0.2, 0.2, 0.6)
+    assert holds("in", contents, holder, name="basket") and not holds("on", contents, holder, name="basket")
+    assert holds("on", contents, holder, name="shelf") and not holds("in", contents, holder, name="shelf")
+    assert not holds("in", moved(contents, x=0.31), holder, name="basket")  # 0.45 of it inside
 
 
 def test_lower_supports_are_under_the_first_support() -> None:
@@ -162,9 +162,9 @@ def test_ambiguous_relation_is_doubtful() -> None:
     chair = box(1.05, 0, 0, 0.5, 0.5, 0.9)
     by_table = Relations(np.array([moved(CUP, x=0.45), TABLE, chair, FLOOR]), ["cup", "table", "chair", "floor"])
     assert by_table.next_to[1, 2] and not by_table.doubtful("next to")[0, 2]  # the cup is never next to it
-    held = np.array([BOOK, SHELF, FLOOR])
+    contents = np.array([BOOK, SHELF, FLOOR])
     for name, is_doubtful in (("shelf", False), ("sofa", False), ("stand", True), ("desk", True)):
-        inner = Relations(held, ["book", name, "floor"])
+        inner = Relations(contents, ["book", name, "floor"])
         assert inner.on[0, 1] and inner.doubtful("on")[0, 1] == is_doubtful == inner.doubtful("under")[1, 0], name
 
 

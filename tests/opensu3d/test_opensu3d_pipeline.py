@@ -169,8 +169,8 @@ def test_detections_lost_in_rings_and_too_far_pixels_are_counted_and_logged(capl
     n_too_far = int(np.count_nonzero(frame.depth_m > 2.5))
     assert method.losses == {"n_swallowed": 1, "n_too_far": n_too_far}
     method.close()
-    said = [record.getMessage() for record in caplog.records]
-    assert said == [
+    printed = [record.getMessage() for record in caplog.records]
+    assert printed == [
         "opensu3d: 1 of 3 detections lie entirely in the rings of others (border_px 12)",
         f"opensu3d: {n_too_far} pixels beyond depth_max (2.5 m) were dropped",
     ]

@@ -111,10 +111,10 @@ def test_map_equals_a_point_list_with_deletions(views: list[list[tuple[int, int]
     for view in views:
         x = np.array([(voxel + 0.1 + 0.05 * k) * EPS for k, (voxel, _) in enumerate(view)])
         for place, (voxel, own) in zip(x, view, strict=True):
-            held = [each for each in expected if density != "all" and int(each[0] / EPS) == voxel]
-            if held and (density == "frame" or (own == 0 and held[0][1] != 0)):
+            contents = [each for each in expected if density != "all" and int(each[0] / EPS) == voxel]
+            if contents and (density == "frame" or (own == 0 and contents[0][1] != 0)):
                 continue
-            expected = [each for each in expected if each not in held] + [(float(place), own)]
+            expected = [each for each in expected if each not in contents] + [(float(place), own)]
         filled.insert(np.column_stack([x, x * 0, x * 0]), np.array([own for _, own in view], np.int32))
     found = [(float(filled.points[k, 0]), int(filled.ids[k])) for k in filled.by_age]
     assert found == expected

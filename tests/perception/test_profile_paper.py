@@ -179,6 +179,6 @@ def test_room_runs_end_to_end(models: Path, tmp_path: Path, rooms_data: Path, mo
     for method in methods:
         found = read_prediction(next((tmp_path / "out").glob(f"scenes/*/{method}/prediction.npz")))
         assert isinstance(found, Instances) and len(found) > 0
-        sealed = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
-        assert {"packages.torch", "packages.transformers"} <= sealed["steps"]["predict"]["key"].keys()
+        record = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
+        assert {"packages.torch", "packages.transformers"} <= record["steps"]["predict"]["key"].keys()
     assert "RAM++ is not installed" in str(read_json(tmp_path / "out" / "metrics.json"))

@@ -149,10 +149,10 @@ FAULTS = (
 
 @pytest.mark.parametrize(("read", "content", "message"), FAULTS, ids=[fault[2] for fault in FAULTS])
 def test_unusable_openlex3d_file_gives_one_line(tmp_path: Path, read: Reader, content: str, message: str) -> None:
-    told = refusal(tmp_path, read, content)
-    assert told.startswith(WHERE)
-    assert message in told
-    assert len(told) < 500 and told.isprintable()
+    result = refusal(tmp_path, read, content)
+    assert result.startswith(WHERE)
+    assert message in result
+    assert len(result) < 500 and result.isprintable()
 
 
 @pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])

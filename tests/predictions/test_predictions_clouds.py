@@ -121,7 +121,9 @@ def test_map_survives_a_round_trip_object_by_object(
     np.testing.assert_array_equal(found.boxes[0, 1], value["objects"][0]["pcd_np"].astype(np.float32).max(axis=0))
     assert not found.boxes[1].any() and not found.centroids[1].any()
     assert any("1 for every object" in remark for remark in prediction.remarks)
-    assert any("1 background objects (wall) have their own names as labels" in said for said in prediction.remarks)
+    assert any(
+        "1 background objects (wall) have their own names as labels" in printed for printed in prediction.remarks
+    )
 
 
 def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:

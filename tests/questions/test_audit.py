@@ -60,7 +60,7 @@ def plain(scene: str, kind: str, k: int) -> AuditedQuestion:
 
 def test_relation_reference_is_the_related_object_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     one = audited(monkeypatch, new_question("painted/a", "relative", "vase on a table", (3,), "generated"))[0]
-    assert (ids(one.right), ids(one.held), ids(one.others)) == ([3], [1], [4])
+    assert (ids(one.right), ids(one.references), ids(one.others)) == ([3], [1], [4])
     assert one.answer == "vase #3"
 
 
@@ -72,9 +72,9 @@ def test_answers_of_templates_are_in_words(monkeypatch: pytest.MonkeyPatch) -> N
     assert far.answer == "0.45 m: coffee table #5, lamp #6"
     assert ids(far.others) == []  # a coffee table mentions no table
     no = as_value["Is there a cup on the coffee table?"]
-    assert (no.answer, ids(no.right), ids(no.held), ids(no.others)) == ("no", [], [5], [8])
+    assert (no.answer, ids(no.right), ids(no.references), ids(no.others)) == ("no", [], [5], [8])
     yes = as_value["Is there a lamp on the coffee table?"]
-    assert (yes.answer, ids(yes.right), ids(yes.held)) == ("yes: lamp #6", [6], [5])
+    assert (yes.answer, ids(yes.right), ids(yes.references)) == ("yes: lamp #6", [6], [5])
 
 
 def test_sampling_is_balanced_and_deterministic() -> None:

@@ -100,5 +100,5 @@ def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
     (tmp_path / "broken.json").write_text('[{"scene_id": "room0"}]')
     words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / "broken.json")]
     assert main(words) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "broken.json: entry 1" in told
+    result = capsys.readouterr().err
+    assert result.count("\n") == 1 and "broken.json: entry 1" in result

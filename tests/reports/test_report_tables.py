@@ -75,10 +75,10 @@ def test_only_significant_best_values_are_marked_on_request() -> None:
 def test_papers_protocol_is_preferred_and_other_setups_are_stated() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
-    told = "Semantic segmentation on replica, replica-conceptgraphs-ex6"
-    assert table.caption == f"{told}; not the paper's set-up: other perception."
+    result = "Semantic segmentation on replica, replica-conceptgraphs-ex6"
+    assert table.caption == f"{result}; not the paper's set-up: other perception."
     whole = measured(profile="paper", encoder="ViT-H-14/laion2b_s32b_b79k")
-    assert paper_table("II", [whole], Shown(), with_published=False)[0].caption == f"{told}."
+    assert paper_table("II", [whole], Shown(), with_published=False)[0].caption == f"{result}."
     others = [
         (measured(profile="paper", encoder="ViT-L-14-336/openai"), "encoder"),
         (measured(profile="paper", limit=20, encoder=whole.encoder), "frames"),

@@ -34,14 +34,14 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+def answer(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     capsys.readouterr()
     assert main(["report", *words]) == 0
     return capsys.readouterr().out
 
 
 def test_tables_of_a_run_have_the_numbers_of_metrics_json(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables = json.loads(told(capsys, "tables", str(sweep), "--table", "II", "III", "--json"))
+    tables = json.loads(answer(capsys, "tables", str(sweep), "--table", "II", "III", "--json"))
     record = json.loads((sweep / "metrics.json").read_text())
     expected = {
         (one["method"], name): one["result"]["metrics"][name] for one in record["results"] for name in one["headline"]
@@ -62,10 +62,10 @@ def test_verify_finds_each_modified_cell(
     monkeypatch.chdir(sweep.parent.parent)
     paper = tmp_path / "paper.tex"
     words = ["--format", "latex", "--intervals", "--ceiling", "--scenes-count", "--out", str(paper), "--table"]
-    told(capsys, "tables", "runs/a run", *words, "I", "III")
-    assert re.search(r"^(\d+) cells checked, 0 differ$", told(capsys, "verify", str(paper)), re.MULTILINE)
-    told(capsys, "tables", "runs/a run", *words, "II")
-    assert re.search(r"^(\d+) cells checked, 0 differ$", told(capsys, "verify", str(paper)), re.MULTILINE)
+    answer(capsys, "tables", "runs/a run", *words, "I", "III")
+    assert re.search(r"^(\d+) cells checked, 0 differ$", answer(capsys, "verify", str(paper)), re.MULTILINE)
+    answer(capsys, "tables", "runs/a run", *words, "II")
+    assert re.search(r"^(\d+) cells checked, 0 differ$", answer(capsys, "verify", str(paper)), re.MULTILINE)
     text = paper.read_text()
     changes: list[Callable[[str], str]] = [
         lambda t: re.sub(r"(& 67\.5 \{\[\})(\d\d\.\d)", r"\g<1>11.1", t, count=1),

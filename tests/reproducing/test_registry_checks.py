@@ -65,7 +65,7 @@ def test_tampered_bundle_is_rejected_with_a_reason(
     tamper(files)
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
     assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
-    assert "t.zip: rejected: " in (said := capsys.readouterr().out) and says in said
+    assert "t.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
     assert not (tmp_path / "bundles").exists()
 
 

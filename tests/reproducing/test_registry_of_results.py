@@ -21,7 +21,7 @@ STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</s
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two bundles with different variants on the same scenes."""
     folder = tmp_path_factory.mktemp("registry")
-    painted_bundle(folder, "ann", ["@drop=1", "@noise_m=0.3"], said=f"my own photos {STRUCK}")
+    painted_bundle(folder, "ann", ["@drop=1", "@noise_m=0.3"], printed=f"my own photos {STRUCK}")
     painted_bundle(folder, "bob", [""])
     return folder
 
@@ -84,7 +84,7 @@ def test_rows_with_other_data_or_duplicate_methods_are_rejected(
     change(files)
     bundle = rewrite_bundle(tmp_path / "dan.zip", files, {**manifest, "program": "another"})
     assert main(["dev", "registry", "add", str(bundle), "--to", str(registry)]) == 1
-    assert "dan.zip: rejected: " in (said := capsys.readouterr().out) and says in said
+    assert "dan.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]
 
 

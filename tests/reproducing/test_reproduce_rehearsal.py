@@ -34,12 +34,12 @@ def test_every_printed_cell_has_a_measured_value_and_causes_of_the_difference(re
     assert len(cells) == 8 + 2
     assert all(cell["measured"] is not None and cell["protocol"].startswith(cell["dataset"]) for cell in cells)
     assert all(cell["difference"] == cell["measured"] - float(cell["reported"]) for cell in cells)
-    for said in (
+    for printed in (
         "judges: ",
         "scenes: 1 procedurally generated room, not ",
         "proposals: masks of the profile 'embedded' instead of ",
     ):
-        assert all(any(cause.startswith(said) for cause in cell["causes"]) for cell in cells)
+        assert all(any(cause.startswith(printed) for cause in cell["causes"]) for cell in cells)
     text = (rehearsed / "tables.md").read_text()
     assert all(f"**{name}**" in text for name in TABLES)
 

@@ -140,13 +140,13 @@ def test_scenes_whose_names_differ_only_in_a_slash_have_separate_maps(capsys: py
 def test_unscored_maps_are_summarised_instead_of_dashes(capsys: pytest.CaptureFixture[str]) -> None:
     noisy = [*words(scenes="b")[3:], "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.3"]
     assert main(["run", "--scenes", f"{PAINTED}/b", *noisy, "--set", "painted.fault=no-truth"]) == 0
-    said = capsys.readouterr()
-    assert said.out.startswith("no protocol applies to these scenes\n\n**Maps without scores**\n")
-    rows = [line for line in said.out.splitlines() if line.startswith("| painted/b")]
+    printed = capsys.readouterr()
+    assert printed.out.startswith("no protocol applies to these scenes\n\n**Maps without scores**\n")
+    rows = [line for line in printed.out.splitlines() if line.startswith("| painted/b")]
     assert [row.split("|")[2].strip() for row in rows] == ["collector", "collector@noise_m=0.3"]
     assert all(" / " in row.split("|")[5] and row.split("|")[8].strip() != "-" for row in rows)
     why = "not scored under rooms-semantic, rooms-instance: painted/b: has no ground truth"
-    assert [line for line in said.err.splitlines() if "not scored" in line] == [
+    assert [line for line in printed.err.splitlines() if "not scored" in line] == [
         f"collector, collector@noise_m=0.3: {why}"
     ]
     log = next(Path("out").glob("scenes/*/collector/log.txt")).read_text()

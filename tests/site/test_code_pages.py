@@ -60,11 +60,13 @@ def test_each_protocol_page_has_every_rule_source_and_class(pages: dict[str, str
 
 def test_each_method_page_has_every_setting_preset_and_published_row(pages: dict[str, str]) -> None:
     for name in registry.BUILT_IN["method"]:
-        text, told = pages[f"{METHODS}/{name}.md"], summary_of(name)
-        assert all(f"<td><code>{'.'.join(path)}</code></td>" in text for path, _ in flatten(told["settings"]))
-        assert all(f"<td><code>{name}@{preset}</code></td>" in text for preset in told["presets"])
+        text, result = pages[f"{METHODS}/{name}.md"], summary_of(name)
+        assert all(f"<td><code>{'.'.join(path)}</code></td>" in text for path, _ in flatten(result["settings"]))
+        assert all(f"<td><code>{name}@{preset}</code></td>" in text for preset in result["presets"])
         shown = words(text)
-        assert all(told[field] in shown for field in ("summary", "paper", "source", "licence", "status") if told[field])
+        assert all(
+            result[field] in shown for field in ("summary", "paper", "source", "licence", "status") if result[field]
+        )
         for figure in figures_of(method=name):
             assert f"<td>{', '.join(f'{metric} {value}' for metric, value in figure.values.items())}</td>" in text
 

@@ -35,5 +35,5 @@ def test_kernel_folders_match_those_of_numba(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "wide"))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     numbas = [Path(line) for line in done.stdout.splitlines()]
-    told, own, wide = kernel_folders()
-    assert (numbas[0].parent, numbas[1], numbas[2].parent) == (told, own, wide)
+    result, own, wide = kernel_folders()
+    assert (numbas[0].parent, numbas[1], numbas[2].parent) == (result, own, wide)

@@ -76,12 +76,12 @@ def test_damaged_record_is_a_one_line_error_that_names_the_field(tmp_path: Path,
         ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a is invalid ("),
     ],
 )
-def test_impossible_metric_value_is_reported(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_impossible_metric_value_is_reported(changed: dict[str, Any], printed: str, tmp_path: Path) -> None:
     result = replace(RESULT, result=replace(VALUES, **changed))
     write_json(tmp_path / "metrics.json", plain(MetricsRecord(limit=0, results=(result,))))
     with pytest.raises(StoreError) as caught:
         read_record(MetricsRecord, tmp_path / "metrics.json", "run")
-    assert said in str(caught.value)
+    assert printed in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_impossible_metric_value_is_reported(changed: dict[str, Any], said: str,
         ("total_ms,total_ms\n1,2\n", "has two columns with the same name"),
     ],
 )
-def test_invalid_updates_table_is_rejected(text: str, said: str, tmp_path: Path) -> None:
+def test_invalid_updates_table_is_rejected(text: str, printed: str, tmp_path: Path) -> None:
     (tmp_path / "updates.csv").write_text(text)
     with pytest.raises(DataError) as caught:
         records.read_updates(tmp_path / "updates.csv", "run")
-    assert said in str(caught.value)
+    assert printed in str(caught.value)

@@ -178,8 +178,8 @@ def _classes_of(rules: ProtocolRules, remarks: Sequence[str]) -> list[str]:
         )
         for entry in rules.classes
     ]
-    said = f"{len(rules.scored)} of {len(rules.classes)} classes are scored"
-    folded = f"<details>\n<summary>{said}</summary>\n{table(head, rows)}\n</details>"
+    counts = f"{len(rules.scored)} of {len(rules.classes)} classes are scored"
+    folded = f"<details>\n<summary>{counts}</summary>\n{table(head, rows)}\n</details>"
     return ["## Classes", f"<p>{prose(' '.join(remarks))}</p>" if remarks else "", folded]
 
 
@@ -205,8 +205,8 @@ def summary_of(name: str) -> dict[str, Any]:
     """The output of ``su3d-bench methods show NAME --json``."""
     with redirect_stdout(io.StringIO()) as answer:
         main(["methods", "show", name, "--json"])
-    told: dict[str, Any] = json.loads(answer.getvalue())
-    return told
+    info: dict[str, Any] = json.loads(answer.getvalue())
+    return info
 
 
 def methods_page(methods: Sequence[Mapping[str, Any]]) -> str:
@@ -219,25 +219,25 @@ def methods_page(methods: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def method_page(told: Mapping[str, Any]) -> str:
+def method_page(info: Mapping[str, Any]) -> str:
     """The output of ``su3d-bench methods show NAME``, as a page."""
-    name = told["name"]
-    origin = [(field, prose(told[field])) for field in ("paper", "source", "licence") if told[field]]
-    origin += [("needs", plain("; ".join(told["needs"])))] if told["needs"] else []
-    origin += [("verification", prose(told["status"]))] if told["status"] else []
+    name = info["name"]
+    origin = [(field, prose(info[field])) for field in ("paper", "source", "licence") if info[field]]
+    origin += [("needs", plain("; ".join(info["needs"])))] if info["needs"] else []
+    origin += [("verification", prose(info["status"]))] if info["status"] else []
     schema = registry.load("method", name).Config.model_json_schema()
     settings = [
         (_code(".".join(path)), _takes(schema, path), "not set" if value is None else _code(toml_value(value)))
-        for path, value in flatten(told["settings"])
+        for path, value in flatten(info["settings"])
     ]
     presets = [
         (_code(f"{name}@{preset}"), _codes(f"{key} = {json.dumps(value)}" for key, value in own.items()))
-        for preset, own in told["presets"].items()
+        for preset, own in info["presets"].items()
     ]
     given = f"Set with <code>--set {plain(name)}.KEY=VALUE</code>, or in a file for <code>--config</code>."
     return _page(
         name,
-        f"<p>{prose(told['summary'])}</p>",
+        f"<p>{prose(info['summary'])}</p>",
         table((), origin, is_stacked=True) if origin else "",
         "## Settings",
         f"<p>{given if settings else 'None.'}</p>",
@@ -255,7 +255,7 @@ def _takes(schema: Mapping[str, Any], path: Sequence[str]) -> str:
     field: Mapping[str, Any] = schema
     for part in path:
         field = _resolved(schema, field).get("properties", {}).get(part, {})
-    return " or ".join(dict.fromkeys(_said(schema, one) for one in field.get("anyOf", [field])))
+    return " or ".join(dict.fromkeys(_describe(schema, one) for one in field.get("anyOf", [field])))
 
 
 def _resolved(schema: Mapping[str, Any], field: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -267,7 +267,7 @@ def _resolved(schema: Mapping[str, Any], field: Mapping[str, Any]) -> Mapping[st
 WORDS = {"integer": "whole number", "number": "number", "boolean": "true or false", "string": "text", "null": "nothing"}
 
 
-def _said(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
+def _describe(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
     field = _resolved(schema, field)
     if "enum" in field:
         return ", ".join(_code(value) for value in field["enum"])
@@ -276,7 +276,7 @@ def _said(schema: Mapping[str, Any], field: Mapping[str, Any]) -> str:
     kind = str(field.get("type", "value"))
     if kind == "array":
         items = field.get("items", {})
-        return f"list of {_said(schema, items)}" if items else "list"
+        return f"list of {_describe(schema, items)}" if items else "list"
     limits = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
     bounds = [f"{word} {plain(field[key])}" for key, word in limits.items() if key in field]
     return " ".join([WORDS.get(kind, plain(kind)), *bounds])

@@ -84,8 +84,8 @@ def summary_data(summary: MethodSummary) -> dict[str, Any]:
     for stage in summary.stages:
         times = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst, "share": stage.share}
         growths = {"by_points": stage.against_points, "by_updates": stage.against_frames}
-        told = {name: growth and {**asdict(growth), "words": growth.words} for name, growth in growths.items()}
-        stages.append({"name": stage.name, **{name: _number(value) for name, value in times.items()}, **told})
+        reported = {name: growth and {**asdict(growth), "words": growth.words} for name, growth in growths.items()}
+        stages.append({"name": stage.name, **{name: _number(value) for name, value in times.items()}, **reported})
     return numbers | {"stages": stages}
 
 
@@ -121,11 +121,11 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
         if reads_all:
             timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
             confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
-    told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
+    reported = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
     numbers = {
         "left_out": None if reads_all else f"{_n_jobs(runs)} jobs, more than {MAX_JOBS}: {LEFT_OUT}",
         "runs": [_about(run) for run in runs],
-        "results": [result for result in results if result["protocol"] in told],
+        "results": [result for result in results if result["protocol"] in reported],
         "found": [
             {"run": index, **asdict(one)}
             for index, run in enumerate(runs)
@@ -327,9 +327,9 @@ def page_contents(
     maps = scored_maps(runs) if options.with_maps else []
     max_points = points_of_each(len(maps), options.max_bytes)
     explained = _explained(runs) if options.with_errors and are_all_read(runs) else {}
-    told = [job for job, one in explained.items() if isinstance(one, Explained)]
-    max_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
-    wanted = _wanted(runs, maps, told, [options.queries, max_points, max_photos, options.with_gallery])
+    reported = [job for job, one in explained.items() if isinstance(one, Explained)]
+    max_photos = photos_of_each(len({scene for index, _ in reported for scene in runs[index].scenes}), len(reported))
+    wanted = _wanted(runs, maps, reported, [options.queries, max_points, max_photos, options.with_gallery])
     made = {one.scene: found for one in wanted if (found := one.place.load(runs)) is not None}
     asked = [one for one in wanted if one.scene not in made]
     begin(sum(one.n_steps for one in asked))

@@ -161,14 +161,14 @@ def page_scene(
     spaces: Spaces,
     data: SceneData,
     max_points: int,
-    tell: Callable[[str], None] = lambda doing: None,
+    report_activity: Callable[[str], None] = lambda doing: None,
     evaluated: Mapping[tuple[int, str], Mapping[str, EvaluatedScene]] = MappingProxyType({}),
 ) -> PageScene:
     """A scene with its ``maps``. A map that fails has a reason on the page instead.
 
-    ``tell`` is called before each map is computed; ``evaluated``: existing evaluations of it, by protocol.
+    ``report_activity`` is called before each map is computed; ``evaluated``: existing evaluations of it, by protocol.
     """
-    return _Scene(scene, maps, spaces, data, evaluated).page(max_points, tell)
+    return _Scene(scene, maps, spaces, data, evaluated).page(max_points, report_activity)
 
 
 @dataclass
@@ -187,7 +187,7 @@ class _Scene:
     def reader(self) -> SceneReader:
         return SceneReader(self.maps[0][1], self.scene, self.data)
 
-    def page(self, max_points: int, tell: Callable[[str], None]) -> PageScene:
+    def page(self, max_points: int, report_activity: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self.maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
         frames = {
@@ -197,7 +197,7 @@ class _Scene:
         seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []
         for index, run, scene, method in self.maps:
-            tell(f"map of {printable(method, 60)}")
+            report_activity(f"map of {printable(method, 60)}")
             prediction, about = read[index, method], (index, printable(scene, 200), printable(method, 200))
             if isinstance(prediction, str):
                 made.append(PageMap(*about, "", prediction))

@@ -98,8 +98,8 @@ class CacheFile:
         with suppress(OSError, Su3dError, ValueError, KeyError, TypeError, RecursionError):
             check_no_links(self.top, self._place)
             if self._place.stat().st_size <= MAX_BYTES:
-                seal, _, content = file_bytes(self._place).partition(b"\n")
-                if seal == self._signed(content):
+                signature, _, content = file_bytes(self._place).partition(b"\n")
+                if signature == self._signed(content):
                     kept, page, gallery = _FORM.validate_json(content)
                     errors = {(index, method): unpacked(one, runs[index].rules) for index, method, one in kept}
                     return SceneContent(self.scene, {**errors}, page, gallery)

@@ -146,10 +146,10 @@ def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: flo
     places, place_of_target = _distinct_places(targets)
     along_x = np.argsort(places[:, 0], kind="stable")
     x = places[along_x, 0]
-    held = np.asarray(points, np.float64)
+    positions = np.asarray(points, np.float64)
     reached = []
     for k in range(len(masks)):
-        own = held[masks.mask(k)]
+        own = positions[masks.mask(k)]
         reached.append(_within(own, places, along_x, x, cap_m) if len(own) else along_x[:0])
     indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in reached])])
     indices = np.concatenate([along_x[:0], *reached])

@@ -81,14 +81,14 @@ class Original(BaseModel):
     @property
     def facts(self) -> dict[str, str]:
         """All entries by their displayed names, in order, without empty ones."""
-        said = {
+        kind_name = {
             "original": f"{self.code} at {self.commit}" if self.none is None else f"none: {self.none}",
             "its files": ", ".join(self.files),
             "licence of its code": self.licence or "",
             "licence of the data": self.data,
             "compared": self.comparison_summary,
         }
-        return {name: text for name, text in said.items() if text}
+        return {name: text for name, text in kind_name.items() if text}
 
 
 @dataclass(frozen=True)
@@ -366,8 +366,8 @@ def read_rules(values: Mapping[str, Any], where: str) -> ProtocolRules:
 
 
 def _made(values: Mapping[str, Any]) -> ProtocolRules:
-    said = values.get("kind")
-    rules = next((rules for kind, rules in RULES_OF_KIND.items() if kind == said), ProtocolRules)
+    kind_name = values.get("kind")
+    rules = next((rules for kind, rules in RULES_OF_KIND.items() if kind == kind_name), ProtocolRules)
     return rules.model_validate(_with_tuples(values))
 
 

@@ -109,8 +109,8 @@ class Mixtures:
             field, _, leaf = rule.partition(".")
             given = getattr(self.second, field)
             values[field] = values[field].model_copy(update={leaf: getattr(given, leaf)}) if leaf else given
-        said = f"{self.first.name} with {', '.join(moved)} of {self.second.name}" if moved else self.first.name
-        values |= {"name": said, "version": 1, "headline": self.values, "not_comparable_with": ()}
+        title = f"{self.first.name} with {', '.join(moved)} of {self.second.name}" if moved else self.first.name
+        values |= {"name": title, "version": 1, "headline": self.values, "not_comparable_with": ()}
         return type(self.first).model_validate(values)
 
     def _inseparable(self, groups: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]] | None:

@@ -258,8 +258,8 @@ class Server:
         return content
 
     def _refused_parameter(self, error: Any) -> str:
-        status, told = int(error.status_code), error.body
-        message = told.get("message") if isinstance(told, dict) else None
+        status, payload = int(error.status_code), error.body
+        message = payload.get("message") if isinstance(payload, dict) else None
         message = self._shown(message if isinstance(message, str) else str(error))
         if status in (401, 403):
             raise ModelMissing(
@@ -286,8 +286,8 @@ class Server:
         try:
             completion = _Completion.model_validate_json(content)
         except ValidationError:
-            said = self._shown(content[:200].decode("utf-8", "replace"), 60)
-            raise _Failed(f"the response is not a chat completion: '{said}'", is_down=True) from None
+            excerpt = self._shown(content[:200].decode("utf-8", "replace"), 60)
+            raise _Failed(f"the response is not a chat completion: '{excerpt}'", is_down=True) from None
         choice = completion.choices[0]
         answer = (choice.message.content or choice.message.refusal or "").encode("utf-8", "replace").decode()
         answer = self._without_key(answer)

@@ -126,14 +126,14 @@ def described(text: str) -> Described | None:
 def chosen_name(text: str, names: Sequence[str]) -> str | None:
     """The name chosen by an answer: one of ``names``, in their spelling, or a short noun phrase of its own."""
     plain = _FENCE.sub("", text[:MAX_READ]).strip()
-    told = next((value["name"] for value in _json_objects(plain) if isinstance(value.get("name"), str)), plain)
-    lines = [_NAME_LEAD.sub("", line.strip(_QUOTE + " ")) for line in told.splitlines() if line.strip()]
+    label = next((value["name"] for value in _json_objects(plain) if isinstance(value.get("name"), str)), plain)
+    lines = [_NAME_LEAD.sub("", line.strip(_QUOTE + " ")) for line in label.splitlines() if line.strip()]
     by_words: dict[tuple[str, ...], str] = {}
     for name in names:
         by_words.setdefault(words(name), name)
     if lines and words(lines[-1]) in by_words:
         return by_words[words(lines[-1])]
-    all_words = tuple(word for part in re.findall(r"[A-Za-z0-9'’\-]+", told) for word in words(part))
+    all_words = tuple(word for part in re.findall(r"[A-Za-z0-9'’\-]+", label) for word in words(part))
     hits = [one for one in by_words if one and _holds(all_words, one)]
     longest = [hit for hit in hits if not any(other != hit and _holds(other, hit) for other in hits)]
     if len(longest) == 1:

@@ -31,14 +31,14 @@ def timed(run: Path, method_ms: Sequence[float] = (40.0,) * 6, finish_ms: float 
     for done in run.rglob("collector/done.json"):
         edit(done, lambda value: of_costs(value).update(COSTS | costs))
         edit(done, lambda value: of_costs(value)["maps"][0].update(finish_ms=finish_ms, perception_ms=0.0))
-    return sealed(run)
+    return record(run)
 
 
 def of_costs(done: Any) -> Any:
     return done["steps"]["predict"]["remarks"]["costs"]
 
 
-def sealed(run: Path) -> Path:
+def record(run: Path) -> Path:
     """The run with completion records that match its files, as if it had been written so."""
     for done in run.rglob("done.json"):
 
@@ -68,7 +68,7 @@ def counted_otherwise(run: Path, n_points: int = 5) -> Path:
             result["result"] = combine(load_protocol(result["protocol"]), scores[result["protocol"]]).to_json()
 
     edit(run / "metrics.json", change)
-    return sealed(run)
+    return record(run)
 
 
 def edit(path: Path, change: Callable[[Any], None]) -> None:

@@ -97,10 +97,10 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
 def test_a_planted_regression_is_caught(
     name: str, run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plant, said = PLANTED[name]
+    plant, printed = PLANTED[name]
     plant(run)
     assert main(["check", str(run), "--against", str(reference_file)]) == 1
-    assert said in capsys.readouterr().out
+    assert printed in capsys.readouterr().out
 
 
 def test_duplicate_protocols_or_results_are_an_error(
@@ -108,10 +108,10 @@ def test_duplicate_protocols_or_results_are_an_error(
 ) -> None:
     record = (run / "run.json").read_text()
     edit(run / "run.json", lambda r: r["protocols"].append(r["protocols"][0] | {"digest": "f" * 64}))
-    for said in ("run.json: names the protocol 'rooms-semantic' twice", "collector / rooms-semantic' twice"):
+    for printed in ("run.json: names the protocol 'rooms-semantic' twice", "collector / rooms-semantic' twice"):
         assert main(["check", str(run), "--against", str(reference_file)]) == 2
         error = capsys.readouterr().err
-        assert said in error and error.count("\n") == 1
+        assert printed in error and error.count("\n") == 1
         assert main(["check", "--build-from", str(run), "--out", str(run / "r.json")]) == 2
         capsys.readouterr()
         (run / "run.json").write_text(record)

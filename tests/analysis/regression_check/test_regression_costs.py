@@ -95,7 +95,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reference(made: Path) -> Reference:
     """The reference learned from the run, but with costs of an idle machine."""
     learnt = learn([read_run(made)], cost_limit=10.0)
-    costs = {method: Cost(start=0.1, updates=0.1, finish=0.1, whole=0.3) for method in learnt.costs}
+    costs = {method: Cost(start=0.1, updates=0.1, finish=0.1, total=0.3) for method in learnt.costs}
     return learnt.model_copy(update={"costs": costs})
 
 
@@ -140,7 +140,7 @@ def _asked(clock: MethodClock, ready: threading.Event) -> None:
         ready.wait(0.05)
 
 
-COST = Cost(start=10, updates=100, finish=40, whole=150)
+COST = Cost(start=10, updates=100, finish=40, total=150)
 
 
 def dearer(limit: float = 1.5, **parts: float) -> list[str]:
@@ -158,16 +158,16 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
 
 def test_every_part_is_compared_with_the_limit_separately() -> None:
     assert dearer() == []
-    assert dearer(updates=150, whole=200) == []  # exactly the limit
-    assert dearer(updates=151, whole=201) == ["updates after the first 3"]
-    assert dearer(finish=61, whole=171) == ["finish"]
-    assert dearer(whole=226) == ["all stages"]
-    assert dearer(updates=1000, whole=1050) == ["updates after the first 3", "all stages"]
+    assert dearer(updates=150, total=200) == []  # exactly the limit
+    assert dearer(updates=151, total=201) == ["updates after the first 3"]
+    assert dearer(finish=61, total=171) == ["finish"]
+    assert dearer(total=226) == ["all stages"]
+    assert dearer(updates=1000, total=1050) == ["updates after the first 3", "all stages"]
 
 
 def test_growth_of_a_part_below_5_percent_of_the_total_is_ignored() -> None:
-    least = MIN_SHARE * COST.whole
-    assert dearer(start=10 + least, whole=157.5) == []
-    assert dearer(start=10 + least + 0.1, whole=157.6) == ["start and first 3 updates"]
-    assert dearer(1.001, whole=151) == []
-    assert dearer(1.001, whole=151.1) == ["all stages"]
+    least = MIN_SHARE * COST.total
+    assert dearer(start=10 + least, total=157.5) == []
+    assert dearer(start=10 + least + 0.1, total=157.6) == ["start and first 3 updates"]
+    assert dearer(1.001, total=151) == []
+    assert dearer(1.001, total=151.1) == ["all stages"]

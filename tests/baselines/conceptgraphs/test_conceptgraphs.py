@@ -54,10 +54,10 @@ def stages(method: ConceptGraphs, plates: list[Plate], index: int) -> set[str]:
 def test_objects_are_denoised_and_merged_every_twentieth_frame() -> None:
     method = ConceptGraphs(QUIET)
     method.start(SCENE)
-    told = [stages(method, [LEFT], index) for index in range(40)]
-    assert [k for k, names in enumerate(told) if "denoise" in names] == [19, 39]
-    assert [k for k, names in enumerate(told) if "overlap" in names] == [19, 39]
-    assert told[1] == {"filter", "backproject", "match", "merge"}
+    answer = [stages(method, [LEFT], index) for index in range(40)]
+    assert [k for k, names in enumerate(answer) if "denoise" in names] == [19, 39]
+    assert [k for k, names in enumerate(answer) if "overlap" in names] == [19, 39]
+    assert answer[1] == {"filter", "backproject", "match", "merge"}
 
 
 def test_finish_midway_changes_nothing() -> None:

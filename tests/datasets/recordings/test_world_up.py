@@ -96,10 +96,10 @@ def test_without_up_the_world_is_unchanged_and_the_guess_is_reported_and_drawn(
 ) -> None:
     write_recording(tmp_path, "y")
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
-    said = 'z is assumed to be up, but y seems to be (by camera orientation); set up = "y" in rgbd.toml, or up = "z"'
+    printed = 'z is assumed to be up, but y seems to be (by camera orientation); set up = "y" in rgbd.toml, or up = "z"'
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
-    assert "  up            assumed z, but probably y: by camera orientation" in out and said in out
+    assert "  up            assumed z, but probably y: by camera orientation" in out and printed in out
     assert main(["datasets", "show", "rgbd/walk", "--quiet", "--out", str(tmp_path / "walk.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["up"]["axis"] == "y"
     look = look_at(Rgbd(tmp_path), "walk")

@@ -88,8 +88,8 @@ def test_boxes_give_perfect_masks(root: Path) -> None:
 def test_scene_without_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "--scenes", "replica/room0", "--methods", "oracle", "--no-pictures", "--jobs", "1"]
     assert main([*words, "--out", "by-default"]) == 0
-    told = capsys.readouterr()
-    assert "the protocol replica-boxes scores it by the boxes of its objects" in told.out + told.err
+    answer = capsys.readouterr()
+    assert "the protocol replica-boxes scores it by the boxes of its objects" in answer.out + answer.err
     assert main([*words, "--protocols", "replica-boxes", "--out", "out"]) == 0
     assert "replica-boxes" in capsys.readouterr().out
     (result,) = json.loads(Path("out/metrics.json").read_text())["results"]

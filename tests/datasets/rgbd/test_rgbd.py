@@ -51,8 +51,8 @@ def test_isolated_largest_value_is_no_depth_reported_once(tmp_path: Path, caplog
     np.testing.assert_array_equal(apart[1:], (near[1:] * 0.001).astype(np.float32))
     np.testing.assert_array_equal(among, (far * 0.001).astype(np.float32))
     assert (again[near > 2000] == 0).all() and again.max() < 2.01
-    (said,) = (record.getMessage() for record in caplog.records)
-    assert said == (
+    (printed,) = (record.getMessage() for record in caplog.records)
+    assert printed == (
         "rgbd/desk: depth 65535 (65.54 m) counts as no depth if it is far from all other depths of its image"
     )
 
@@ -65,9 +65,9 @@ def test_unscored_run_needs_no_ground_truth_and_qualifies_its_labels(
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     words = ["run", "--scenes", "rgbd/desk", "--stride", "1", "--no-pictures", "--jobs", "1"]
     assert main([*words, "--out", str(tmp_path / "run")]) == 0
-    said = capsys.readouterr()
-    assert "no protocol applies to these scenes" in said.out
-    assert "names and labels are unreliable here" in said.err and "ceiling" not in said.err
+    printed = capsys.readouterr()
+    assert "no protocol applies to these scenes" in printed.out
+    assert "names and labels are unreliable here" in printed.err and "ceiling" not in printed.err
     assert main([*words, "--methods", "oracle", "--out", str(tmp_path / "other")]) == 3
     assert "rgbd/desk: oracle needs ground truth, the dataset has none" in capsys.readouterr().err
 
@@ -219,7 +219,7 @@ def write_room(root: Path, direction: str, axes: str) -> Path:
     [("World2CamPose", "world_to_camera"), ("# camera-to-world", "camera_to_world"), ("pose", None)],
 )
 def test_pose_header_is_skipped_and_a_contradicting_one_is_named(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str, said: str | None
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str, printed: str | None
 ) -> None:
     folder = write_scene(tmp_path)
     plain = open_scene(tmp_path)
@@ -233,5 +233,5 @@ def test_pose_header_is_skipped_and_a_contradicting_one_is_named(
         "rgbd/desk: rgbd.toml: the poses are read as camera_to_world, but 3 of their files have another header "
         f"(the first: frame-0.pose.txt begins with {header!r}); only the depth images can decide"
     )
-    assert (warning in caplog.text) == (said == "world_to_camera")
-    assert direction_in(header) == said
+    assert (warning in caplog.text) == (printed == "world_to_camera")
+    assert direction_in(header) == printed

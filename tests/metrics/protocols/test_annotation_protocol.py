@@ -58,10 +58,10 @@ def named(names: tuple[str, ...]) -> Instances:
     whole = truth_as_prediction(TRUTH, with_labels=False)
     k = len(names)
     views = np.zeros((2 * k, 2), np.int32)
-    told = tuple(name for one in names for name in (one, "couch"))
+    result = tuple(name for one in names for name in (one, "couch"))
     return replace(
         whole, names=names, views=views, view_indptr=np.arange(k + 1, dtype=np.int64) * 2,
-        view_names=told, view_scores=np.tile([0.9, 0.1], k),
+        view_names=result, view_scores=np.tile([0.9, 0.1], k),
     )  # fmt: skip
 
 
@@ -97,8 +97,8 @@ def test_instances_excluded_by_n_prime_count_only_for_n() -> None:
     assert [found[name] for name in ("label n", "label n'", "n_label n", "n_label n'")] == [0.75, 1.0, 4, 3]
     assert (found["over-merged"], found["over-merged n'"]) == (0.25, 0.0)
     assert found["well-merged n'"] == found["n_well-merged n'"] / 3 == 1.0
-    said = " ".join(score_scene(RULES, truth(lambda _: refined), prediction, None).warnings)
-    assert "n' excludes 1 of 4 instances: 'wall' is background" in said
+    printed = " ".join(score_scene(RULES, truth(lambda _: refined), prediction, None).warnings)
+    assert "n' excludes 1 of 4 instances: 'wall' is background" in printed
 
 
 def test_part_becomes_well_merged_when_the_other_part_is_excluded() -> None:
@@ -123,8 +123,8 @@ def test_vote_uses_the_name_with_most_weight() -> None:
 
 
 def test_label_source_is_read_only_after_the_scene_name() -> None:
-    told = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' excludes 1 of 4"]
-    assert remarks_starting(told, REFINED_BY) == ("the vote", "a model")
+    result = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' excludes 1 of 4"]
+    assert remarks_starting(result, REFINED_BY) == ("the vote", "a model")
 
 
 def test_label_of_the_method_has_priority_over_the_name() -> None:
@@ -162,8 +162,8 @@ def test_unjudged_instances_are_reported() -> None:
     whole = truth_as_prediction(TRUTH, with_labels=True)
     masks, labels = [whole.mask(k) for k in range(len(whole))], list(whole.labels or ())
     without_wall = instances(TRUTH.points, masks[1:], labels[1:])
-    told = [score_scene(RULES, truth(), one, None).warnings for one in (whole, without_wall)]
-    assert [sum("not judged" in line for line in lines) for lines in told] == [1, 0]
+    result = [score_scene(RULES, truth(), one, None).warnings for one in (whole, without_wall)]
+    assert [sum("not judged" in line for line in lines) for lines in result] == [1, 0]
 
 
 def test_shuffled_instances_change_nothing() -> None:

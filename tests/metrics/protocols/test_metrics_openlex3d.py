@@ -296,8 +296,8 @@ def test_points_in_several_instances_are_reported() -> None:
     assert whole.features is not None
     features = np.vstack([whole.features, whole.features[:1]])
     twice = instances_with(truth.points, [*masks_of(whole), whole.mask(0)], features)
-    told = score_scene(TOPN, truth, twice, ENCODER).warnings
-    assert f"points in several instances, counted for the first of them: {len(whole.mask(0))}" in told
+    result = score_scene(TOPN, truth, twice, ENCODER).warnings
+    assert f"points in several instances, counted for the first of them: {len(whole.mask(0))}" in result
 
 
 def test_a_prediction_without_features_cannot_be_ranked() -> None:

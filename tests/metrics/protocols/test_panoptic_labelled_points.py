@@ -66,10 +66,10 @@ def test_points_excluded_from_evaluation_are_in_no_predicted_segment() -> None:
 
 def test_oracle_ground_truth_has_one_instance_per_stuff_class_only_if_stuff_counts() -> None:
     truth = open_walls()
-    told = visible_truth(RULES, truth)
-    assert set(told.instance[truth.semantic == ID["wall"]].tolist()) == {truth.instance.max() + 1}
+    record = visible_truth(RULES, truth)
+    assert set(record.instance[truth.semantic == ID["wall"]].tolist()) == {truth.instance.max() + 1}
     is_other = truth.semantic != ID["wall"]
-    assert told.instance[is_other].tolist() == truth.instance[is_other].tolist()
+    assert record.instance[is_other].tolist() == truth.instance[is_other].tolist()
     assert visible_truth(load_protocol("rooms-instance"), truth) is truth
     assert (
         visible_truth(RULES, room()) is not None

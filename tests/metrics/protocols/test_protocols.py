@@ -176,8 +176,8 @@ TRUTHS = [
 
 @pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
 def test_ground_truth_unfit_for_a_protocol_gives_a_reason(name: str, truth: TruthFacts, reason: str | None) -> None:
-    said = truth_incompatibility(load_protocol(name), truth)
-    assert said == reason if reason is None else str(said).startswith(reason)
+    printed = truth_incompatibility(load_protocol(name), truth)
+    assert printed == reason if reason is None else str(printed).startswith(reason)
 
 
 def test_dataset_questions_need_a_dataset_with_questions() -> None:

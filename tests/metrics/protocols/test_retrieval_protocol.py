@@ -178,9 +178,9 @@ def test_questions_of_the_dataset_are_used(tmp_path: Path, all_is_seen: None) ->
 )  # fmt: skip
 def test_answer_is_right_within_the_tolerance(value: float, given: float | None, is_right: bool) -> None:
     assert REASONING.answers is not None
-    true, told = TrueAnswer("?", "count", value, ()), SolverAnswer(given, np.zeros(0, np.int64), True)
-    assert is_answer_right(REASONING.answers, true, told, np.zeros(0, np.int64)) is is_right
-    assert not is_answer_right(REASONING.answers, true, replace(told, is_decided=False), np.zeros(0, np.int64))
+    true, record = TrueAnswer("?", "count", value, ()), SolverAnswer(given, np.zeros(0, np.int64), True)
+    assert is_answer_right(REASONING.answers, true, record, np.zeros(0, np.int64)) is is_right
+    assert not is_answer_right(REASONING.answers, true, replace(record, is_decided=False), np.zeros(0, np.int64))
 
 
 def test_objects_are_right_if_instances_match_exactly_them() -> None:

@@ -106,9 +106,9 @@ def test_answer_ids_are_restricted_to_the_map() -> None:
 def test_long_part_ids_are_parsed_completely() -> None:
     part = 123456000012  # of object 12; its first nine digits are the id of another object
     known = (123456000, part)
-    told = answered(f'{{"answer": "lamp", "object_ids": [{part}], "reference_ids": ["#{part}", 123456000]}}', known)
-    assert told is not None
-    assert (told.object_ids, told.reference_ids) == ((part,), (123456000,))
+    result = answered(f'{{"answer": "lamp", "object_ids": [{part}], "reference_ids": ["#{part}", 123456000]}}', known)
+    assert result is not None
+    assert (result.object_ids, result.reference_ids) == ((part,), (123456000,))
     prose = answered(f"The lamp (id {part}) hangs above nothing.", known)
     assert prose is not None and prose.object_ids == (part,)
     digits = answered(f"The lamp (id 1{'0' * 18}) hangs above nothing.", (10**18,))

@@ -28,8 +28,8 @@ def boxes_of(*rows: tuple[float, ...]) -> Float32Array:
 
 def test_boxes_are_scaled_to_pixels_before_corners_as_in_the_original() -> None:
     """Boxes of 1200x680 by ``Model.post_process_result``; the other order changes the last bits."""
-    told = corners_of(boxes_of((0.34, 0.43, 0.97, 0.56)), 680, 1200)
-    np.testing.assert_array_equal(told, boxes_of((-174.0, 102.0, 990.0, 482.79998779296875)))
+    result = corners_of(boxes_of((0.34, 0.43, 0.97, 0.56)), 680, 1200)
+    np.testing.assert_array_equal(result, boxes_of((-174.0, 102.0, 990.0, 482.79998779296875)))
 
 
 def mask_of(rows: str) -> BoolArray:

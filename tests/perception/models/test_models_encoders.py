@@ -162,11 +162,11 @@ def test_weights_file_with_code_is_rejected(tmp_path: Path, name: str) -> None:
     ],
 )
 def test_invalid_configuration_fails_before_loading(
-    folder: Path, tmp_path: Path, change: dict[str, Any], said: str
+    folder: Path, tmp_path: Path, change: dict[str, Any], printed: str
 ) -> None:
     target = tmp_path / "clip-vit-h-14"
     shutil.copytree(folder / "clip-vit-h-14", target)
     content = json.loads((target / "config.json").read_text())
     (target / "config.json").write_text(json.dumps(content | change))
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=printed):
         load_encoder(config(tmp_path))

@@ -104,9 +104,9 @@ CENTRES = np.array(
 
 
 def test_boxes_are_thresholded_suppressed_and_named_by_phrase(tokenizer: Any) -> None:
-    told = Told(tokenizer, PROBABILITIES, CENTRES)
-    found = told.detect(RGB, ["Cat", "coffee table", "cat"], BoxConfig())
-    assert told.texts == ["cat. coffee table."], "each tag is requested once"
+    result = Told(tokenizer, PROBABILITIES, CENTRES)
+    found = result.detect(RGB, ["Cat", "coffee table", "cat"], BoxConfig())
+    assert result.texts == ["cat. coffee table."], "each tag is requested once"
     # The third overlaps the second by exactly one half, more than 0.4; the fourth has no name.
     assert found.names == ("cat", "table")
     np.testing.assert_allclose(found.scores, [0.9, 0.8])
@@ -125,9 +125,9 @@ def test_box_matched_by_start_token_has_first_tag_or_no_name(
 ) -> None:
     probabilities = np.zeros((1, 8), np.float32)
     probabilities[0, [0, 3]] = 0.9  # [CLS] coffee
-    told = Told(tokenizer, probabilities, CENTRES[:1])
-    assert told.detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES).names == ("cat",)
-    assert told.detect(RGB, ["cat", "coffee table"], BoxConfig()).names == ("coffee",)
+    result = Told(tokenizer, probabilities, CENTRES[:1])
+    assert result.detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES).names == ("cat",)
+    assert result.detect(RGB, ["cat", "coffee table"], BoxConfig()).names == ("coffee",)
 
 
 def test_box_is_named_by_complete_tag_or_dropped(tokenizer: Any) -> None:
@@ -138,6 +138,6 @@ def test_box_is_named_by_complete_tag_or_dropped(tokenizer: Any) -> None:
 
 
 def test_tags_beyond_text_limit_use_a_second_prompt(tokenizer: Any) -> None:
-    told = Told(tokenizer, PROBABILITIES, CENTRES, longest_text=7)
-    told.detect(RGB, ["cat", "coffee table", "sofa", "lamp", "book"], BoxConfig())
-    assert told.texts == ["cat. coffee table.", "sofa. lamp.", "book."]
+    result = Told(tokenizer, PROBABILITIES, CENTRES, longest_text=7)
+    result.detect(RGB, ["cat", "coffee table", "sofa", "lamp", "book"], BoxConfig())
+    assert result.texts == ["cat. coffee table.", "sofa. lamp.", "book."]

@@ -95,7 +95,7 @@ def test_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file: 
     ],
 )
 def test_invalid_manifest_gives_one_line_error(
-    folder: Path, tmp_path: Path, path: tuple[str, ...], value: Any, said: str
+    folder: Path, tmp_path: Path, path: tuple[str, ...], value: Any, printed: str
 ) -> None:
     content = json.loads((folder / f"{CLIP}-onnx/manifest.json").read_text())
     inner = content
@@ -103,7 +103,7 @@ def test_invalid_manifest_gives_one_line_error(
         inner = inner[key]
     inner[path[-1]] = value
     (tmp_path / "manifest.json").write_text(json.dumps(content))
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=printed):
         EncoderManifest.read(tmp_path / "manifest.json")
 
 

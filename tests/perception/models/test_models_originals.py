@@ -104,7 +104,7 @@ def test_sam_pixels_match_the_original_to_the_bit() -> None:
 def test_grid_points_reach_sam_with_the_bits_of_the_original(case: dict[str, Any]) -> None:
     import torch
 
-    told: list[Any] = []
+    result: list[Any] = []
 
     class Told:
         image_px = case["image_px"]
@@ -113,14 +113,14 @@ def test_grid_points_reach_sam_with_the_bits_of_the_original(case: dict[str, Any
 
         def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> Any:
             assert prompts.points is not None
-            told.append(prompts.points)
+            result.append(prompts.points)
             return torch.zeros(len(prompts), 3, 4, 4), torch.zeros(len(prompts), 3)
 
     n_side, side = case["points_per_side"], case["image_px"]
     config = AutomaticMaskConfig(points_per_side=n_side, points_per_batch=n_side**2)
     AutomaticMasks(Sam(Told()), config).regions(blocks(case["height"], case["width"]))
     # transformers' SamPositionalEmbedding, on the points from TorchSam.
-    points = torch.from_numpy(as_shares_of_float32(told[0][:, 0], side))
+    points = torch.from_numpy(as_shares_of_float32(result[0][:, 0], side))
     places = (2 * ((points + 0.5) / side) - 1).to(torch.float32).numpy()
     np.testing.assert_array_equal(places, np.array(case["places"], np.float32))
     # Points rounded before, as in the predictor, give different bits, so that the case detects a mix-up.

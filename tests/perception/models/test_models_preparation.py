@@ -74,11 +74,11 @@ def test_old_and_new_processor_files_give_the_same_transform(tmp_path: Path) -> 
         ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
     ],
 )
-def test_processor_file_with_unusual_steps_is_rejected(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_processor_file_with_unusual_steps_is_rejected(tmp_path: Path, change: dict[str, Any], printed: str) -> None:
     path = tmp_path / "preprocessor_config.json"
     usual = {"size": 32, "crop_size": 32, "image_mean": [0, 0, 0], "image_std": [1, 1, 1], "do_center_crop": True}
     path.write_text(json.dumps(usual | change))
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=printed):
         read_transform(path, "original")
 
 

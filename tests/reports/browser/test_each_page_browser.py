@@ -62,7 +62,7 @@ def site_of_registry(folder: Path) -> Path:
     registry, site = folder.parent / "registry", folder.parent / "registry-site"
     if not site.exists():
         registry.mkdir()
-        painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], said=f"{LONG} {STRUCK}")
+        painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], printed=f"{LONG} {STRUCK}")
         painted_bundle(registry, "bob", [""], scenes="ab")
         words = ["--out", str(site), "--bundle-url", "https://example.org/bundles", "--quiet"]
         assert main(["dev", "registry", "build", str(registry), *words]) == 0

@@ -101,9 +101,9 @@ def test_cards_contain_all_wrong_points(page: Path) -> None:
     text = page.read_text()
     for one in numbers(text)["errors"]:
         for of in (of for of in one["protocols"] if of["kind"] == "semantic"):
-            for cause, told in of["causes"].items():
+            for cause, result in of["causes"].items():
                 own = [card for card in cards(text) if (card["method"], card["kind"]) == (one["method"], cause)]
-                assert sum(card["n_points"] for card in own) == told["n"]
+                assert sum(card["n_points"] for card in own) == result["n"]
 
 
 def plane_seen(n_pixels: int = 40) -> Frame:
@@ -156,7 +156,7 @@ def reopened(browser: Chromium) -> Iterator[Chromium]:
 def test_card_links_to_its_instance_in_the_map_and_back(reopened: Chromium, page: Path, kind: str) -> None:
     choose(reopened, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
     choose(reopened, "gallery", "Kind", kind)
-    told = next(card for card in cards(page.read_text()) if card["kind"] == kind)
+    result = next(card for card in cards(page.read_text()) if card["kind"] == kind)
     reopened.run("document.querySelector('#gallery .card .to-map').scrollIntoView({ block: 'center' })")
     before = reopened.run("scrollY")
     reopened.run("document.querySelector('#gallery .card .to-map').focus()")
@@ -168,16 +168,16 @@ def test_card_links_to_its_instance_in_the_map_and_back(reopened: Chromium, page
         name: reopened.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
         for name in ("Scene", "Map", "Compare with")
     }
-    assert shown == {"Scene": told["scene"], "Map": told["method"], "Compare with": "ground truth"}
+    assert shown == {"Scene": result["scene"], "Map": result["method"], "Compare with": "ground truth"}
     colour = reopened.run(f"{SELECT.format(part='maps', label='Colour by')}.value")
     assert colour == ("class" if kind == "label" else "instance")
     told_there = reopened.run("document.querySelector('#maps .detail').innerText")
-    assert told["true"][0] in told_there
-    if told["rows"]:
+    assert result["true"][0] in told_there
+    if result["rows"]:
         chosen = reopened.run("document.querySelector('#maps .side tr[aria-selected=true]').innerText")
         assert chosen.split()[0] == reopened.run(f"{heading}.innerText")
     else:
-        assert reopened.run(f"{heading}.innerText") == f"Ground truth: {told['true'][0]}"
+        assert reopened.run(f"{heading}.innerText") == f"Ground truth: {result['true'][0]}"
     reopened.run("history.back()")
     reopened.until("!location.hash.startsWith('#maps')")
     reopened.until(f"Math.abs(scrollY - {before}) < 5")

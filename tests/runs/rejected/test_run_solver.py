@@ -47,14 +47,14 @@ def geometry(body: Body) -> Answered:
     found = Solver(scene).answer(question)
     value = {True: "yes", False: "no"}.get(found.value) if isinstance(found.value, bool) else found.value
     words = found.text if value is None else str(value)
-    told = {"answer": words, "object_ids": found.object_ids, "reference_ids": found.reference_ids}
-    return Answered(json.dumps(told))
+    record = {"answer": words, "object_ids": found.object_ids, "reference_ids": found.reference_ids}
+    return Answered(json.dumps(record))
 
 
 def llm(server: ChatServer, *more: str) -> list[str]:
     settings = {"base_url": server.url, "text_model": "tiny", "max_retries": 0}
-    told = [f"perception.language.{name}={value}" for name, value in settings.items()]
-    return [*RUN, *ASKED, "--solver", "llm", "--out", "run", *more, "--set", *told]
+    record = [f"perception.language.{name}={value}" for name, value in settings.items()]
+    return [*RUN, *ASKED, "--solver", "llm", "--out", "run", *more, "--set", *record]
 
 
 def result(folder: Path) -> Any:

@@ -84,8 +84,8 @@ def test_run_on_a_cluster_stops_cleanly_on_sigterm(cluster: Any) -> None:
     driver = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     workers_of(cluster.doomed)
     driver.send_signal(signal.SIGTERM)
-    _, said = driver.communicate(timeout=WHILE_LOADED_S)
-    assert (driver.returncode, said) == (143, "su3d-bench: stopped by SIGTERM; the same command resumes\n")
+    _, printed = driver.communicate(timeout=WHILE_LOADED_S)
+    assert (driver.returncode, printed) == (143, "su3d-bench: stopped by SIGTERM; the same command resumes\n")
     assert json.loads(Path("ended/run.json").read_text())["status"] == "interrupted"
 
 

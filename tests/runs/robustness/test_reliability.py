@@ -256,10 +256,10 @@ def test_kernel_is_compiled_again_when_an_imported_function_changes(tmp_path: Pa
     (tmp_path / "middle.py").write_text(middle)
     (tmp_path / "outer.py").write_text(outer)
 
-    def told(value: int) -> str:
+    def result(value: int) -> str:
         (tmp_path / "inner.py").write_text(inner.format(value))
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "PYTHONDONTWRITEBYTECODE": "1"}
         words = [sys.executable, "-c", "from outer import more; print(more(10), sum(more.stats.cache_hits.values()))"]
         return subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
 
-    assert [told(value) for value in (2, 2, 3)] == ["21 0\n", "21 1\n", "31 0\n"]
+    assert [result(value) for value in (2, 2, 3)] == ["21 0\n", "21 1\n", "31 0\n"]

@@ -50,7 +50,7 @@ def numbers(folder: Path, protocol: str = "scannet-instance", **more: Any) -> di
     return found
 
 
-def said(found: dict[str, Any], beginning: str) -> str:
+def printed(found: dict[str, Any], beginning: str) -> str:
     """The only warning with this beginning."""
     (line,) = [line for line in found["warnings"] if line.startswith(beginning)]
     return str(line)

@@ -48,12 +48,12 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
     """
     asked = []
     for k, (first, second, merging) in enumerate(truths):
-        told = {"n": first, "n'": second}
+        result = {"n": first, "n'": second}
         names: list[tuple[str, ...]] = [("n'",), ("n",)] if k % 2 else [("n",), ("n'",)]
         if second in ("", first):
             names = [("n", "n'") if second else ("n",)]
         represents = {f"label {place}": what for place, what in enumerate(names, 1)}
-        automatic = {ask: told[what[0]] for ask, what in represents.items()} | {"merging": merging}
+        automatic = {ask: result[what[0]] for ask, what in represents.items()} | {"merging": merging}
         key = KeyItem("", "rooms/a", ("opensu3d",), (k,), "", "", represents, automatic)
         asked.append((f"labels of {k}", key))
     return _set("annotation", asked, ("opensu3d",), annotators)

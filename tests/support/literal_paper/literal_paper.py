@@ -164,13 +164,13 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConf
     if settings.density == "all":
         return scene.followed_by(frame)
     voxels = cells_of(np.floor(np.concatenate([scene.points[near], frame.points]) / settings.eps))
-    held, new = np.split(voxels, [np.count_nonzero(near)])
+    contents, new = np.split(voxels, [np.count_nonzero(near)])
     holds_instance, is_instance = scene.ids[near] != NONE, frame.ids != NONE
-    comes = is_instance | ~np.isin(new, np.append(held[holds_instance], new[is_instance]))
+    comes = is_instance | ~np.isin(new, np.append(contents[holds_instance], new[is_instance]))
     if settings.density == "frame":
-        return scene.followed_by(frame.where(comes & ~np.isin(new, held) & one_per_voxel(new, is_instance, 1)))
+        return scene.followed_by(frame.where(comes & ~np.isin(new, contents) & one_per_voxel(new, is_instance, 1)))
     comes &= one_per_voxel(new, is_instance, -1)
-    goes = np.isin(held, new[is_instance]) | (~holds_instance & np.isin(held, new))
+    goes = np.isin(contents, new[is_instance]) | (~holds_instance & np.isin(contents, new))
     stays = np.ones(len(near), bool)
     stays[np.flatnonzero(near)[goes]] = False
     return scene.where(stays).followed_by(frame.where(comes))

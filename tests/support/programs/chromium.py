@@ -162,9 +162,12 @@ class Chromium:
     def press(self, *keys: str) -> None:
         """Press keys one after another: ``1``, ``u``, ``ArrowLeft``, ``Enter``, ``Shift+Tab``."""
         for name in keys:
-            *held, key = name.split("+") if len(name) > 1 else [name]
+            *contents, key = name.split("+") if len(name) > 1 else [name]
             text = {"Enter": "\r", "Space": " "}.get(key, key if len(key) == 1 else "")
-            values: dict[str, Any] = {"key": " " if key == "Space" else key, "modifiers": 8 if held == ["Shift"] else 0}
+            values: dict[str, Any] = {
+                "key": " " if key == "Space" else key,
+                "modifiers": 8 if contents == ["Shift"] else 0,
+            }
             if key in KEY_CODES:
                 values |= {"code": key, "windowsVirtualKeyCode": KEY_CODES[key]}
             self.call("Input.dispatchKeyEvent", {"type": "keyDown", **values, **({"text": text} if text else {})})

@@ -23,10 +23,10 @@ def called(words: Sequence[str]) -> None:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(list(words))
-    said = err.getvalue()
-    lines = said.splitlines()
-    if code == EXIT_INTERNAL or "Traceback" in said:
-        raise BadMessage(f"exit code {code}: {said[-400:]}")
+    printed = err.getvalue()
+    lines = printed.splitlines()
+    if code == EXIT_INTERNAL or "Traceback" in printed:
+        raise BadMessage(f"exit code {code}: {printed[-400:]}")
     for text in (*lines, *out.getvalue().split("\n")):
         fault = fault_of_message(text) if text.strip() else None
         if fault is not None and not fault.startswith(f"message: {len(text)} characters"):
@@ -34,7 +34,7 @@ def called(words: Sequence[str]) -> None:
     if code in (EXIT_DONE, EXIT_CHECK_FAILED, EXIT_INCOMPLETE):
         return
     if not lines or len(lines) > MAX_LINES or not lines[-1].startswith("su3d-bench: "):
-        raise BadMessage(f"exit code {code} and {len(lines)} lines: {said[-300:]!r}")
+        raise BadMessage(f"exit code {code} and {len(lines)} lines: {printed[-300:]!r}")
     if (fault := fault_of_message(lines[-1].removeprefix("su3d-bench: "))) is not None:
         raise BadMessage(f"exit code {code}: {fault}")
     raise Declined(lines[-1])

@@ -23,12 +23,12 @@ Files = dict[str, bytes]
 
 
 def painted_bundle(
-    folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), said: str = ""
+    folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), printed: str = ""
 ) -> Path:
     """``folder/name.zip``: variants of the painted collector; it uses its own code, so verifiers reject it."""
     named = [f"{COLLECTOR}{method}" for method in methods]
     painted_run(folder / "runs" / name, "--quiet", *more, methods=named, scenes=scenes)
-    bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], said)
+    bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], printed)
     return folder / f"{name}.zip"
 
 
