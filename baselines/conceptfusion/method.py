@@ -149,7 +149,7 @@ class ConceptFusionConfig(BaseModel):
     # gradslam at 59ca872 multiplies confidence by feature in half precision, so that points beyond about 3 m, with
     # minimal confidence, lose the feature of the first image: "half", the preset half-products. The default is
     # "single", because that loss is neither in the paper nor intended.
-    product_precision: Literal["single", "half"] = "single"
+    matmul_precision: Literal["single", "half"] = "single"
     distance_m: Positive = 0.05  # PointFusion's dist_th
     normal_angle_deg: float = Field(default=20.0, ge=0, le=180)  # angle_th
     sigma: Positive = 0.6  # m, of alpha
@@ -163,7 +163,7 @@ class ConceptFusion:
     name = "conceptfusion"
     warms_up = True
     Config: type[ConceptFusionConfig] = ConceptFusionConfig
-    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"half-products": {"product_precision": "half"}}
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"half-products": {"matmul_precision": "half"}}
     about = MethodAbout(
         paper=PAPER,
         source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are from the paper only",
@@ -252,7 +252,7 @@ class ConceptFusion:
         is_met = matched != ABSENT
         pixel = np.flatnonzero(is_met & is_valid[field.row.ravel()])
         seen = matched[pixel], field.features, field.row.ravel()[pixel], view.alpha[pixel]
-        if self.config.product_precision == "single":
+        if self.config.matmul_precision == "single":
             features.average(*seen)
         elif is_met.any():
             features.average_in_half(*seen)

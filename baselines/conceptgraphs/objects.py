@@ -49,7 +49,7 @@ class MappingConfig(BaseModel):
     mask_area_threshold: int = Field(default=25, ge=0)  # pixels; the original uses at least 10
     mask_conf_threshold: Fraction = 0.95  # of SAM's predicted IoU
     # Used instead if a profile's scores have a different scale (Detections.score_scale); 0: all regions stay.
-    own_scale_conf_threshold: Fraction = 0.0
+    other_scale_conf_threshold: Fraction = 0.0
     max_bbox_area_ratio: Fraction = 0.5
     min_points_threshold: int = Field(default=16, ge=0)  # the original uses at least 5
     # Gaussian noise on every coordinate, "to avoid colinearity": 4 mm in the code, there from an unseeded generator,
@@ -255,7 +255,7 @@ def kept_regions(detections: Detections, is_background: BoolArray, config: Mappi
     boxes = detections.boxes.astype(np.float64)
     box_areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     is_published = detections.score_scale == "published"
-    least_score = np.float32(config.mask_conf_threshold if is_published else config.own_scale_conf_threshold)
+    least_score = np.float32(config.mask_conf_threshold if is_published else config.other_scale_conf_threshold)
     is_kept = detections.masks.sum(axis=(1, 2)) >= max(config.mask_area_threshold, MIN_MASK_AREA)
     is_kept &= is_background | (box_areas <= config.max_bbox_area_ratio * image_area)
     is_kept &= detections.scores >= least_score

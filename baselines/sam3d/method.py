@@ -46,21 +46,21 @@ class SAM3DConfig(BaseModel):
 
     stride: int = Field(default=20, ge=1)  # --frame_skip of the original's export
     voxel_m: Metres = 0.05  # --voxel_size
-    ratio: float = Field(default=0.5, ge=0, le=1)  # cal_group's default, changed by no caller
-    th: int = Field(default=50, ge=0)  # --th: points below which a group is dropped at the end
-    merge_th: int = Field(default=50, ge=0)  # the same before each merge; 50 regardless of --th
+    overlap_ratio: float = Field(default=0.5, ge=0, le=1)  # cal_group's default, changed by no caller
+    min_group_points: int = Field(default=50, ge=0)  # --th: points below which a group is dropped at the end
+    merge_min_points: int = Field(default=50, ge=0)  # the same before each merge; 50 regardless of --th
     # "tree" merges neighbouring frames, then neighbouring pairs, ... at the end; "incremental" merges every
     # frame into the map immediately, as for SAM3D on a stream.
-    schedule: Literal["tree", "incremental"] = "tree"
+    merge_schedule: Literal["tree", "incremental"] = "tree"
     max_distance_m: Metres = 0.6  # vertices farther from every merged point have no group
-    ensemble: bool = False  # pcd_ensemble: groups snap to the mesh's over-segmentation
-    ensemble_th: int = Field(default=20, ge=0)  # vertices, in pcd_ensemble
+    snap_to_segments: bool = False  # pcd_ensemble: groups snap to the mesh's over-segmentation
+    snap_min_vertices: int = Field(default=20, ge=0)  # vertices, in pcd_ensemble
     features: Literal["mean-of-views", "largest-view"] = "mean-of-views"  # ours
 
     @property
     def rules(self) -> overlap.MergeRules:
         """Parameters of merging two clouds."""
-        return overlap.MergeRules(self.voxel_m, self.ratio, self.merge_th)
+        return overlap.MergeRules(self.voxel_m, self.overlap_ratio, self.merge_min_points)
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ class SAM3D:
     warms_up = True
     Config = SAM3DConfig
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {
-        "incremental": {"schedule": "incremental"},
-        "ensemble": {"ensemble": True},
+        "incremental": {"merge_schedule": "incremental"},
+        "ensemble": {"snap_to_segments": True},
     }
     about = MethodAbout(
         paper="Yang, Wu, He, Zhao, Liu: SAM3D: Segment Anything in 3D Scenes, 2023",
         source="https://github.com/Pointcept/SegmentAnything3D, commit 2aaa8c9",
         licence="none stated in its README",
-        needs=("class-agnostic masks", "the scan's mesh if ensemble is on"),
+        needs=("class-agnostic masks", "the scan's mesh if snap_to_segments is on"),
         status=(
             "the merging of clouds, the tree and the ensemble match the original's output on reference inputs to the "
             "last id, with a stable sort in place of its unstable one; compared with the original on one generated "
@@ -122,7 +122,7 @@ class SAM3D:
     @property
     def needs_surface(self) -> bool:
         """Only the ensemble needs the scan's segments."""
-        return self.config.ensemble
+        return self.config.snap_to_segments
 
     @property
     def caveat(self) -> str:
@@ -164,15 +164,15 @@ class SAM3D:
         try:
             return self._tools.surface()
         except DataError as error:
-            if self.config.ensemble:
+            if self.config.snap_to_segments:
                 raise DataError(
-                    f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set ensemble=false"
+                    f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set snap_to_segments=false"
                 ) from error
             logger.warning("%s: sam3d's groups stay on its own points; no mesh (%s)", self._scene, error)
             return None
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        """Adds one image; with ``schedule`` incremental it is merged immediately, at a cost proportional to the map."""
+        """Add one image; with ``merge_schedule`` incremental it is merged at once, at cost proportional to the map."""
         detections.check_of(frame)
         n_dimensions = detections.crop_features.shape[2]
         if len(detections) and self._views and n_dimensions != len(self._views[0].feature):
@@ -190,7 +190,7 @@ class SAM3D:
             cloud = overlap.voxelise(cloud, self.config.voxel_m)
         if not len(cloud):
             return
-        if self.config.schedule == "incremental" and self._clouds:
+        if self.config.merge_schedule == "incremental" and self._clouds:
             merged = overlap.merge(self._clouds[0], cloud, self.config.rules, timer)
             self._clouds = [merged] if merged is not None else []
         else:
@@ -218,7 +218,7 @@ class SAM3D:
         return GroupedCloud(points, group, rows, rows + first_view)
 
     def finish(self) -> Instances:
-        """The groups of at least ``th`` points, on the mesh's vertices if there is one, otherwise on the merged cloud.
+        """The groups of at least ``min_group_points`` points, on the mesh's vertices, otherwise on the merged cloud.
 
         A segment of the ensemble without a group has no feature and is not an instance.
         """
@@ -227,13 +227,13 @@ class SAM3D:
         if cloud is None:
             logger.warning("%s: sam3d found no valid points in any frame; its map is empty", self._scene)
             cloud = _EMPTY
-        cloud = overlap.numbered(overlap.without_small_groups(cloud, self.config.th))
+        cloud = overlap.numbered(overlap.without_small_groups(cloud, self.config.min_group_points))
         points, group = cloud.points.astype(np.float32), cloud.group
         if self._surface is not None:
             points = self._surface.vertices
             with timer.stage("surface"):
                 group = overlap.groups_on_surface(cloud, points, self.config.max_distance_m)
-            if self.config.ensemble:
+            if self.config.snap_to_segments:
                 with timer.stage("ensemble"):
                     group, cloud = self._in_segments(group, cloud, self._surface)
         instances = self._instances(points, group, cloud)
@@ -249,9 +249,11 @@ class SAM3D:
             segments = mesh_segments(surface.vertices, surface.triangles)
         large = overlap.without_small_groups(
             GroupedCloud(surface.vertices.astype(np.float64), group, cloud.view_group, cloud.views),
-            self.config.ensemble_th,
+            self.config.snap_min_vertices,
         )
-        return overlap.ensemble(group, segments, self.config.ensemble_th, self.config.ratio), overlap.numbered(large)
+        return overlap.ensemble(
+            group, segments, self.config.snap_min_vertices, self.config.overlap_ratio
+        ), overlap.numbered(large)
 
     def _instances(self, points: Float32Array, group: Int64Array, cloud: GroupedCloud) -> Instances:
         ids = np.intersect1d(group, cloud.view_group)

@@ -1,7 +1,7 @@
 """Error attribution: what each kind of error and each stage of the pipeline costs a run.
 
 A run's maps are matched to the ground truth again, with the evaluators of its protocols; counts that differ from those
-stored in the run are an error. ``report samples`` and the galleries of a page use the same iteration,
+stored in the run are an error. ``report instances`` and the galleries of a page use the same iteration,
 ``matched_instances`` or ``Explained.matched``. The kinds of errors are defined in ``metrics.attribution``.
 """
 

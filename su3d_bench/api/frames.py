@@ -95,7 +95,7 @@ def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
 
 
 def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
-    """One row per sample; ``report samples --columns`` describes the columns."""
+    """One row per sample; ``report instances --describe-columns`` describes the columns."""
     return frame(SAMPLES, [astuple(sample) for sample in samples])
 
 

@@ -175,7 +175,7 @@ class Run(Scores):
 
     @property
     def instances(self) -> pandas.DataFrame:
-        """Every predicted and ground-truth instance, for each protocol of masks or points; ``samples`` without filter.
+        """Every predicted and ground-truth instance, for each protocol of masks or points.
 
         >>> import su3d_bench as su3d
         >>> instances = su3d.load_run("runs/demo").instances
@@ -190,15 +190,15 @@ class Run(Scores):
     def _all_samples(self) -> Any:
         return self._samples()
 
-    def samples(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
-        """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report samples``.
+    def select_instances(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
+        """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report instances``.
 
         The ground truth is read again: raises ``DataError`` if the scenes' data is missing (``SU3D_DATA``), and
         ``ConfigError`` for a name that the run does not have, or if there are no instances. ``su3d-bench report
-        samples --columns`` describes the columns; boxes are in metres.
+        instances --describe-columns`` describes the columns; boxes are in metres.
 
         >>> import su3d_bench as su3d
-        >>> found = su3d.load_run("runs/demo").samples(methods="opensu3d", protocols="rooms-instance")
+        >>> found = su3d.load_run("runs/demo").select_instances(methods="opensu3d", protocols="rooms-instance")
         >>> found["kind"].unique().tolist()
         ['predicted', 'true']
         """

@@ -202,11 +202,11 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "perception backend: auto, embedded, oracle, stored or paper (default: auto)",
         ),
         option(
-            "--solver",
+            "--question-solver",
             "how to answer questions: built-in (geometry) or llm (default: built-in)",
             choices=("built-in", "llm"),
         ),
-        option("--exclude FILE", "CSV file with ids of questions to exclude"),
+        option("--exclude-ids FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
             ".npz file with text features, for predictions with features",

@@ -39,7 +39,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("scene", "scene, such as rooms/living0")
     parser.option("question", "question in English")
     parser.shared("--run", "--method")
-    parser.option("--solver", SHARED["--solver"]["help"], choices=("built-in", "llm"), default="built-in")
+    parser.option(
+        "--question-solver", SHARED["--question-solver"]["help"], choices=("built-in", "llm"), default="built-in"
+    )
     parser.option(
         "--names",
         "labels n, or n' of runs refine (default: n' if available)",
@@ -108,7 +110,7 @@ def call_ask(arguments: argparse.Namespace) -> None:
     """Answer a question about a scene from its map, by geometry or a language model.
 
     su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
-    su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run
+    su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --question-solver llm --dry-run
     """
     from su3d_bench.core.maps import Instances
     from su3d_bench.questions.scene_map import map_of
@@ -154,7 +156,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.solver import LanguageSolver
 
-    if arguments.solver != "llm":
+    if arguments.question_solver != "llm":
         return options.answer_estimate(arguments, None, ())
     client, config = options.chat_client(arguments, run)
     request = LanguageSolver(scene, client, config).request(arguments.question)
@@ -168,7 +170,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     from su3d_bench.questions.scene_map import nearest_by
     from su3d_bench.questions.solver import LanguageSolver, Solver
 
-    if arguments.solver == "llm":
+    if arguments.question_solver == "llm":
         return LanguageSolver(scene, *options.chat_client(arguments, run)).answer(arguments.question)
     eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
     if eye is not None and not np.isfinite(eye).all():

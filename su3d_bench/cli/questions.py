@@ -37,9 +37,9 @@ def add_parser(verbs: Verbs) -> None:
         default=SOURCES[0],
         choices=SOURCES,
     )
-    parser.shared("--exclude")
+    parser.shared("--exclude-ids")
     parser.option(
-        "--form",
+        "--format",
         "own query sets, or Beacon3D's metadata_*.json (default: own)",
         default=FORMS[0],
         choices=FORMS,
@@ -65,12 +65,12 @@ def add_parser(verbs: Verbs) -> None:
 def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
-    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude disputed.csv --out queries.toml
-    su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json
+    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'rooms/*' --format beacon3d-qa --out metadata_qa.json
     """
     from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.form != FORMS[0]:
+    if arguments.format != FORMS[0]:
         _make_beacon3d(arguments)
         return
     check_form(arguments.out)
@@ -87,17 +87,17 @@ def _make_beacon3d(arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, scene_objects
 
-    if arguments.exclude is not None or arguments.source != SOURCES[0]:
-        raise ConfigError("query make: --exclude and --source need --form own")
+    if arguments.exclude_ids is not None or arguments.source != SOURCES[0]:
+        raise ConfigError("query make: --exclude-ids and --source need --format own")
     if arguments.out.suffix != ".json":
-        raise ConfigError(f"query make: --form {arguments.form} writes JSON; use --out FILE.json")
+        raise ConfigError(f"query make: --format {arguments.format} writes JSON; use --out FILE.json")
     objects = {}
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         if scene in objects:
             raise ConfigError(f"query make: two datasets have a scene '{scene}', this form identifies scenes by name")
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
-    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.form) - 1]
+    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.format) - 1]
     write_json(arguments.out, content)
     n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
     line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
@@ -110,7 +110,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.questions.ground_truths import questions_of
     from su3d_bench.questions.query_files import read_excluded_ids
 
-    left_out = frozenset[str]() if arguments.exclude is None else read_excluded_ids(arguments.exclude)
+    left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         found = questions_of(dataset, scene, own=arguments.source == "auto")

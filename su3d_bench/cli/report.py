@@ -27,7 +27,7 @@ def add_parser(verbs: Verbs) -> None:
     _add_tables(actions)
     _add_timing(actions)
     report_files.add_pages(actions)
-    _add_samples(actions)
+    _add_instances(actions)
     _add_leaderboard(actions)
     _add_attribution(actions)
     _add_power(actions)
@@ -145,30 +145,30 @@ def call_timing(arguments: argparse.Namespace) -> None:
 FORMATS = ("csv", "parquet")
 
 
-def _add_samples(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "samples", call_samples)
+def _add_instances(verbs: Verbs) -> None:
+    parser = add_verb(verbs, "instances", call_instances)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
     parser.option("--format", "csv or parquet (default: by the suffix of --out, else csv)", choices=FORMATS)
     parser.option("--out FILE", "file to write (default: print CSV)")
-    parser.option("--columns", "describe the columns and exit")
+    parser.option("--describe-columns", "describe the columns and exit")
     parser.shared("--table-format")
 
 
-def call_samples(arguments: argparse.Namespace) -> None:
+def call_instances(arguments: argparse.Namespace) -> None:
     """List every predicted and ground-truth instance: class, confidence, best IoU, error type, box.
 
-    su3d-bench report samples runs/my-run --out samples.csv
-    su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
+    su3d-bench report instances runs/my-run --out samples.csv
+    su3d-bench report instances runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
     """
     from su3d_bench.analysis.samples import Selection, samples
     from su3d_bench.core.files.atomic import make_folder, write_bytes
     from su3d_bench.reports.tables.samples import COLUMNS, columns_table, csv_of, parquet_of
     from su3d_bench.runs.finished import read_run
 
-    if arguments.columns == bool(arguments.runs):
-        raise ConfigError("report samples: give a run folder, such as runs/my-run, or --columns")
-    if arguments.columns:
+    if arguments.describe_columns == bool(arguments.runs):
+        raise ConfigError("report instances: give a run folder, such as runs/my-run, or --describe-columns")
+    if arguments.describe_columns:
         output.answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
         return
     out = arguments.out

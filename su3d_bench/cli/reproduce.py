@@ -17,7 +17,17 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, Ru
 if TYPE_CHECKING:
     from su3d_bench.reproducing.recipe import Experiment, Recipe, RecipeRequest, RecipeRun
 
-RUN_OPTIONS = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
+RUN_OPTIONS = (
+    "jobs",
+    "limit",
+    "question_solver",
+    "offline",
+    "executor",
+    "ray_address",
+    "gpus_per_job",
+    "retries",
+    "slurm",
+)
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -37,7 +47,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.shared("--profile")
     parser.option("--encoder ENCODER", "encoder of all runs (default: set by the recipe)")
-    parser.shared("--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
+    parser.shared("--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR, "--set")
     parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)")
     parser.shared("--format")
 

@@ -26,7 +26,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "ablate", call_ablate, takes_up=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
     parser.option("--method METHOD", "method to vary, or file.py:Class (default: opensu3d)", default="opensu3d")
-    parser.option("--also METHOD...", "additional methods to run without variation", default=[])
+    parser.option("--also-methods METHOD...", "additional methods to run without variation", default=[])
     parser.option("--grid", "run every combination instead of one setting at a time")
     _add_run_options(parser)
 
@@ -36,7 +36,7 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'rooms/*')")
     parser.option("--protocols PROTOCOL...", "protocols to score (default: those of the dataset)")
-    parser.shared("--profile", "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR)
+    parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
@@ -157,7 +157,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
 def call_ablate(arguments: argparse.Namespace) -> int:
     """Run an ablation: vary settings of a method, one at a time, on the same scenes.
 
-    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --also conceptgraphs --scenes 'rooms/*' --out runs/sweep
+    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --also-methods conceptgraphs --scenes 'rooms/*' --out runs/sweep
     su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run
     """
     from su3d_bench.core import registry
@@ -166,7 +166,7 @@ def call_ablate(arguments: argparse.Namespace) -> int:
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
     default_name = str(registry.load("method", arguments.method).name)
     swept = [arguments.method + row.method.removeprefix(default_name) for row in rows]
-    arguments.methods = list(dict.fromkeys([*swept, *arguments.also]))
+    arguments.methods = list(dict.fromkeys([*swept, *arguments.also_methods]))
     plan = plan_of(arguments)
     code = execute(plan, arguments)
     if code == EXIT_DONE and not arguments.dry_run:

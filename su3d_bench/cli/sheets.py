@@ -36,7 +36,7 @@ def _add_score(verbs: Verbs) -> None:
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review")
-    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude")
+    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids")
     parser.shared("--format")
 
 
@@ -157,7 +157,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
-    parser.option("--figure", "add the texts of a figure of the paper or its project page", choices=FIGURES)
+    parser.option("--paper-figure", "add the texts of a figure of the paper or its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
     parser.option("--photo", "add a column with the colours of the scene")
     parser.option("--view", "viewpoint (default: corner)", choices=("corner", "above"), default="corner")
@@ -169,7 +169,7 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     """Draw a figure of a run: similarity to texts, labels n and n', or answers with their objects.
 
     su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
-    su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf
+    su3d-bench sheets pictures runs/my-run --paper-figure schemes --scenes replica/room0 --out schemes.pdf
     """
     from su3d_bench.human_eval.drawing import Figures
     from su3d_bench.human_eval.sources import RunSource
@@ -178,7 +178,7 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run
 
-    of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
+    of_figure = () if arguments.paper_figure is None else figure_texts(arguments.paper_figure)
     texts = [*of_figure, *(query.strip() for query in arguments.queries)]
     if (arguments.draw == "labels") == bool(texts) or not all(texts):
         what = "labels take none" if arguments.draw == "labels" else f"{arguments.draw} needs at least one, not empty"

@@ -51,7 +51,7 @@ def add_parser(verbs: Verbs) -> None:
         "scenes of the run (default: all), or patterns without RUN",
         default=[],
     )
-    parser.shared("--exclude")
+    parser.shared("--exclude-ids")
     parser.option(
         "--per-kind N",
         "maximum number of items per kind and scene (default: depends on the kind)",
@@ -63,7 +63,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.shared("--seed", "--jobs", "--device")
     parser.option(
-        "--solver",
+        "--question-solver",
         "how to answer questions: built-in (geometry) or llm (default: built-in)",
         choices=("built-in", "llm"),
         default="built-in",
@@ -82,7 +82,7 @@ def call(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.finished import read_run
 
     _check(arguments)
-    left_out = frozenset[str]() if arguments.exclude is None else read_excluded_ids(arguments.exclude)
+    left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kind))
     origins: dict[SheetKind, Key] = {}
     drafts: dict[SheetKind, list[Draft]] = {}
@@ -121,16 +121,16 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
         raise ConfigError("RUN: name a run folder; only --kind questions works without one, with --scenes")
     has_questions = arguments.questions != "generated"
-    if kinds == {"annotation"} and (has_questions or arguments.exclude is not None):
-        raise ConfigError("--questions, --exclude: not valid for annotation sheets, which have no questions")
+    if kinds == {"annotation"} and (has_questions or arguments.exclude_ids is not None):
+        raise ConfigError("--questions, --exclude-ids: not valid for annotation sheets, which have no questions")
     if kinds == {QUESTIONS} and (has_questions or arguments.methods):
         raise ConfigError(
             "--questions, --methods: not valid for --kind questions, which uses questions from the ground truth"
         )
-    if arguments.solver == "llm" and "reasoning" not in arguments.kind:
-        raise ConfigError("--solver llm: needs --kind reasoning")
-    if arguments.solver != "llm" and (given := options.given_language_option(arguments)):
-        raise ConfigError(f"{given}: only valid with --solver llm")
+    if arguments.question_solver == "llm" and "reasoning" not in arguments.kind:
+        raise ConfigError("--question-solver llm: needs --kind reasoning")
+    if arguments.question_solver != "llm" and (given := options.given_language_option(arguments)):
+        raise ConfigError(f"{given}: only valid with --question-solver llm")
 
 
 def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
@@ -188,10 +188,10 @@ def _drafts(
     random = np.random.default_rng(arguments.seed)
     given = _given(source, arguments)
     drafts_of: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
-    needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
+    needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.question_solver != "llm")
     encoder = source.run.encoder(arguments.device or "cpu") if needs_encoder else None
     ask, answered_by = solver.built_in(encoder), solver.BUILT_IN
-    if arguments.solver == "llm":
+    if arguments.question_solver == "llm":
         client, config = options.chat_client(arguments, source.run.folder)
         ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}

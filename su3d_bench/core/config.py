@@ -103,7 +103,7 @@ class RunConfig(BaseModel):
 
     ``protocols`` empty: those of each dataset; ``stride`` 0: the method's default; ``jobs`` 0: one per scene, at most
     one per CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is
-    partial; ``solver``: how questions of reasoning protocols are answered, by geometry alone or by the text model of
+    partial; ``question_solver``: how reasoning questions are answered, by geometry alone or by the text model of
     ``perception.language``; ``offline``: no language model is called, replies stored with the run are used;
     ``accept_poses``: also run recordings whose depth contradicts their poses;
     ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
@@ -122,7 +122,7 @@ class RunConfig(BaseModel):
     limit: int = Field(default=0, ge=0)
     jobs: int = Field(default=0, ge=0)
     pictures: bool = True
-    solver: Literal["built-in", "llm"] = "built-in"
+    question_solver: Literal["built-in", "llm"] = "built-in"
     offline: bool = False
     accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()

@@ -441,7 +441,7 @@ def _entry(look: ReviewItem) -> Entry:
 
 
 def disputed_csv(key: Key, looks: Iterable[ReviewItem]) -> str:
-    """One line per question of ``looks``, in the format for ``--exclude``, with the reason."""
+    """One line per question of ``looks``, in the format for ``--exclude-ids``, with the reason."""
     of_item = {item.id: item for item in key.items}
     why: dict[str, list[str]] = defaultdict(list)
     texts: dict[str, str] = {}

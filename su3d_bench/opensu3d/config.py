@@ -77,9 +77,9 @@ class OpenSU3DConfig(BaseModel):
     border_shape: Literal["disc", "square"] = "disc"
     # Ring pixels that are in another mask: points of no instance in the map, because M' contains the ring and
     # Eq. 1 back-projects M'; points of that mask's instance, excluded from matching; or no points.
-    border_pixels: Literal["background", "owner", "drop"] = "background"
+    border_pixel_rule: Literal["background", "owner", "drop"] = "background"
     # Pixels in no mask: Eq. 1 back-projects every pixel.
-    background_pixels: Literal["keep", "drop"] = "keep"
+    background_pixel_rule: Literal["keep", "drop"] = "keep"
     # Head nouns of excluded labels: a tagger calls the paper's "walls" "brick wall"; "wall lamp" is a lamp.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling", "ground", "roof")
     max_box_fraction: Fraction = 0.95
@@ -112,10 +112,10 @@ class OpenSU3DConfig(BaseModel):
             raise ValueError(
                 f"crop_ratios: 1.0 is missing ({fusion.crop_ratios}); weighted multi-scale fusion needs that crop"
             )
-        if self.border_pixels == "background" and self.background_pixels == "drop":
+        if self.border_pixel_rule == "background" and self.background_pixel_rule == "drop":
             raise ValueError(
-                "border_pixels: 'background' conflicts with background_pixels 'drop'; set "
-                "border_pixels to 'drop' or 'owner'"
+                "border_pixel_rule: 'background' conflicts with background_pixel_rule 'drop'; set "
+                "border_pixel_rule to 'drop' or 'owner'"
             )
         if self.depth_min >= self.depth_max:
             raise ValueError(f"depth_min ({self.depth_min} m) must be below depth_max ({self.depth_max} m)")

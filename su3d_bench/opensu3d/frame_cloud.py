@@ -103,8 +103,8 @@ def _cloud(
         np.ascontiguousarray(frame.camera_to_world[:3, 3], np.float64),
         painted.ids,
         painted.owner,
-        rings[config.border_pixels],
-        config.background_pixels == "drop",
+        rings[config.border_pixel_rule],
+        config.background_pixel_rule == "drop",
         config.voxel_of_frame,
     )
     return cloud

@@ -41,7 +41,7 @@ class OpenSU3D:
     )
     presets: ClassVar[Mapping[str, Mapping[str, str]]] = {
         **{scheme: {"scheme": scheme} for scheme in SCHEMES},
-        "owner": {"border_pixels": "owner"},
+        "owner": {"border_pixel_rule": "owner"},
         **{f"score-{rule}": {"instance_score": rule} for rule in ("mean", "max", "top-m-sum")},
     }
     # The paper's symbols, as varied in its ablation (Table I).

@@ -214,7 +214,7 @@ class Solver:
         """The answer to an English question; unsettled if it cannot be parsed or answered."""
         question = read_question(text)
         if question is None:
-            return undecided("the built-in solver cannot read the question; try --solver llm")
+            return undecided("the built-in solver cannot read the question; try --question-solver llm")
         return self.solve(question)
 
     def solve(self, question: Question) -> Answer:

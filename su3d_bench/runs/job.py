@@ -231,7 +231,7 @@ class JobInputs:
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
         key |= {"pictures": str(self.job.config.pictures)}
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
-        if self.job.config.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
+        if self.job.config.question_solver == "llm" and any(one.answers is not None for one in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.uses_names for protocol in rules.values()) else key
 

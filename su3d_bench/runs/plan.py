@@ -235,9 +235,9 @@ def make_plan(
     ceiling = None if CEILING_METHOD in named else part_of("method", CEILING_METHOD, settings)
     datasets = {target: part_of("dataset", target, settings) for target in targets.values()}
     protocols = protocols_of_run(config.protocols, list(datasets))
-    if config.solver == "llm" and not any(map(asks_questions, protocols.values())):
+    if config.question_solver == "llm" and not any(map(asks_questions, protocols.values())):
         raise ConfigError(
-            "--solver llm: only answers questions of reasoning protocols; add one, such as --protocols rooms-reasoning"
+            "--question-solver llm: needs a reasoning protocol; add one, such as --protocols rooms-reasoning"
         )
     if place is None:
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))

@@ -186,7 +186,7 @@ class _Scene:
     @cached_property
     def solver(self) -> MapSolver | None:
         """The solver that answers questions about maps; None: the built-in solver."""
-        if self.job.config.solver == "built-in":
+        if self.job.config.question_solver == "built-in":
             return None
         config = PerceptionConfig.model_validate_json(self.job.perception).language
         client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.config.offline)

@@ -228,7 +228,7 @@ def test_failed_scenes_raise_an_error_and_the_others_are_kept(tmp_path: Path, mo
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/x", "oracle"), "contains no map of rooms/x"),
-        (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "has no scores of the method 'sam3d'"),
+        (lambda: su3d.load_run("runs/demo").select_instances(methods="sam3d"), "has no scores of the method 'sam3d'"),
     ],
 )
 def test_each_user_error_is_one_line(call: Any, line: str, here: Path) -> None:

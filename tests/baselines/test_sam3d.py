@@ -17,7 +17,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo, Surface
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms")
-TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(schedule="incremental")
+TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(merge_schedule="incremental")
 Views = Sequence[tuple[Frame, Detections]]
 
 
@@ -76,8 +76,8 @@ def test_order_of_merging_matters() -> None:
     # mostly that plate, and shares too little with the left one.
     left, right, strip = plate(-1, 0), plate(0, 1), plate(-0.2, 0.2)
     views = [look([one], index) for index, one in enumerate((left, right, strip, right))]
-    assert len(run(views, SAM3DConfig(ratio=0.4)).finish()) == 2
-    assert len(run(views, SAM3DConfig(ratio=0.4, schedule="incremental")).finish()) == 1
+    assert len(run(views, SAM3DConfig(overlap_ratio=0.4)).finish()) == 2
+    assert len(run(views, SAM3DConfig(overlap_ratio=0.4, merge_schedule="incremental")).finish()) == 1
 
 
 @pytest.mark.parametrize("config", [TREE, INCREMENTAL])
@@ -130,7 +130,7 @@ def test_ensemble_assigns_whole_segments_to_their_group() -> None:
     mesh = grid_mesh((-0.6, 0.6))
     views = [look([replace(LEFT, feature=axis(1)), replace(RIGHT, feature=axis(2))], 0)]
     apart = run(views, surface=mesh).finish()
-    found = run(views, SAM3DConfig(ensemble=True), mesh).finish()
+    found = run(views, SAM3DConfig(snap_to_segments=True), mesh).finish()
     # The border of the groups at x = 0 moves to that of the segments at 0.1.
     seams = [max(mesh.vertices[each.mask(k)][:, 0].min() for k in range(2)) for each in (apart, found)]
     assert seams == [pytest.approx(0, abs=0.03), pytest.approx(0.1, abs=0.001)]

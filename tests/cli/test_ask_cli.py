@@ -78,7 +78,7 @@ def server(chat: ChatServer) -> ChatServer:
 
 def llm(server: ChatServer, *more: str) -> list[str]:
     settings = [f"perception.language.{one}" for one in QUICK]
-    return ["--solver", "llm", "--model", "tiny", "--base-url", server.url, *more, "--set", *settings]
+    return ["--question-solver", "llm", "--model", "tiny", "--base-url", server.url, *more, "--set", *settings]
 
 
 def test_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,7 +129,7 @@ def test_model_reply_is_stored_in_the_run_and_reused(
 def test_dry_run_reports_the_cost_and_sends_no_request(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
+    assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--question-solver", "llm"]) == 0
     assert "1 requests, 0 of them already answered; 1 to send to gpt-4-1106-preview: about " in capsys.readouterr().out
     assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
@@ -147,13 +147,13 @@ def test_dry_run_reports_the_cost_and_sends_no_request(
         (f"query text {SCENE} x --run runs/made --method opensud", "by opensud; did you mean 'opensu3d'?"),
         (f"query ask {SCENE} x --names refined", "no labels n'; create them with su3d-bench runs refine"),
         (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers (metres)"),
-        (f"query ask {SCENE} x --solver llm --offline", "no stored reply to this ask request"),
+        (f"query ask {SCENE} x --question-solver llm --offline", "no stored reply to this ask request"),
         (
-            f"query ask {SCENE} x --solver llm --base-url http://a:b@c/v1",
+            f"query ask {SCENE} x --question-solver llm --base-url http://a:b@c/v1",
             "--base-url: language.base_url = 'http://a:b@c/v1': contains credentials or a query; set keys in",
         ),
         (
-            f"query ask {SCENE} x --solver llm --set perception.cache=false",
+            f"query ask {SCENE} x --question-solver llm --set perception.cache=false",
             "only perception.language.KEY=VALUE can be set here",
         ),
     ],
@@ -171,7 +171,7 @@ def test_missing_api_key_is_a_one_line_error(
     job: JobFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("OPENAI_API_KEY")
-    assert main(["query", "ask", SCENE, "x", "--solver", "llm"]) == 2
+    assert main(["query", "ask", SCENE, "x", "--question-solver", "llm"]) == 2
     assert "su3d-bench: $OPENAI_API_KEY is not set" in capsys.readouterr().err
 
 

@@ -35,7 +35,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report tables": ("out --format latex --out tables.tex", 0, "tables.tex"),
     "report timing": ("out --out timing", 0, "timing/timing.md"),
     "report html": ("out --no-maps --out page.html", 0, "page.html"),
-    "report samples": ("out --out samples.csv", 0, "predicted instances"),
+    "report instances": ("out --out samples.csv", 0, "predicted instances"),
     "report rerun": ("out --out out.rrd", 0, "out.rrd"),
     "report leaderboard": ("out --out board.md", 0, "board.md"),
     "report bundle": ("out --out registry/bundles/mine.zip", 0, "registry/bundles/mine.zip"),

@@ -46,7 +46,7 @@ CASES: dict[str, list[list[str]]] = {
     ],
     "report timing": [["RUN", "--out", "out/timing"]],
     "report html": [["RUN", "--no-maps", "--out", "out/page.html", "--title", HOSTILE]],
-    "report samples": [["RUN", "--out", "out/samples.csv"]],
+    "report instances": [["RUN", "--out", "out/samples.csv"]],
     "report leaderboard": [["."], [".", "--format", "html", "--out", "out/board.html"]],
     "report bundle": [["RUN", "--out", "out/run.zip"],
                       ["RUN", "--out", f"out/{IN_A_PATH}.zip", "--trained-on", HOSTILE]],
@@ -77,7 +77,7 @@ CASES: dict[str, list[list[str]]] = {
 }  # fmt: skip
 # Commands that draw or call models, and those that need their files: only in the proofs.
 SLOW = {
-    "report attribution", "report timing", "report html", "report samples", "sheets make", "sheets score",
+    "report attribution", "report timing", "report html", "report instances", "sheets make", "sheets score",
     "sheets pictures", "query text", "query ask", "datasets show",
 }  # fmt: skip
 METHOD_FILE = f'''

@@ -97,7 +97,7 @@ def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None
     assert not [one.question_id for one in key.items if one.question_id in page]
     listed = key.items[0].question_id
     Path("gone.csv").write_text(f"question_id\n{listed}\n")
-    assert main([*words, "--exclude", "gone.csv", "--out", "without", "--quiet"]) == 0
+    assert main([*words, "--exclude-ids", "gone.csv", "--out", "without", "--quiet"]) == 0
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
 
 

@@ -48,7 +48,7 @@ def result(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, An
 
 
 def asked(server: ChatServer, *more: str) -> list[str]:
-    words = ["--kind", "reasoning", "--questions", "asked.csv", "--out", "out", "--solver", "llm", "--model", "tiny"]
+    words = "--kind reasoning --questions asked.csv --out out --question-solver llm --model tiny".split()
     return [*words, "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
 
 

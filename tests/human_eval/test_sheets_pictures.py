@@ -91,7 +91,7 @@ def test_figure_contains_its_words_as_text(
         question = "How many chairs are there?"
         assert main([*words, "--draw", "reasoning", "--queries", question, "--out", "answer.svg"]) == 0
         assert question in (painted_folder / "answer.svg").read_text()
-        assert main([*words, "--figure", "schemes", "--out", "schemes.svg"]) == 0
+        assert main([*words, "--paper-figure", "schemes", "--out", "schemes.svg"]) == 0
         assert all(text in (painted_folder / "schemes.svg").read_text() for text in figure_texts("schemes"))
         assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2
 

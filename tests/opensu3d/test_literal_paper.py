@@ -134,7 +134,8 @@ def test_map_that_differs_from_the_papers_is_detected() -> None:
 # The values of section IV-A, and our readings of what the paper leaves open.
 OF_THE_PAPER = {
     "crop_ratios": (0.8, 1.0, 1.2), "multi_scale": "direct", "multi_view": "direct", "top_m": 5, "border_px": 20.0,
-    "border_reference_width": 1200, "border_shape": "disc", "border_pixels": "background", "background_pixels": "keep",
+    "border_reference_width": 1200, "border_shape": "disc", "border_pixel_rule": "background",
+    "background_pixel_rule": "keep",
     "depth_min": 0.0, "depth_max": 10.0, "eps": 0.02, "frame_voxel": 0.02, "overlap_threshold": 0.3,
     "overlap_rule": "smaller-segment", "density": "scene", "dbscan_eps": 0.1, "dbscan_min_points": 20,
     "split_fraction": 0.8, "instance_score": "ones",

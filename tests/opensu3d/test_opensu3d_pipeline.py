@@ -185,7 +185,7 @@ def test_points_without_an_instance_are_in_the_map_but_in_no_mask() -> None:
     assert on_wall.any()
     assert not on_wall[found.indices].any()
     dropped = run(
-        [look(TWINS, 0)], CONFIG.model_copy(update={"border_pixels": "drop", "background_pixels": "drop"})
+        [look(TWINS, 0)], CONFIG.model_copy(update={"border_pixel_rule": "drop", "background_pixel_rule": "drop"})
     ).finish()
     assert not (dropped.points[:, 2] > 2.5).any()
 
@@ -195,7 +195,7 @@ def test_ring_pixels_are_not_matched_and_go_to_owner_background_or_nowhere() -> 
     plates = {1: Plate((-0.8, 0.8), (-0.6, 0.6)), 2: Plate((-0.1, 0.1), (-0.1, 0.1), 1.999)}
     n_points = {}
     for choice in ("owner", "background", "drop"):
-        config = CONFIG.model_copy(update={"border_px": 10.0, "border_pixels": choice})
+        config = CONFIG.model_copy(update={"border_px": 10.0, "border_pixel_rule": choice})
         found = run([look(plates, 0)], config).finish()
         x, y, _ = np.abs(found.points).T
         is_ring = (x < 0.2) & (y < 0.2) & ((x > 0.13) | (y > 0.13)) & (found.points[:, 2] < 2.5)

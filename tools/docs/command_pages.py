@@ -29,8 +29,8 @@ MORE = {
     "run": "`--methods all` runs OpenSU3D and the seven baselines; `opensu3d@scheme4` (a preset) and "
     "`opensu3d@top_m=1` are variants of a method. See [Run folder](running/run-folder.md), "
     "[Clusters](running/clusters.md) and [GPU](running/gpu.md).",
-    "ablate": "Perception is computed once. `--also all` adds all methods: one run gives the five tables of the "
-    "paper ([Results](numbers/results.md)).",
+    "ablate": "Perception is computed once. `--also-methods all` adds all methods: one run gives the five tables "
+    "of the paper ([Results](numbers/results.md)).",
     "evaluate": "See [Prediction formats](evaluate.md).",
     "reproduce": "See [Reproduce a paper](running/reproduce.md).",
     "report tables": "`report verify` recomputes every cell.",

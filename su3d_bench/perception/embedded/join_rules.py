@@ -23,8 +23,8 @@ class JoinWeights(BaseModel):
     bias: float = 2.8
     contrast: float = -0.68  # colour difference right at the border
     concave: float = -1.25  # the border is an inner edge
-    stepped_colour: float = -3.73  # the colours differ, and the surfaces are off each other's plane by centimetres
-    raised_colour: float = -0.8  # the same for millimetres, if one is much smaller: a plate on a table
+    colour_at_step: float = -3.73  # the colours differ, and the surfaces are off each other's plane by centimetres
+    colour_at_small_step: float = -0.8  # the same for millimetres, if one is much smaller: a plate on a table
     gap: float = -1.0  # share of the border with a jump in depth
     step: float = -1.77  # size of the jump
     contact: float = 0.71  # length of border without a jump
@@ -63,7 +63,7 @@ class SegmenterConfig(BaseModel):
     noise_margin: float = Field(default=4.0, ge=0)  # noise standard deviations not counted as a depth step
     depth_jump: float = Field(default=0.012, gt=0)
     normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller near jumps in depth
-    normal_keep: float = Field(default=0.001, ge=0)  # relative depth by which a neighbour's plane must fit better
+    normal_min_gain: float = Field(default=0.001, ge=0)  # relative depth by which a neighbour's plane must fit better
 
     # superpixels
     colour_unit: float = Field(default=8.0, gt=0)
@@ -86,7 +86,7 @@ class SegmenterConfig(BaseModel):
     structure_flush_relative: float = Field(default=0.0015, gt=0)
     structure_colour: float = Field(default=12.0, gt=0)
     structure_lightness_weight: float = Field(default=0.4, ge=0)
-    structure_patch_fraction: float = Field(default=0.01, ge=0, le=1)  # smaller flush patches are its pattern
+    structure_pattern_fraction: float = Field(default=0.01, ge=0, le=1)  # smaller flush patches are its pattern
 
     # objects
     join: JoinWeights = JoinWeights()
@@ -201,7 +201,7 @@ def remove_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, Bool
     rest = join_surfaces(graph, config, is_structure)
     of_plane = _marks_after(rest, graph, of_plane)
     flush = plane_of_flush(rest.pieces, planes, config)
-    small = rest.pieces.n_pixels < config.structure_patch_fraction * rest.pieces.n_pixels.sum()
+    small = rest.pieces.n_pixels < config.structure_pattern_fraction * rest.pieces.n_pixels.sum()
     of_plane = np.where((of_plane < 0) & small, flush, of_plane)
     joined, of_plane = _join_marked(rest, of_plane, len(planes))
     return joined, of_plane >= 0
@@ -257,8 +257,8 @@ def join_cues(graph: Graph) -> dict[str, Float64Array]:
     return {
         "contrast": _saturating(contrast, 10.0),
         "concave": _saturating(np.maximum(-bend, 0), 0.5),
-        "stepped_colour": _saturating(distance, 0.03) * off_colour,
-        "raised_colour": _saturating(distance, 0.004) * off_colour * (1 - sizes.min(axis=0) / sizes.max(axis=0)),
+        "colour_at_step": _saturating(distance, 0.03) * off_colour,
+        "colour_at_small_step": _saturating(distance, 0.004) * off_colour * (1 - sizes.min(axis=0) / sizes.max(axis=0)),
         "gap": gap,
         "step": _saturating(borders.jump / np.maximum(borders.gap, 1), 0.1),
         "contact": np.log10(1 + borders.n_deep - borders.gap),

@@ -127,7 +127,7 @@ def _planes(
     planes = kernels.fit_planes(half, radius, half_x, half_y)
     reach = config.normal_radius
     planes = kernels.sharpen_planes(
-        planes, half, reach, config.normal_keep, config.noise_margin * noise, half_x, half_y
+        planes, half, reach, config.normal_min_gain, config.noise_margin * noise, half_x, half_y
     )
     return np.asarray(kernels.double_planes(planes, disparity, x, y), np.float32)
 

@@ -109,7 +109,7 @@ def test_small_flush_patch_joins_wall_and_large_patch_is_object() -> None:
     truth = np.zeros(frame.depth_m.shape, bool)
     truth[95:105, 20:30] = True
     assert best_iou(objects(frame, min_region_px=60), truth) < 0.1
-    assert best_iou(objects(frame, min_region_px=60, structure_patch_fraction=0.001), truth) > 0.6
+    assert best_iou(objects(frame, min_region_px=60, structure_pattern_fraction=0.001), truth) > 0.6
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.2])

@@ -54,7 +54,7 @@ def geometry(body: Body) -> Answered:
 def llm(server: ChatServer, *more: str) -> list[str]:
     settings = {"base_url": server.url, "text_model": "tiny", "max_retries": 0}
     record = [f"perception.language.{name}={value}" for name, value in settings.items()]
-    return [*RUN, *ASKED, "--solver", "llm", "--out", "run", *more, "--set", *record]
+    return [*RUN, *ASKED, "--question-solver", "llm", "--out", "run", *more, "--set", *record]
 
 
 def result(folder: Path) -> Any:

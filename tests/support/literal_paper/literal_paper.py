@@ -93,7 +93,7 @@ def around(mask: Array, border_px: int, shape: str) -> Array:
 def back_projected(depth: Array, intrinsics: Array, pose: Array, image: Array, settings: OpenSU3DConfig) -> Cloud:
     """P_frame, Eq. 1: { T (D(u, v) K^-1 (u, v, 1)), M'(u, v) }."""
     has_depth = np.isfinite(depth) & (depth > 0) & (depth >= settings.depth_min) & (depth <= settings.depth_max)
-    if settings.background_pixels == "drop":
+    if settings.background_pixel_rule == "drop":
         has_depth &= image != NONE
     v, u = np.nonzero(has_depth)
     rays = np.linalg.inv(intrinsics) @ np.stack([u, v, np.ones(len(u))])

@@ -49,7 +49,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "border_px": (0.0, 0.4, 1.0, 2.0, 3.0),
     "border_reference_width": (0, 0, 12, 20),
     "border_shape": ("disc", "square"),
-    "background_pixels": ("keep", "keep", "drop"),
+    "background_pixel_rule": ("keep", "keep", "drop"),
     "depth_min": (0.0, 0.0, 0.9),
     "depth_max": (1.1, 10.0),
     "eps": (0.02, 0.04, 0.08, 0.15),
@@ -73,8 +73,8 @@ def random_settings(rng: np.random.Generator) -> OpenSU3DConfig:
         chosen["frame_voxel"] *= chosen["eps"]
     if chosen["density"] != "scene":
         chosen["dbscan_eps"] = 5.0  # which views hit a part is determined if a voxel's points are of one instance
-    if chosen["background_pixels"] == "drop":
-        chosen["border_pixels"] = "drop"
+    if chosen["background_pixel_rule"] == "drop":
+        chosen["border_pixel_rule"] = "drop"
     return OpenSU3DConfig(crop_ratios=tuple(ratios), **chosen)
 
 
