@@ -126,7 +126,7 @@ class SceneMeans(Semantic):
 class Shares:
     """Shares of correctly answered questions, about 10 to 40 per scene."""
 
-    names = ("share of correct answers",)
+    names = ("correct answers",)
 
     def draw(self, rng: np.random.Generator, n: int) -> list[list[ShareCounts]]:
         n_asked, shared = rng.integers(10, 41, n), 0.8 + rng.normal(0, 0.6, n)
@@ -134,11 +134,11 @@ class Shares:
         return [[share_counts([a], [r]) for a, r in zip(n_asked, of_method, strict=True)] for of_method in right]
 
     def values(self, counts: Sequence[ShareCounts], weights: Weights) -> Values:
-        return {"share of correct answers": asking.resampled(counts, weights)[:, 0]}
+        return {"correct answers": asking.resampled(counts, weights)[:, 0]}
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
         counts = asking.ShareCounts.joined(self.draw(rng, 10 * N_TRUTH)[0])
-        return {"share of correct answers": float(asking.shares(counts)[0])}
+        return {"correct answers": float(asking.shares(counts)[0])}
 
 
 class Instances:
@@ -203,7 +203,7 @@ REASONS: Mapping[str, str] = {
     "pooled AP": "rare classes have few instances, and AP of few instances is biased upwards",
     "pooled AP50": "rare classes have few instances, and AP of few instances is biased upwards",
     "mean of scenes": "the scenes' values are skewed",
-    "share of correct answers": "scenes with many questions outweigh the others",
+    "correct answers": "scenes with many questions outweigh the others",
 }
 
 
@@ -287,10 +287,11 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90: an interval is shown from 2 scenes on.\n")
     yield "The same simulations with two alternatives that are not used:\n"
     few = [n for n in sizes if n <= MAX_BOOTSTRAP]
+    single = [name for name in names if not name.endswith("difference")]
     yield from aligned(
         [
             ["", *(f"{kind}, {n} scenes" for kind in (BOOTSTRAP, PSEUDO) for n in few[2::2])],  # 4 and 20 by default
-            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in names),
+            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in single),
         ]
     )
     yield f"\nThe bootstrap: {N_RESAMPLES} resamples, {min(N_BOOTSTRAP, n_simulations)} simulations per cell.\n"
@@ -323,7 +324,7 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     yield (
         "\nShares miss 95 % (in italics) because counts are integers: coverage oscillates with the true share and "
         "the number of items (Brown, Cai and DasGupta). The other two miss it because the distribution over few items "
-        f"is skewed. With fewer than {MIN_ITEMS} items these two have no interval: with 5, coverage would be {few[0]} and {few[1]} %."
+        f"is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would be {few[0]} and {few[1]} %)."
     )
 
 
