@@ -198,7 +198,7 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
 def reproduced(place: Place) -> Path:
     """Tables II and III of OpenSU3D's paper from the fetched data; the archive."""
     words = ("reproduce", "opensu3d", "--table", *TABLES, "--limit", "1", "--out", place.folder / "out")
-    expect("preflight", place.run(*words, "--dry-run"), 0, "everything that is required is here")
+    expect("preflight", place.run(*words, "--dry-run"), 0, "all requirements are available")
     # The fetched networks are tiny, with random weights: the numbers come from embedded perception.
     rc, out, err = place.run(*words, "--profile", "embedded", "--encoder", "embedded", "--quiet")
     assert rc == 0, err

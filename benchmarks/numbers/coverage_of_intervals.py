@@ -126,7 +126,7 @@ class SceneMeans(Semantic):
 class Shares:
     """Shares of correctly answered questions, about 10 to 40 per scene."""
 
-    names = ("share of questions",)
+    names = ("correct answers",)
 
     def draw(self, rng: np.random.Generator, n: int) -> list[list[ShareCounts]]:
         n_asked, shared = rng.integers(10, 41, n), 0.8 + rng.normal(0, 0.6, n)
@@ -134,11 +134,11 @@ class Shares:
         return [[share_counts([a], [r]) for a, r in zip(n_asked, of_method, strict=True)] for of_method in right]
 
     def values(self, counts: Sequence[ShareCounts], weights: Weights) -> Values:
-        return {"share of questions": asking.resampled(counts, weights)[:, 0]}
+        return {"correct answers": asking.resampled(counts, weights)[:, 0]}
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
         counts = asking.ShareCounts.joined(self.draw(rng, 10 * N_TRUTH)[0])
-        return {"share of questions": float(asking.shares(counts)[0])}
+        return {"correct answers": float(asking.shares(counts)[0])}
 
 
 class Instances:
@@ -203,7 +203,7 @@ REASONS: Mapping[str, str] = {
     "pooled AP": "rare classes have few instances, and AP of few instances is biased upwards",
     "pooled AP50": "rare classes have few instances, and AP of few instances is biased upwards",
     "mean of scenes": "the scenes' values are skewed",
-    "share of questions": "scenes with many questions outweigh the others",
+    "correct answers": "scenes with many questions outweigh the others",
 }
 
 
@@ -285,12 +285,13 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
     refused = [(n, n_) for n, of in table.items() for n_ in sizes if (of[n_].per_cent(JACKKNIFE) or 0) < MIN_COVERAGE]
     where = ", ".join(f"{name} at {n} scenes" for name, n in refused)
     yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90: an interval is shown from 2 scenes on.\n")
-    yield "The same benchmarks with the two rejected intervals:\n"
+    yield "The same simulations with two alternatives that are not used:\n"
     few = [n for n in sizes if n <= MAX_BOOTSTRAP]
+    single = [name for name in names if not name.endswith("difference")]
     yield from aligned(
         [
-            ["", *(f"{kind}, {n}" for kind in (BOOTSTRAP, PSEUDO) for n in few[2::2])],  # 4 and 20 of the default sizes
-            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in names),
+            ["", *(f"{kind}, {n} scenes" for kind in (BOOTSTRAP, PSEUDO) for n in few[2::2])],  # 4 and 20 by default
+            *([m, *(_cell(table[m][n].per_cent(k)) for k in (BOOTSTRAP, PSEUDO) for n in few[2::2])] for m in single),
         ]
     )
     yield f"\nThe bootstrap: {N_RESAMPLES} resamples, {min(N_BOOTSTRAP, n_simulations)} simulations per cell.\n"
@@ -315,15 +316,15 @@ RATES = (0.5, 0.7, 0.9, 0.98)
 def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     """The table of intervals over items: Wilson's, computed exactly; those of changes and agreement, simulated."""
     rng = np.random.default_rng([seed, 1])
-    rows = [[f"share of {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
+    rows = [[f"true share {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
     for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
     yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
-        "\nShares miss the target, in italics, because counts are integers: coverage oscillates with rate and "
-        "number (Brown, Cai and DasGupta); changes and agreement because few items are skewed. With fewer than "
-        f"{MIN_ITEMS} items these two have no interval: at 5 coverage is {few[0]} and {few[1]} per cent."
+        "\nShares miss 95 % (in italics) because counts are integers: coverage oscillates with the true share and "
+        "the number of items (Brown, Cai and DasGupta). The other two miss it because the distribution over few items "
+        f"is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would be {few[0]} and {few[1]} %)."
     )
 
 

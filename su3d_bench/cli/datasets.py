@@ -84,7 +84,7 @@ def call_make(arguments: argparse.Namespace) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List datasets and available scenes; with names, also how to obtain missing ones.
+    """List datasets and available scenes; for named datasets, also how to obtain missing ones.
 
     su3d-bench datasets list
     su3d-bench datasets list scannet --json

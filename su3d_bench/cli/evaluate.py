@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "several methods; METHOD alone names PREDICTIONS (default: name of --out)",
+        "method of PREDICTIONS (default: name of --out), or several with their predictions",
         action="extend",
         default=[],
     )
@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "source of confidences if a protocol sets them all to 1 (default: file for ScanNet text)",
+        "confidences if a protocol sets all to 1 (default: file for ScanNet text)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--format FORMAT", "format of the predictions (default: recognised)")
     parser.option(
         "--protocol PROTOCOL",
-        "protocol with the classes (scannet, scannetpp; default: the only one that fits)",
+        "protocol that defines the classes of scannet(pp) files (default: the only one)",
     )
     parser.shared("--text-features")
 

@@ -205,7 +205,7 @@ def add_data(verbs: Verbs) -> None:
     parser.option("scans [SCAN...]", "scans or splits: scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
     parser.option("--script FILE", "your official download script", given)
-    parser.option("--from URL", "your URL of a folder with v1/scans and v2/scans", given, dest="address")
+    parser.option("--from URL", "URL that you received, a folder with v1/scans and v2/scans", given, dest="address")
     _add_fetch_options(parser, has_servers=False)
 
 
@@ -224,7 +224,7 @@ def call_replica(arguments: argparse.Namespace) -> None:
 
 
 def call_scannet(arguments: argparse.Namespace) -> None:
-    """Download ScanNet into $SU3D_DATA with the official script or your link.
+    """Download ScanNet into $SU3D_DATA with the official script or the URL that you received.
 
     su3d-bench datasets fetch scannet --script download-scannet.py
     su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet

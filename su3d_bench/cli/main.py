@@ -55,7 +55,7 @@ def build_parser(verb: str | None = None) -> Parser:
     """The parser of all commands, or of ``verb`` only if it is one; imports nothing heavy."""
     parser = Parser(prog="su3d-bench", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
-    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verbs = parser.add_subparsers(dest="verb", metavar="COMMAND", required=True)
     known = [one for group in GROUPS.values() for one in group]
     for name in dict.fromkeys(MODULE_OF.get(one, one) for one in ([verb] if verb in known else known)):
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)

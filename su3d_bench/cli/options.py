@@ -124,7 +124,7 @@ def add_group(verbs: Verbs, name: str, add: Callable[[Verbs], None], *, lists: b
 
     Without a command it runs ``list`` if it ``lists``.
     """
-    return _parser(verbs, name, add.__doc__).add_subparsers(dest="action", metavar="VERB", required=not lists)
+    return _parser(verbs, name, add.__doc__).add_subparsers(dest="action", metavar="COMMAND", required=not lists)
 
 
 def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
@@ -175,7 +175,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
     [
         option("run RUN", "run folder"),
         option("runs RUN...", "folders of finished runs"),
-        option("--jobs N", "parallel processes (default: number of CPU cores)", type=count),
+        option("--jobs N", "number of parallel jobs (default: number of CPU cores)", type=count),
         option("--device DEVICE", "device for models and matching: cpu, cuda or cuda:N (default: cpu)"),
         option("--methods METHOD...", "methods to use (default: all)", default=[]),
         option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
@@ -196,10 +196,10 @@ SHARED: dict[str, dict[str, Any]] = dict(
             choices=TABLE_FORMATS,
         ),
         option("--seed N", "random seed (default: 0)", type=index, default=0),
-        option("--limit N", "use only the first N updates of each scene (marked partial)", type=int),
+        option("--limit N", "process only the first N frames of each scene (results are marked partial)", type=int),
         option(
             "--profile PROFILE",
-            "perception backend: auto, embedded, oracle, stored or paper (default: auto)",
+            "source of masks and features: embedded models, paper, oracle, stored or auto (default)",
         ),
         option(
             "--question-solver",
@@ -209,7 +209,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--exclude-ids FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
-            ".npz file with text features, for predictions with features",
+            ".npz file with features of the class names, for predictions without labels",
         ),
         option(
             "--queries FILE",
@@ -220,11 +220,11 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "--ray-address ADDRESS",
             "address of the Ray cluster, or local to start one (default: $RAY_ADDRESS)",
         ),
-        option("--gpus-per-job N", "GPUs per scene (ray, slurm), such as 0.5", type=float),
+        option("--gpus-per-job N", "GPUs per job (ray, slurm), such as 0.5", type=float),
         option("--retries N", "retries of a scene after a lost worker (default: 2)", type=int),
         option("--slurm KEY=VALUE...", "submitit options, such as slurm_partition=gpu timeout_min=60"),
         option("--offline", "use only stored replies of language models", action=argparse.BooleanOptionalAction),
-        option("--dry-run", "show what would be done and what it takes, and exit"),
+        option("--dry-run", "show what would be done and the time, memory and disk it needs, and exit"),
     ]
 )
 SHARED["--table-format"] = SHARED["--format"]  # where --format is an input format

@@ -30,16 +30,16 @@ def add_parser(verbs: Verbs) -> None:
     add_verb(actions, "list", call_list)
     parser = add_verb(actions, "show", call_show)
     parser.option("name PROTOCOL", "protocol, or .toml file")
-    parser.option("--names", "print the texts, one per line")
+    parser.option("--names", "print the encoded texts of the classes, one per line")
     parser.shared("--queries")
     parser = add_verb(actions, "diff", call_diff)
     parser.option("name A", "protocol, or .toml file")
     parser.option("other B", "protocol to compare with")
     parser.option(
         "--prediction RUN[:METHOD]",
-        "attribute the difference of its scores to the rules",
+        "run to score under both, to show the effect of each rule",
     )
-    parser.option("--out PNG", "plot of the steps (with --prediction)")
+    parser.option("--out PNG", "plot of the effect of each rule (with --prediction)")
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol P", "protocol, or .toml file", required=True)

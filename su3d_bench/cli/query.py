@@ -44,7 +44,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.option(
         "--names",
-        "labels n, or n' of runs refine (default: n' if available)",
+        "labels of the map, or refined by runs refine (default: refined if available)",
         choices=("auto", "label", "refined"),
         default="auto",
     )

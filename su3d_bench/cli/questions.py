@@ -40,12 +40,14 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--exclude-ids")
     parser.option(
         "--format",
-        "own query sets, or Beacon3D's metadata_*.json (default: own)",
+        "format of this program, or Beacon3D's metadata_*.json (default: own)",
         default=FORMS[0],
         choices=FORMS,
     )
     parser = add_verb(verbs, "show", _show)
-    parser.option("file FILE", "question set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or paper", type=str)
+    parser.option(
+        "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
+    )
     parser = add_verb(verbs, "audit", _audit)
     parser.option(*scenes)
     parser.option("--out DIR", "folder for page, pictures and table")

@@ -230,7 +230,7 @@ def _add_attribution(verbs: Verbs) -> None:
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
-    """Attribute lost points to error types: the gain if each type were corrected.
+    """Attribute errors to types: the gain in each metric if a type were corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
     su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json

@@ -22,7 +22,7 @@ def add_pages(verbs: Verbs) -> None:
     parser.shared("runs")
     parser.option("--out FILE", "page to write (default: page.html)", default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
-    parser.option("--queries TEXT...", "texts for the similarity view (default: eight)")
+    parser.option("--queries TEXT...", "texts for the similarity view (default: eight built-in texts)")
     parser.option("--no-maps", "omit the maps")
     parser.option("--no-errors", "omit the error analysis and the gallery (faster)")
     parser.option("--no-gallery", "omit the gallery of errors")
@@ -42,7 +42,7 @@ def add_archives(verbs: Verbs) -> None:
     parser.option("--out FILE", "archive to write (default: name of the first run)")
     parser.option("--trained-on TEXT", "training data of your weights, for a registry", default="")
     parser = add_verb(verbs, "verify", call_verify)
-    parser.option("files FILE...", "LaTeX files with tables of report tables, or bundle.zip")
+    parser.option("files FILE...", "LaTeX files written by report tables, or bundle.zip")
     parser.option("--root DIR", "folder of the runs (default: current folder, then that of the file)")
 
 
@@ -85,7 +85,7 @@ def call_html(arguments: argparse.Namespace) -> None:
 
 
 def call_rerun(arguments: argparse.Namespace) -> None:
-    """Export frames, masks, maps and ground truth of a run for the rerun viewer.
+    """Export frames, masks, maps and ground truth of a run for the viewer Rerun (rerun.io).
 
     su3d-bench report rerun runs/my-run --out my-run.rrd
     su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd

@@ -32,7 +32,7 @@ RUN_OPTIONS = (
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "reproduce", call, takes_up=True)
-    parser.option("recipe [RECIPE]", "recipe, or .toml file (default: list recipes)")
+    parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
     parser.option("--table NAME...", "experiments to run (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)")
     parser.shared("--dry-run")

@@ -116,7 +116,7 @@ def call_show(arguments: argparse.Namespace) -> None:
 
 
 def call_remove(arguments: argparse.Namespace) -> None:
-    """Remove run folders after confirmation; folders with other files are kept.
+    """Remove run folders after confirmation; folders that contain other files are kept.
 
     su3d-bench runs remove runs/demo
     su3d-bench runs remove runs/a runs/b --yes
@@ -147,7 +147,7 @@ def _is_agreed(lines: list[str]) -> bool:
 
 
 def call_refine(arguments: argparse.Namespace) -> None:
-    """Refine labels: choose one name per instance from its best views (label n'), and exclude large background.
+    """Refine labels: choose a final name per instance from its best views, and exclude large background instances.
 
     su3d-bench runs refine runs/my-run
     su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1

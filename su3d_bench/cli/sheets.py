@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "answers, .csv or .xlsx (default: score the ground truth only)")
+    parser.option("files [FILE...]", "answers, .csv or .xlsx (default: none; score with the ground truth only)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review")
@@ -157,7 +157,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
-    parser.option("--paper-figure", "add the texts of a figure of the paper or its project page", choices=FIGURES)
+    parser.option("--paper-figure", "draw the texts of a figure of the paper or its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
     parser.option("--photo", "add a column with the colours of the scene")
     parser.option("--view", "viewpoint (default: corner)", choices=("corner", "above"), default="corner")

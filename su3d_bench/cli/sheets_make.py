@@ -34,21 +34,19 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call)
     parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
-    parser.option(
-        "--kind ...", "what annotators rate; several kinds give one folder each in DIR", choices=KINDS, required=True
-    )
+    parser.option("--kind ...", "what annotators rate; one folder per kind if several", choices=KINDS, required=True)
     parser.option("--out DIR", "folder for the sheets", required=True)
-    parser.option("--key DIR", "folder for the key (default: DIR-key)")
+    parser.option("--key DIR", "folder for the answer key: which method made which item (default: DIR-key)")
     parser.option(
         "--questions FILE",
-        "question file, paper, or generated (default: generated)",
+        "'generated' (default), 'paper' (those of OpenSU3D's paper), or a question file",
         default="generated",
         type=str,
     )
     parser.shared("--methods")
     parser.option(
         "--scenes S...",
-        "scenes of the run (default: all), or patterns without RUN",
+        "scenes of RUN (default: all); without RUN: scenes or patterns",
         default=[],
     )
     parser.shared("--exclude-ids")

@@ -236,9 +236,7 @@ def make_plan(
     datasets = {target: part_of("dataset", target, settings) for target in targets.values()}
     protocols = protocols_of_run(config.protocols, list(datasets))
     if config.question_solver == "llm" and not any(map(asks_questions, protocols.values())):
-        raise ConfigError(
-            "--question-solver llm: needs a reasoning protocol; add one, such as --protocols rooms-reasoning"
-        )
+        raise ConfigError("--question-solver llm: needs a reasoning protocol, such as --protocols rooms-reasoning")
     if place is None:
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
         existing = existing_run(place.folder.path)

@@ -43,7 +43,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             painted_run(Path(out), "--quiet", *more, scenes=scenes)
         copy_as("a", "other-encoder", "metrics.json", lambda text: text.replace("words-1", "words-2"))
         copy_as(
-            "a", "other-rules", "run.json", lambda text: text.replace(load_protocol("rooms-instance").digest, "0" * 64)
+            "a", "other-rules", "run.json", lambda one: one.replace(load_protocol("rooms-instance").digest, "0" * 64)
         )
         copy_as("a", "old-rules", "run.json", lambda text: text.replace('"version": ', '"version": 9'))
     return folder

@@ -133,11 +133,9 @@ def test_points_have_rows_by_predicted_name_and_by_true_object() -> None:
     assert (rows[0].centre_x_m, rows[0].size_x_m) == (1.5, 3.0)
 
 
-def test_samples_command_has_one_row_per_instance(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_instances_command_has_one_row_each(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "samples.csv"
-    assert main(["report", "samples", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
+    assert main(["report", "instances", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
     rows = samples([run]).rows
     n_predicted = sum(row.kind == "predicted" for row in rows)
     printed = capsys.readouterr()
@@ -149,7 +147,7 @@ def test_samples_command_has_one_row_per_instance(
         written = list(csv.DictReader(stream))
     assert [row["best_iou"] for row in written] == [repr(row.best_iou) for row in rows]
     assert json.loads((tmp_path / "rows.json").read_text())[0]["scene"] == "painted/a"
-    assert main(["report", "samples", str(run), "--methods", "oracle", "--scenes", "painted/b"]) == 0
+    assert main(["report", "instances", str(run), "--methods", "oracle", "--scenes", "painted/b"]) == 0
     result = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert {(row["method"], row["scene"]) for row in result} == {("oracle", "painted/b")}
 
@@ -158,7 +156,7 @@ def test_parquet_has_the_same_rows_and_column_descriptions(run: Path, tmp_path: 
     from pyarrow import parquet
 
     file = tmp_path / "samples.parquet"
-    assert main(["report", "samples", str(run), "--out", str(file), "--quiet"]) == 0
+    assert main(["report", "instances", str(run), "--out", str(file), "--quiet"]) == 0
     table = parquet.read_table(file)
     assert [Sample(**row) for row in table.to_pylist()] == list(samples([run]).rows)
     assert table.schema.field("best_iou").metadata[b"meaning"].startswith(b"highest IoU")

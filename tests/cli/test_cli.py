@@ -73,7 +73,7 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
     ("words", "line"),
     [
         ("rum", "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
-        ("", "the following arguments are required: VERB; see su3d-bench --help"),
+        ("", "the following arguments are required: COMMAND; see su3d-bench --help"),
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),

@@ -211,7 +211,7 @@ def test_method_template_runs_on_the_built_in_rooms() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "printed"),
     [
         (["methods", "new", "there.py"], "exists; choose another name"),
         (["methods", "new", "my_method.txt"], "must end in .py"),

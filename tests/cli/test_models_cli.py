@@ -79,7 +79,7 @@ def test_check_reports_faults_with_exit_code_1(found: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "line"),
     [
         (["models", "check"], "no models found"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),

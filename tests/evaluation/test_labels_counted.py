@@ -45,7 +45,7 @@ def test_mask_has_several_labels_only_with_a_different_label() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "by_features", "are_several", "said"),
+    ("name", "by_features", "are_several", "printed"),
     [
         ("scannet-instance", False, False, "one label"),
         ("scannet-instance", False, True, "the top labels of a mask"),

@@ -105,7 +105,7 @@ def test_redirects_are_followed_only_to_allowed_hosts(server: FileServer, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("served", "said"),
+    ("served", "text"),
     [
         (Served(b"", status=404), "status 404"),
         (Served(b"", status=503), "status 503.*nothing was downloaded"),

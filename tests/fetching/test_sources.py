@@ -34,7 +34,7 @@ def test_every_fact_has_a_reference_and_every_file_uses_https() -> None:
 
 
 @pytest.mark.parametrize(
-    ("address", "said"),
+    ("address", "printed"),
     [
         ("http://example.org/a", "is not encrypted"),
         ("file:///etc/passwd", "is not an address"),

@@ -63,7 +63,7 @@ def test_only_wanted_members_are_unpacked(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("form", ["zip", "gnu"])
 @pytest.mark.parametrize(
-    ("names", "said"),
+    ("names", "printed"),
     [
         (["../out.txt"], "leads out of the folder"),
         (["/tmp/out.txt"], "leads out of the folder"),

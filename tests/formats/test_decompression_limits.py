@@ -116,7 +116,7 @@ def test_torch_archive_with_a_pickle_bomb_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "n", "byte", "told"),
+    ("first", "n", "byte", "result"),
     [
         (b"\x80\x04\x8e" + struct.pack("<Q", 1500 * MIB), 1500, 0, "unpacks to more than"),  # one payload
         (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # memoised again and again

@@ -48,8 +48,8 @@ def result(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, An
 
 
 def asked(server: ChatServer, *more: str) -> list[str]:
-    words = "--kind reasoning --questions asked.csv --out out --question-solver llm --model tiny".split()
-    return [*words, "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
+    words = ["--kind", "reasoning", "--questions", "asked.csv", "--out", "out", "--question-solver", "llm"]
+    return [*words, "--model", "tiny", "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
 
 
 def test_each_kind_has_a_folder_equal_to_a_single_kind_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,7 +120,7 @@ def test_answers_shared_by_maps_are_judged_once(painted_source: RunSource) -> No
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "result"),
     [
         ("lamp #60 is closest to sofa #26: 1.03 m; lamp #102761000071 2.77 m",
          "lamp A is closest to sofa: 1.03 m; lamp B 2.77 m"),

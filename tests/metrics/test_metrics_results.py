@@ -217,7 +217,7 @@ UNFIT: list[tuple[str, Instances, Encoder | None, str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "prediction", "encoder", "said"), UNFIT)
+@pytest.mark.parametrize(("name", "prediction", "encoder", "printed"), UNFIT)
 def test_prediction_without_names_or_with_non_finite_values_is_refused(
     name: str, prediction: Instances, encoder: Encoder | None, printed: str
 ) -> None:

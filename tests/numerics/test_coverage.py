@@ -38,6 +38,6 @@ def test_page_matches_the_simulation_and_coverage_is_at_least_90_percent() -> No
 @pytest.mark.proof
 def test_intervals_of_few_scenes_have_coverage_where_bootstrap_fails() -> None:
     world = coverage.Shares()
-    tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["share of questions"]
+    tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["correct answers"]
     assert 89 < (tally.per_cent(coverage.JACKKNIFE) or 0) < 98  # 93 of the page, within 3 standard errors
     assert (tally.per_cent(coverage.BOOTSTRAP) or 100) < 88

@@ -65,7 +65,7 @@ def test_damaged_record_is_a_one_line_error_that_names_the_field(tmp_path: Path,
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "printed"),
     [
         (
             {"metrics": {"mAcc": 7e300}},
@@ -85,7 +85,7 @@ def test_impossible_metric_value_is_reported(changed: dict[str, Any], printed: s
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("update,total_ms\n0,-1.0\n", "has -1 and 0; expected 0 to 1e+18"),
         ("update,total_ms\n0,7e300\n", "has 0 and 7e+300; expected 0 to"),

@@ -215,7 +215,7 @@ def write_room(root: Path, direction: str, axes: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("header", "said"),
+    ("header", "printed"),
     [("World2CamPose", "world_to_camera"), ("# camera-to-world", "camera_to_world"), ("pose", None)],
 )
 def test_pose_header_is_skipped_and_a_contradicting_one_is_named(

@@ -152,7 +152,7 @@ def test_weights_file_with_code_is_rejected(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "printed"),
     [
         ({"model_type": "bert"}, "an encoder is 'clip' or 'siglip'"),
         ({"vision_config": {"num_hidden_layers": 10**6}}, "num_hidden_layers is 1000000"),

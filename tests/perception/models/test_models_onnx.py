@@ -87,7 +87,7 @@ def test_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file: 
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "said"),
+    ("path", "value", "printed"),
     [
         (("format",), "x", "format is 'x'"),
         (("files", "../x.onnx"), "0", "files must be names inside the folder"),

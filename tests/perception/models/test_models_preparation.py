@@ -65,7 +65,7 @@ def test_old_and_new_processor_files_give_the_same_transform(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "printed"),
     [
         ({"do_normalize": False}, "do_normalize is False"),
         ({"rescale_factor": 1}, "rescale_factor is 1"),
