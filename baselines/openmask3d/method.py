@@ -189,7 +189,7 @@ class OpenMask3D:
         paper="Takmaz et al.: OpenMask3D: Open-Vocabulary 3D Instance Segmentation, NeurIPS 2023",
         source="https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
         licence="MIT",
-        needs=("a mesh of the scan", "Mask3D's exported masks; without them weight-free proposals from the mesh"),
+        needs=("a mesh of the scan", "Mask3D's exported masks; without them geometric proposals from the mesh"),
         status="projection, view choice, crops and means are tested on hand-worked values, file formats on synthetic "
         "files; segments match ScanNet's program on synthetic meshes; compared with the original on a generated "
         "room with the same masks: the same views, 72 of 72 crops; Mask3D's score of a part is a mean of its heat map, "
@@ -350,7 +350,7 @@ class OpenMask3DSegment3D(OpenMask3D):
         source="https://github.com/LeapLabTHU/Segment3D, commit 1861478; "
         "https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
         licence="Apache-2.0 (Segment3D); MIT (OpenMask3D)",
-        needs=("a mesh of the scan", "Segment3D's exported masks; without them weight-free proposals from the mesh"),
+        needs=("a mesh of the scan", "Segment3D's exported masks; without them geometric proposals from the mesh"),
         status="as openmask3d; connected parts, dropped ones and the kept share are tested on hand-worked values; no "
         "public file of these proposals was found; Segment3D's score of a part is a mean of its heat map, "
         "which exports lack: parts keep the score of their mask; no results have been reproduced",

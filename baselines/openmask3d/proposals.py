@@ -164,7 +164,7 @@ def _digest(path: Path, size: int, changed_ns: int) -> str:
     return digest_file(path)
 
 
-SOURCE = "weight-free proposals from the mesh's shape, not a network's"
+SOURCE = "geometric proposals from the mesh's shape, without a network"
 # Surface area (square metres) above which size no longer counts for a part. Chosen on rooms/living0 and rooms/office0.
 FULL_AREA_M2 = 0.5
 MIN_BORDER = 0.2  # added to the relative border length, which is 0 for an isolated part
@@ -234,7 +234,7 @@ Share = Annotated[float, Field(gt=0, le=1)]
 class ProposalConfig(BaseModel):
     """Source of proposals; the defaults are Mask3D's in OpenMask3D if the original has the setting.
 
-    ``proposals``: ``files`` of ``proposals_folder``, ``surface`` for weight-free ones from the mesh, ``oracle``
+    ``proposals``: ``files`` of ``proposals_folder``, ``surface`` for geometric ones from the mesh, ``oracle``
     for the ground truth's instances; ``auto`` uses files if a folder is set, otherwise the surface.
     ``split_parts``: the original's last step on its masks: connected parts, then whole segments by majority
     if ``segment_vote`` is on. Exports already include it, so it applies to ``surface`` only; ``always`` applies it

@@ -44,8 +44,8 @@ NOTES_HEAD = f"""# What was measured
 
 {MACHINE}Summary: [Performance](../docs/running/performance.md).
 """
-MARKS_TITLE = "## Marks"
-MISSED_TITLE = "## What misses its mark, and why"
+TARGETS_TITLE = "## Targets"
+MISSED_TITLE = "## Missed targets"
 ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
@@ -219,7 +219,7 @@ def results_page(before: str, hardware: str | None, rooms: Path | None, corridor
     """The page of results; None keeps the text of ``before``."""
     sections = [
         head_of(before) if hardware is None else PAGE_HEAD.format(hardware=hardware),
-        section_of(before, MARKS_TITLE),
+        section_of(before, TARGETS_TITLE),
         section_of(before, MISSED_TITLE),
         section_of(before, ROOMS_TITLE) if rooms is None else rooms_section(rooms),
         section_of(before, CORRIDORS_TITLE) if corridors is None else corridors_section(corridors),

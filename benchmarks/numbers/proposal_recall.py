@@ -1,7 +1,7 @@
 """Recall of 3D proposals: the upper bound for methods that describe them.
 
 ``python benchmarks proposal_recall rooms/living0 rooms/office0`` prints a Markdown table with one row for the
-weight-free proposals of each method based on proposals and, with ``--folder DIR``, one for those in files. An
+geometric proposals of each method based on proposals and, with ``--folder DIR``, one for those in files. An
 object counts if it is scored and large enough in the protocol, and is covered if a proposal has the IoU.
 """
 

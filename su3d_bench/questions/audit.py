@@ -84,7 +84,7 @@ def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list
         named = {one for one in known if one == kind or (one in GENERATED_KINDS) is is_query}
         if not named:
             hint = suggest(kind, (*known, RETRIEVAL, REASONING), "there are:")
-            raise ConfigError(f"questions audit: no questions of kind '{printable(kind, 40)}'{hint}")
+            raise ConfigError(f"query audit: no questions of kind '{printable(kind, 40)}'{hint}")
         wanted |= named
     return [question for question in questions if not kinds or question.kind in wanted]
 

@@ -73,7 +73,7 @@ class Original(BaseModel):
             return ""
         parts = [self.compared]
         if self.largest_difference is not None:
-            parts.append(f"{self.problems:,} generated problems, largest difference {self.largest_difference:g}")
+            parts.append(f"{self.problems:,} test cases, largest difference {self.largest_difference:g}")
         if self.cases:
             parts.append(f"cases in {', '.join(self.cases)}")
         return "; ".join(parts)
