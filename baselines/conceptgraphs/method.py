@@ -36,7 +36,7 @@ class ConceptGraphs:
         needs=("class-agnostic masks", "an image encoder"),
         status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; compared with "
         "the original on one generated room with the same detections: 62 of 62 and 56 of 56 objects, 450 of 450, 511 "
-        "of 511 associations, points equal if poses are rounded to float32 as in the original; the original's unseeded noise "
+        "of 511 associations, points equal with poses in float32 as in the original; the original's unseeded noise "
         "lowers the median voxel IoU between two of its own runs to 0.65; no results of the paper have been reproduced",
     )
 
