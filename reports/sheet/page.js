@@ -20,11 +20,11 @@
       const kept = JSON.parse(localStorage.getItem(place) || "null");
       if (!kept || typeof kept !== "object") return;
       for (const item of sheet.items) {
-        const told = kept.answers && kept.answers[item.id];
-        if (!told) continue;
+        const saved = kept.answers && kept.answers[item.id];
+        if (!saved) continue;
         for (const name of item.asks) {
-          if (Object.hasOwn(told, name) && asks.get(name).choices.includes(told[name])) {
-            (answers[item.id] ||= {})[name] = told[name];
+          if (Object.hasOwn(saved, name) && asks.get(name).choices.includes(saved[name])) {
+            (answers[item.id] ||= {})[name] = saved[name];
           }
         }
       }

@@ -73,7 +73,7 @@ def call_show(arguments: argparse.Namespace) -> None:
 
 
 def call_make(arguments: argparse.Namespace) -> None:
-    """Generate scenes on disk; the same command resumes an interrupted one.
+    """Generate scenes on disk; the same command resumes after an interruption.
 
     su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'
     su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200

@@ -199,7 +199,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--limit N", "process only the first N frames of each scene (results are marked partial)", type=int),
         option(
             "--profile PROFILE",
-            "source of masks and features: embedded models, paper, oracle, stored or auto (default)",
+            "perception: embedded (built-in models), paper, stored, oracle or auto (default)",
         ),
         option(
             "--question-solver",

@@ -30,7 +30,7 @@ def add_parser(verbs: Verbs) -> None:
     add_verb(actions, "list", call_list)
     parser = add_verb(actions, "show", call_show)
     parser.option("name PROTOCOL", "protocol, or .toml file")
-    parser.option("--names", "print the encoded texts of the classes, one per line")
+    parser.option("--names", "print the texts that are encoded for the classes, one per line")
     parser.shared("--queries")
     parser = add_verb(actions, "diff", call_diff)
     parser.option("name A", "protocol, or .toml file")

@@ -36,7 +36,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--table NAME...", "experiments to run (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)")
     parser.shared("--dry-run")
-    parser.option("--rehearse", "run on synthetic rooms in the same layouts, with embedded perception")
+    parser.option("--rehearse", "run on synthetic rooms in the datasets' file layouts, with embedded perception")
     parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
     parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160")
     parser.option("--predictions METHOD=DIR...", "predictions of methods that are not implemented here", default=[])

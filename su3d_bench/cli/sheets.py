@@ -157,7 +157,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
-    parser.option("--paper-figure", "draw the texts of a figure of the paper or its project page", choices=FIGURES)
+    parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
     parser.option("--photo", "add a column with the colours of the scene")
     parser.option("--view", "viewpoint (default: corner)", choices=("corner", "above"), default="corner")
@@ -166,7 +166,7 @@ def _add_pictures(verbs: Verbs) -> None:
 
 
 def call_pictures(arguments: argparse.Namespace) -> None:
-    """Draw a figure of a run: similarity to texts, labels n and n', or answers with their objects.
+    """Draw a figure of a run: similarity to texts, original and refined labels, or answers.
 
     su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
     su3d-bench sheets pictures runs/my-run --paper-figure schemes --scenes replica/room0 --out schemes.pdf

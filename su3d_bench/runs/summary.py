@@ -259,10 +259,10 @@ def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Fou
 
 def without_score(run: FinishedRun) -> list[tuple[str, str]]:
     """(scene, method) of every job that did not fail but that no protocol scored."""
-    told = {(failure.scene, failure.method) for failure in run.record.failed}
+    known = {(failure.scene, failure.method) for failure in run.record.failed}
     for (method, _), result in run.results.items():
-        told |= {(scene, method) for scene in (result.result.scenes if result.result is not None else ())}
-    return [(scene, method) for scene in run.scenes for method in run.methods if (scene, method) not in told]
+        known |= {(scene, method) for scene in (result.result.scenes if result.result is not None else ())}
+    return [(scene, method) for scene in run.scenes for method in run.methods if (scene, method) not in known]
 
 
 def _names(prediction: Instances) -> tuple[tuple[str, int], ...]:

@@ -335,5 +335,5 @@ class TestVariants:
         cls = registry.load("method", name)
         method = cls(cls.Config())
         assert cls.name == name and method.needs.masks == "none" and not method.needs.true_proposals
-        assert "not a network's" in method.caveat and "reproduced" in cls.about.status
+        assert "without a network" in method.caveat and "reproduced" in cls.about.status
         assert cls(cls.Config(proposals="oracle")).needs.true_proposals

@@ -211,7 +211,7 @@ class TestTree:
         is_box = (np.abs(surface.vertices - (2, 2, 0.5)) <= 0.501).all(axis=1)
         best = np.isin(np.arange(len(is_box)), found.mask(0))
         assert (best & is_box).sum() / (best | is_box).sum() > 0.8
-        assert (np.diff(found.scores) <= 0).all() and "not a network's" in found.source
+        assert (np.diff(found.scores) <= 0).all() and "without a network" in found.source
 
     def test_published_segments_are_used_if_available(self) -> None:
         vertices, triangles = sheet([[0.0] * 6] * 6)

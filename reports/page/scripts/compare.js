@@ -58,13 +58,13 @@ function compared(one, isTurned) {
 
 function differenceStrip(row) {
   const width = 150, most = Math.max(0.02, ...row.scenes.map(([, value]) => Math.abs(value || 0)));
-  const x = (v) => width / 2 + (v / most) * (width / 2 - 6), told = ([scene, value]) => `${scene} ${signed(value)}`;
+  const x = (v) => width / 2 + (v / most) * (width / 2 - 6), label = ([scene, value]) => `${scene} ${signed(value)}`;
   return svg('svg', { width, height: 20, viewBox: `0 0 ${width} 20`, role: 'img',
-    'aria-label': row.scenes.map(told).join(', ') },
+    'aria-label': row.scenes.map(label).join(', ') },
   svg('line', { class: 'track', x1: 0, x2: width, y1: 10, y2: 10 }),
   svg('line', { class: 'tick', x1: width / 2, x2: width / 2, y1: 3, y2: 17 }),
   row.scenes.map((one) => svg('circle', { class: 'dot', cx: x(one[1] || 0), cy: 10, r: 3.5, 'fill-opacity': 0.75 },
-    svg('title', null, told(one)))));
+    svg('title', null, label(one)))));
 }
 
 function provenanceSection() {

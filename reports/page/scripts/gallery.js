@@ -91,9 +91,9 @@ function galleryContent(section) {
     const lists = DATA.gallery.filter((one) => one.protocol === protocols.protocol() && (!side || sideKey(one) === side));
     const sum = (what) => lists.reduce((total, one) => total
       + one[what].reduce((part, value, k) => part + (!scene || one.scenes[k] === scene ? value : 0), 0), 0);
-    const told = sum('told'), there = sum('n');
+    const listed = sum('listed'), there = sum('n');
     status.textContent = `${shown.length} of ${plural(found.length, 'error')}, ${withPhoto} with a photo`
-      + (told < there ? `; only the ${told} most costly of ${there} are listed` : '');
+      + (listed < there ? `; only the ${listed} most costly of ${there} are listed` : '');
     cards.replaceChildren(...shown.map((one) => cardOf(one, metric.input.value, photos.get(one.scene))));
     more.hidden = shown.length === found.length;
   }

@@ -83,8 +83,8 @@ function notesOf(rows) {
   const kinds = [...new Set(ranked.map((one) => one.confidences))];
   if (kinds.length === 1) lines.push(`confidences: ${kinds[0]}`);
   if (kinds.length > 1) {
-    const told = kinds.map((kind) => `${kind} (${ranked.filter((one) => one.confidences === kind).map(nameOf).join(', ')})`);
-    lines.unshift(`MIXED CONFIDENCES: ${told.join('; ')}: average precisions are not comparable`);
+    const parts = kinds.map((kind) => `${kind} (${ranked.filter((one) => one.confidences === kind).map(nameOf).join(', ')})`);
+    lines.unshift(`MIXED CONFIDENCES: ${parts.join('; ')}: average precisions are not comparable`);
   }
   return [...new Set(lines)];
 }

@@ -164,12 +164,12 @@ def summary_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
     for gallery in galleries:
         for one in gallery.of_methods:
             about = {"run": one.run, "method": one.method, "protocol": one.protocol}
-            empty: dict[str, Any] = {"scenes": [], "n": [], "told": [], "kinds": {}, "classes": {}, "pairs": {}}
+            empty: dict[str, Any] = {"scenes": [], "n": [], "listed": [], "kinds": {}, "classes": {}, "pairs": {}}
             of = summary.setdefault((one.run, one.method, one.protocol), about | empty)
             if one.cards:
                 of["scenes"].append(gallery.scene)
                 of["n"].append(one.n)
-                of["told"].append(len(one.cards))
+                of["listed"].append(len(one.cards))
             for card in one.cards:
                 of["kinds"][card.kind] = None
                 of["classes"] |= dict.fromkeys((*card.true, *card.called))

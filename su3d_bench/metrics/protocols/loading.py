@@ -101,8 +101,8 @@ class ResolvedOriginal:
     @property
     def facts(self) -> dict[str, str]:
         """Those of the original; a protocol that inherits it has additional rules."""
-        told = self.original.facts
-        return told if self.base is None else {"original of": f"{self.base}, which these rules extend", **told}
+        facts = self.original.facts
+        return facts if self.base is None else {"original of": f"{self.base}, which these rules extend", **facts}
 
 
 def original_of(name: str) -> ResolvedOriginal | None:
