@@ -284,7 +284,7 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
             yield f"\n- {name} at {', '.join(map(str, of_sizes))} scenes: {reason}."
     refused = [(n, n_) for n, of in table.items() for n_ in sizes if (of[n_].per_cent(JACKKNIFE) or 0) < MIN_COVERAGE]
     where = ", ".join(f"{name} at {n} scenes" for name, n in refused)
-    yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90: an interval is shown from 2 scenes on.\n")
+    yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90, so intervals are shown from 2 scenes on.\n")
     yield "The same simulations with two alternatives that are not used:\n"
     few = [n for n in sizes if n <= MAX_BOOTSTRAP]
     single = [name for name in names if not name.endswith("difference")]
@@ -319,12 +319,14 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     rows = [[f"true share {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
     for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
+    yield "Intervals over items such as annotators' ratings (see below):\n"
     yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
         "\nShares miss 95 % (in italics) because counts are integers: coverage oscillates with the true share and "
-        "the number of items (Brown, Cai and DasGupta). The other two miss it because the distribution over few items "
-        f"is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would be {few[0]} and {few[1]} %)."
+        "the number of items (Brown, Cai and DasGupta). The other two rows are slightly below 95 % where the "
+        f"distribution over few items is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would "
+        f"be {few[0]} and {few[1]} %)."
     )
 
 
