@@ -50,10 +50,10 @@ ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
 `make bench-methods`: corridors of the given lengths, perfect masks, one update per frame. OpenMask3D's map is the
-complete scan from the first frame on, so it uses the first metres of several corridors. Milliseconds are medians
-without reading and perception, over the tenth of the updates with the smallest maps and the tenth with the largest.
-Exponents, with 95 % intervals, are those of log-log fits against the points of the method's map: of the total, and of
-stages that grow and take at least 1/20 of that time.
+complete scan from the first frame on, so it is measured on the first metres of several corridors. Milliseconds are
+medians without reading and perception, over the tenth of the updates with the smallest maps and the tenth with the
+largest. Exponents, with 95 % intervals, are slopes of log-log fits of time against the number of map points, for the
+total and for stages that grow and take at least 1/20 of it.
 """
 MIN_SHARE = 0.05  # minimum share of the time (without reading and perception) to list a stage
 
