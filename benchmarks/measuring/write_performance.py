@@ -138,8 +138,8 @@ def rooms_section(run: Path) -> str:
             ]
         )
     scenes = ", ".join(read_run(run).scenes)
-    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes side by side. "
-    text += "Medians over updates, slowest `finish`, memory of the process."
+    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes at a time. "
+    text += "Medians over updates (map update: without reading and perception), slowest `finish`, memory of the process."
     return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
 
 
