@@ -139,7 +139,7 @@ def rooms_section(run: Path) -> str:
         )
     scenes = ", ".join(read_run(run).scenes)
     text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes at a time. "
-    text += "Medians over updates (map update: without reading and perception), slowest `finish`, memory of the process."
+    text += "Medians over updates (map update: without reading and perception), slowest `finish`, process memory."
     return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
 
 
