@@ -50,10 +50,10 @@ ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
 `make bench-methods`: corridors of the given lengths, perfect masks, one update per frame. OpenMask3D's map is the
-complete scan from the first frame on, so it uses the first metres of several corridors. Milliseconds are medians
-without reading and perception, over the tenth of the updates with the smallest maps and the tenth with the largest.
-Exponents, with 95 % intervals, are those of log-log fits against the points of the method's map: of the total, and of
-stages that grow and take at least 1/20 of that time.
+complete scan from the first frame on, so it is measured on the first metres of several corridors. Milliseconds are
+medians without reading and perception, over the tenth of the updates with the smallest maps and the tenth with the
+largest. Exponents, with 95 % intervals, are slopes of log-log fits of time against the number of map points, for the
+total and for stages that grow and take at least 1/20 of it.
 """
 MIN_SHARE = 0.05  # minimum share of the time (without reading and perception) to list a stage
 
@@ -138,8 +138,8 @@ def rooms_section(run: Path) -> str:
             ]
         )
     scenes = ", ".join(read_run(run).scenes)
-    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes side by side. "
-    text += "Medians over updates, slowest `finish`, memory of the process."
+    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes at a time. "
+    text += "Medians over updates (map update: without reading and perception), slowest `finish`, process memory."
     return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
 
 
