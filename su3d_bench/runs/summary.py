@@ -142,7 +142,7 @@ def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str 
         return f"{what}, by the protocol"
     named = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
     are_equal = EVERY_SCENE in named or named >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
-    return "the same for all instances of a scene" if are_equal else COMPUTED_BY_METHOD
+    return "constant within each scene" if are_equal else COMPUTED_BY_METHOD
 
 
 def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:

@@ -75,6 +75,6 @@ def test_source_of_confidences_is_reported() -> None:
     assert confidences_of(load_protocol("rooms-semantic"), numbers()) is None
     assert confidences_of(ones, numbers()) == "1 for every instance, by the protocol"
     assert confidences_of(load_protocol("query-ap"), numbers()) == "similarity to the query, by the protocol"
-    assert confidences_of(own, numbers("d/a", "d/b")) == "the same for all instances of a scene"
-    assert confidences_of(own, numbers("every scene")) == "the same for all instances of a scene"
+    assert confidences_of(own, numbers("d/a", "d/b")) == "constant within each scene"
+    assert confidences_of(own, numbers("every scene")) == "constant within each scene"
     assert confidences_of(own, numbers("d/a")) == "computed by the method"
