@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "name of the method (default: that of --out), or METHOD=PREDICTIONS for several",
+        "NAME of the method (default: that of --out), or METHOD=PREDICTIONS for several",
         action="extend",
         default=[],
     )
@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "rank by protocol (all 1) or file (default: protocol; ScanNet text: file)",
+        "use those of the protocol or of the file (default: protocol; ScanNet text: file)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

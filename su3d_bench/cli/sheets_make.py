@@ -36,7 +36,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
     parser.option("--kind ...", "what annotators rate; one folder per kind if several", choices=KINDS, required=True)
     parser.option("--out DIR", "folder for the sheets", required=True)
-    parser.option("--key DIR", "folder for the answer key: which method made which item (default: DIR-key)")
+    parser.option("--key DIR", "folder for the answer key: which method made which item (default: <--out>-key)")
     parser.option(
         "--questions FILE",
         "'generated' (default), 'paper' (those of OpenSU3D's paper), or a question file",
