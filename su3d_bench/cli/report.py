@@ -224,7 +224,7 @@ def _add_attribution(verbs: Verbs) -> None:
     parser.shared("run")
     parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
     parser.shared("--protocols")
-    parser.option("--oracle RUN", "the same run with --profile oracle (perfect 2D masks)")
+    parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
     parser.option("--out PNG", "plot to write")
     parser.shared("--format")
 

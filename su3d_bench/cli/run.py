@@ -157,7 +157,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
 def call_ablate(arguments: argparse.Namespace) -> int:
     """Run an ablation: vary settings of a method, one at a time, on the same scenes.
 
-    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --also-methods conceptgraphs --scenes 'rooms/*' --out runs/sweep
+    su3d-bench ablate --vary top_m=1,5,10 k=1,3,5 --also-methods conceptgraphs --scenes 'rooms/*' --out runs/sweep
     su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run
     """
     from su3d_bench.core import registry
