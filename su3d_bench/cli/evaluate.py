@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "name of the method (default: that of --out); METHOD=PREDICTIONS to score several",
+        "name of the method (default: name of --out), or METHOD=PREDICTIONS to score several",
         action="extend",
         default=[],
     )

@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (without: only the ground truth's verdicts)")
+    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: only the ground truth's verdicts)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review")
