@@ -323,8 +323,8 @@ def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
-        "\nShares miss 95 % (in italics) because counts are integers: coverage oscillates with the true share and "
-        "the number of items (Brown, Cai and DasGupta). The other two rows are slightly below 95 % where the "
+        "\nThe coverage of shares deviates from 95 % (in italics) because counts are integers: it oscillates with the "
+        "true share and the number of items (Brown, Cai and DasGupta). The other two rows are slightly below 95 % where the "
         f"distribution over few items is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would "
         f"be {few[0]} and {few[1]} %)."
     )

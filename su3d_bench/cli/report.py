@@ -230,7 +230,7 @@ def _add_attribution(verbs: Verbs) -> None:
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
-    """Attribute errors to types: the gain in each metric if a type were corrected.
+    """Show the score lost to each type of error: the gain in each metric if the type were corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
     su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json
