@@ -316,17 +316,17 @@ RATES = (0.5, 0.7, 0.9, 0.98)
 def over_items(n_simulations: int, seed: int) -> Iterator[str]:
     """The table of intervals over items: Wilson's, computed exactly; those of changes and agreement, simulated."""
     rng = np.random.default_rng([seed, 1])
-    rows = [[f"true share {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
+    rows = [[f"true proportion {rate:g}", *(_marked(100 * wilson(rate, n)) for n in ITEMS)] for rate in RATES]
     for name, simulated in (("paired change", change), ("Krippendorff's alpha, 3 annotators", agreement)):
         rows.append([name, *(_marked(100 * simulated(rng, n, n_simulations)) for n in ITEMS)])
     yield "Intervals over items such as annotators' ratings (see below):\n"
     yield from aligned([["coverage, %", *(f"{n} items" for n in ITEMS)], *rows])
     few = [f"{100 * simulated(rng, 5, n_simulations):.1f}" for simulated in (change, agreement)]
     yield (
-        "\nThe coverage of shares deviates from 95 % (in italics) because counts are integers: it oscillates with the "
-        "true share and the number of items (Brown, Cai and DasGupta). The other two rows are slightly below 95 % where the "
-        f"distribution over few items is skewed; below {MIN_ITEMS} items they have no interval (with 5, coverage would "
-        f"be {few[0]} and {few[1]} %)."
+        "\nThe coverage of proportions deviates from 95 % (in italics) because counts are integers: it oscillates with "
+        "the true proportion and the number of items (Brown, Cai and DasGupta). The other two rows are slightly below "
+        f"95 % where the distribution over few items is skewed; below {MIN_ITEMS} items they have no interval (with 5, "
+        f"coverage would be {few[0]} and {few[1]} %)."
     )
 
 
