@@ -85,7 +85,7 @@ class Started:
                 process.kill()
 
     def left_behind(self) -> list[str]:
-        programs = [f"{process.pid} {process.name()}" for process in self.mentions() if process.is_running()]
+        programs = [str(process.pid) for process in self.mentions() if process.is_running()]  # a name may be gone
         return programs + [path.name for path in self.scratch.iterdir() if path.name.startswith("su3d-")]
 
     def assert_nothing_is_left(self) -> None:
