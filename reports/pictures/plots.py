@@ -16,7 +16,7 @@ from su3d_bench.formats.tables.table import signed
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes
-from su3d_bench.reports.tables.samples import LEFT, n_text
+from su3d_bench.reports.tables.instances import LEFT, n_text
 from su3d_bench.reports.tables.timing import AnytimePoint
 
 if TYPE_CHECKING:

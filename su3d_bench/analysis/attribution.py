@@ -29,7 +29,7 @@ from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.job import as_configured
+from su3d_bench.runs.job import with_visible_truth
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # ground-truth variant -> ground truth
@@ -185,10 +185,10 @@ class Inputs:
             return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
         truth = truth_of(rules.ground_truth)
         prediction = self.of_map(scene)
-        if (part := self._run.visible_truth(self._method)) is None:
+        if (part := self._run.truth_part(self._method)) is None:
             return truth, prediction
         first: str = self._run.dataset(scene).variants[0]
-        return truth, as_configured(part, rules, truth, prediction, lambda: truth_of(first).labels)
+        return truth, with_visible_truth(part, rules, truth, prediction, lambda: truth_of(first).labels)
 
     def _read_map(self, scene: str) -> Prediction:
         return read_prediction(self._run.folder.job(scene, self._method).prediction)

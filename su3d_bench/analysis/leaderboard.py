@@ -148,7 +148,7 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         if protocols and protocol not in protocols:
             continue
         what = f"{printable(method, 80)} / {printable(protocol, 80)}"
-        if reason := _missing_reason(run, protocol, record.failed):
+        if reason := _exclusion_reason(run, protocol, record.failed):
             yield Refused(name, what, reason)
             continue
         try:
@@ -184,7 +184,7 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         )
 
 
-def _missing_reason(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
+def _exclusion_reason(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
     if run.record.is_partial:
         return f"is partial: only the first {counted(run.limit, 'frame')} of each scene"
     if failed:

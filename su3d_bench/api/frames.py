@@ -11,7 +11,7 @@ from dataclasses import astuple
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.samples import COLUMNS, Sample
+from su3d_bench.reports.tables.instances import COLUMNS, InstanceRow
 
 if TYPE_CHECKING:
     import pandas
@@ -41,7 +41,7 @@ DIFFERENCES = {
     "n_scenes": WHOLE,
 }
 _OF_KIND = {"text": TEXT, "whole number": WHOLE, "number": NUMBER, "yes or no": TRUTH}
-SAMPLES = {
+INSTANCES = {
     one.name: WHOLE_OR_NONE if one.may_lack and one.kind == "whole number" else _OF_KIND[one.kind] for one in COLUMNS
 }
 
@@ -94,9 +94,9 @@ def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
     return whole.astype({name: UPDATES.get(name, NUMBER) for name in order})
 
 
-def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
-    """One row per sample; ``report instances --describe-columns`` describes the columns."""
-    return frame(SAMPLES, [astuple(sample) for sample in samples])
+def instances_frame(rows: Sequence[InstanceRow]) -> pandas.DataFrame:
+    """One row per instance; ``report instances --describe-columns`` describes the columns."""
+    return frame(INSTANCES, [astuple(row) for row in rows])
 
 
 def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:

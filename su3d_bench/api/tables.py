@@ -184,11 +184,11 @@ class Run(Scores):
         >>> bool((predicted["best_iou"] == 1).all())
         True
         """
-        return frames.samples_frame(self._all_samples)
+        return frames.instances_frame(self._all_instance_rows)
 
     @cached_property
-    def _all_samples(self) -> Any:
-        return self._samples()
+    def _all_instance_rows(self) -> Any:
+        return self._instance_rows()
 
     def select_instances(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
         """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report instances``.
@@ -202,12 +202,12 @@ class Run(Scores):
         >>> found["kind"].unique().tolist()
         ['predicted', 'true']
         """
-        return frames.samples_frame(self._samples(several(methods), several(protocols), several(scenes)))
+        return frames.instances_frame(self._instance_rows(several(methods), several(protocols), several(scenes)))
 
-    def _samples(self, *chosen: tuple[str, ...]) -> Any:
-        from su3d_bench.analysis.samples import Selection, samples
+    def _instance_rows(self, *chosen: tuple[str, ...]) -> Any:
+        from su3d_bench.analysis.instances import Selection, instance_rows
 
-        return samples([self.path], Selection(*chosen)).rows
+        return instance_rows([self.path], Selection(*chosen)).rows
 
     @property
     def errors(self) -> pandas.DataFrame:

@@ -158,12 +158,12 @@ def _add_instances(verbs: Verbs) -> None:
 def call_instances(arguments: argparse.Namespace) -> None:
     """List every predicted and ground-truth instance: class, confidence, best IoU, error type, box.
 
-    su3d-bench report instances runs/my-run --out samples.csv
-    su3d-bench report instances runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
+    su3d-bench report instances runs/my-run --out instances.csv
+    su3d-bench report instances runs/a runs/b --methods opensu3d --format parquet --out instances.parquet
     """
-    from su3d_bench.analysis.samples import Selection, samples
+    from su3d_bench.analysis.instances import Selection, instance_rows
     from su3d_bench.core.files.atomic import make_folder, write_bytes
-    from su3d_bench.reports.tables.samples import COLUMNS, columns_table, csv_of, parquet_of
+    from su3d_bench.reports.tables.instances import COLUMNS, columns_table, csv_of, parquet_of
     from su3d_bench.runs.finished import read_run
 
     if arguments.describe_columns == bool(arguments.runs):
@@ -175,12 +175,12 @@ def call_instances(arguments: argparse.Namespace) -> None:
     form = arguments.format or ("parquet" if out is not None and out.suffix == ".parquet" else "csv")
     if form == "parquet":
         if out is None:
-            raise ConfigError("--format parquet: is binary; name a file with --out samples.parquet")
+            raise ConfigError("--format parquet: is binary; name a file with --out instances.parquet")
         parquet_of(())  # fail early if it is not installed
     chosen = Selection(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
     with output.progress(n_scenes, is_quiet=arguments.quiet) as report:
-        found = samples(arguments.runs, chosen, report)
+        found = instance_rows(arguments.runs, chosen, report)
     remark(*found.remarks, quiet=arguments.quiet)
     if out is not None:
         make_folder(out.parent)
@@ -236,7 +236,7 @@ def call_attribution(arguments: argparse.Namespace) -> None:
     su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json
     """
     from su3d_bench.analysis.attribution import attribute
-    from su3d_bench.reports.tables.samples import attribution_tables
+    from su3d_bench.reports.tables.instances import attribution_tables
 
     chosen = {name: getattr(arguments, name) for name in ("method", "protocols", "oracle")}
     attribution = attribute(arguments.run, **chosen).to_json()

@@ -161,8 +161,8 @@ class Scoring:
         facts = scene_scoring.facts_of(prediction.content)
         if any(rules.names_masks for rules in self.rules.values()):
             facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
-        incompatibility = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
-        reasons = {name: reason for name, reason in incompatibility.items() if reason is not None}
+        found = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
+        reasons = {name: reason for name, reason in found.items() if reason is not None}
         for name, reason in reasons.items():
             if self._is_named or self._first is not None:
                 raise PredictionError(f"{where}: {name}: {reason}")

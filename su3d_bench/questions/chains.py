@@ -107,7 +107,7 @@ MAX_PER_TEMPLATE = 4  # questions of one template about one object
 
 
 @dataclass(frozen=True)
-class GeneratedQuestionRecord:
+class ChainQuestion:
     """A question about an object; ``hint`` are the words that determine the answer: a text with them reveals it."""
 
     text: str
@@ -159,7 +159,7 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[GeneratedQuestionRecord]:
+def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[ChainQuestion]:
     """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
     # a text with the words that determine an answer reveals it
     asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
@@ -171,7 +171,7 @@ def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[Ge
         turn[one.tag] += 1
         ranked.append((turn[one.tag], _digest(f"{thing.id} {one.tag}"), one))
     ranked.sort(key=lambda entry: entry[:2])
-    drawn: dict[tuple[str, str], GeneratedQuestionRecord] = {}
+    drawn: dict[tuple[str, str], ChainQuestion] = {}
     for _, _, one in ranked:
         drawn.setdefault((one.tag, one.hint), one)
     return list(drawn.values())[:CHAINS_EACH]
@@ -181,18 +181,18 @@ def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
 
 
-def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
+def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """All questions about an object referred to by an unambiguous text."""
     it = f"the {text}" if len(text.split()) <= MAX_UNQUOTED_WORDS else f"'the {text}'"
     colours = sorted(set(thing.caption.split()) & COLOURS)
     if len(colours) == 1:
-        yield GeneratedQuestionRecord(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
+        yield ChainQuestion(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
         named = sorted(COLOURS - set(colours))
         other = named[_digest(it)[0] % len(named)]
         for word, answer in ((colours[0], "Yes"), (other, "No")):
-            yield GeneratedQuestionRecord(f"Is {it} {word}?", answer, "appearance", colours[0])
+            yield ChainQuestion(f"Is {it} {word}?", answer, "appearance", colours[0])
     alone = [other for other in objects.objects if _is_alone(other, objects) and other.id != thing.id]
-    yield from _supported_objects(thing, it, objects)
+    yield from _support_question(thing, it, objects)
     yield from _measured(thing, it, alone)
     yield from _beside(thing, it, alone, objects)
     yield from _existing(thing, it, objects)
@@ -209,16 +209,16 @@ def _called(name: str, objects: SceneMap) -> list[MapObject]:
     return [other for other in objects.objects if wanted <= set(words(other.name)) or set(words(other.name)) <= wanted]
 
 
-def _supported_objects(thing: MapObject, it: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
+def _support_question(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """The supporting object, if there is exactly one."""
     others = [other for other in objects.objects if other.id != thing.id]
     under = [other for other in others if objects.holds("on", thing, other)]
     is_sure = not any(objects.is_doubtful("on", thing, other) for other in others)
     if len(under) == 1 and is_sure and under[0].is_query_target:
-        yield GeneratedQuestionRecord(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
+        yield ChainQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
 
 
-def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[GeneratedQuestionRecord]:
+def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[ChainQuestion]:
     """Height and size comparisons with a clear margin, between completely observed objects."""
     ways = 0
     for other in sorted(alone, key=lambda other: _digest(f"{it} {other.name}")):
@@ -235,12 +235,10 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator
         else:
             continue
         ways += 1
-        yield GeneratedQuestionRecord(text, answer, "geometry", f"{answer} {other.name}")
+        yield ChainQuestion(text, answer, "geometry", f"{answer} {other.name}")
 
 
-def _beside(
-    thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap
-) -> Iterator[GeneratedQuestionRecord]:
+def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object is next to another, and which of two is closer by a clear margin."""
     for other in alone:
         if objects.is_doubtful("next to", thing, other):
@@ -248,17 +246,17 @@ def _beside(
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
             answer = "Yes" if is_next else "No"
-            yield GeneratedQuestionRecord(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
+            yield ChainQuestion(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
     ranked = sorted(alone, key=lambda other: gap_m(thing.box, other.box))
     for near, far in zip(ranked[:MAX_PER_TEMPLATE], reversed(ranked), strict=False):
         if gap_m(thing.box, far.box) - gap_m(thing.box, near.box) < LEAD_M or near is far:
             continue
         first, second = sorted((near.name, far.name), key=lambda name: _digest(f"{it} {name}"))
         text = f"Which is closer to {it}, the {first} or the {second}?"
-        yield GeneratedQuestionRecord(text, near.name.capitalize(), "spatial", near.name)
+        yield ChainQuestion(text, near.name.capitalize(), "spatial", near.name)
 
 
-def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[GeneratedQuestionRecord]:
+def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object with a name is next to an object; the answer is no if all such objects are far away."""
     names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
     ways = Counter[str]()
@@ -272,4 +270,4 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[Generate
         answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1
-            yield GeneratedQuestionRecord(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)
+            yield ChainQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)

@@ -245,7 +245,7 @@ class Solver:
         kept: list[MapObject] = []
         related: dict[int, MapObject] = {}
         for thing in meant.objects:
-            witnesses = self._supporting_objects(thing, phrase.relation, others)
+            witnesses = self._related_objects(thing, phrase.relation, others)
             if witnesses:
                 kept.append(thing)
                 related |= {other.id: other for other in witnesses}
@@ -260,7 +260,7 @@ class Solver:
     def _has_no(self, noun: str) -> str:
         return f"the map has no '{noun}'{scene_map.name_suggestion(noun, self._scene)}"
 
-    def _supporting_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
+    def _related_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``thing`` has the ``relation``."""
         if relation == "between":
             if len(others) == 1 and len(others[0]) == 2:

@@ -39,7 +39,7 @@ SCHEMA = 1
 @dataclass(frozen=True)
 class Compared:
     """A printed cell. ``reported``: as printed, in per cent; ``measured``, ``interval``, ``difference``: in percentage
-    points, None if nothing was measured (``incompatibility`` has the reason); ``causes``: in order of importance."""
+    points, None if nothing was measured (``missing_reason`` has the reason); ``causes``: in order of importance."""
 
     experiment: str
     method: str
@@ -54,7 +54,7 @@ class Compared:
     run_method: str | None = None
     n_scenes: int = 0
     causes: tuple[str, ...] = ()
-    incompatibility: str = ""
+    missing_reason: str = ""
     source: str = ""
 
     @property
@@ -121,7 +121,7 @@ def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results
     )  # fmt: skip
     row = _measured(experiment, figure, method, name, results)
     if row is None:
-        return replace(blank, incompatibility=_missing_reason(experiment, figure, method, name, results))
+        return replace(blank, missing_reason=_missing_reason(experiment, figure, method, name, results))
     interval = row.intervals.get(name)
     value = row.metrics[name]
     assert value is not None
@@ -296,7 +296,7 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
 
 def _notes_of(cell: Compared) -> list[str]:
     if cell.measured is None:
-        return [f"not measured: {cell.incompatibility}"]
+        return [f"not measured: {cell.missing_reason}"]
     what = list(cell.causes) or ["no known differences: protocol, encoder, proposals and stride are the paper's"]
     return [f"under {cell.protocol}", *what]
 

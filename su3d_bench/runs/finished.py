@@ -134,11 +134,11 @@ class FinishedRun:
         """The dataset of ``scene``; a ``DataError`` if its data differ from those of the run."""
         return self.data.dataset(scene)
 
-    def visible_truth(self, method: str) -> Part | None:
+    def truth_part(self, method: str) -> Part | None:
         """The method with its settings if it is a built-in one that uses ground truth, otherwise None."""
-        is_own = method in registry.METHODS and method not in self.external
-        is_told = is_own and hasattr(registry.load("method", method), "receive_ground_truth")
-        return part_of("method", method, self.data.settings) if is_told else None
+        is_built_in = method in registry.METHODS and method not in self.external
+        uses_truth = is_built_in and hasattr(registry.load("method", method), "receive_ground_truth")
+        return part_of("method", method, self.data.settings) if uses_truth else None
 
     def encoder(self, device: str = "cpu") -> Encoder:
         """The text encoder that matches the run's features; a ``PredictionError`` if a different one is used here."""

@@ -60,7 +60,7 @@ def build_method(part: Part) -> Any:
     return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
 
 
-def as_configured(
+def with_visible_truth(
     part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
 ) -> Prediction:
     """``prediction``, a map of the method ``part``; computed again for a method that uses ground truth if ``rules``

@@ -325,7 +325,7 @@ class _Scene:
                 unscored[rules.name] = reason
                 continue
             self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
-            configured = jobs.as_configured(part, rules, truth, prediction, lambda: self.first_truth.labels)
+            configured = jobs.with_visible_truth(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
             scores[rules.name] = score_scene(rules, known, configured, encoder)
         return scores, unscored

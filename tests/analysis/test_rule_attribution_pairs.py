@@ -159,7 +159,7 @@ def _places(runs: dict[str, Path], request: pytest.FixtureRequest, monkeypatch: 
     monkeypatch.setenv("SU3D_CACHE", str(runs[dataset] / "cache"))
     monkeypatch.setattr(finished, "encoder_of", lambda run, device: NamingEncoder())
     # The map in the oracle's place is a faulty one, which does not use ground truth
-    monkeypatch.setattr(finished.FinishedRun, "visible_truth", lambda run, method: None)
+    monkeypatch.setattr(finished.FinishedRun, "truth_part", lambda run, method: None)
 
 
 def alone(rules: ProtocolRules, run_folder: Path) -> Any:

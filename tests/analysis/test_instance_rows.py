@@ -16,7 +16,7 @@ from painted_runs import COLLECTOR, painted_run, see_painted
 from scored_room import ENCODER, noisy
 
 from su3d_bench.analysis.attribution import attribute
-from su3d_bench.analysis.samples import _OfPoints, samples
+from su3d_bench.analysis.instances import _OfPoints, instance_rows
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks
@@ -25,7 +25,7 @@ from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_insta
 from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.reports.tables.samples import Sample
+from su3d_bench.reports.tables.instances import InstanceRow
 from su3d_bench.runs import finished as finished_run
 
 
@@ -62,7 +62,7 @@ def test_hits_and_errors_match_evaluator_and_attribution(name: str, seed: int) -
 
 def test_rows_of_points_add_up_to_the_confusion_matrix_and_the_causes_of_the_run(run: Path) -> None:
     """Number of points and correct points per true class, and number of points per predicted class."""
-    rows = [row for row in samples([run]).rows if row.protocol == "rooms-semantic"]
+    rows = [row for row in instance_rows([run]).rows if row.protocol == "rooms-semantic"]
     finished = finished_run.read_run(run)
     names = [entry.name for entry in finished.rules("rooms-semantic").classes]
     for method in finished.methods:
@@ -93,7 +93,7 @@ def test_rows_of_points_add_up_to_the_confusion_matrix_and_the_causes_of_the_run
     }
 
 
-def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
+def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[InstanceRow]:
     """Ten points: a chair of six points (instance 4), two lamp points without an instance, two points of no class."""
     rules = load_protocol("rooms-semantic")
     chair, lamp = ([entry.name for entry in rules.classes].index(name) for name in ("chair", "lamp"))
@@ -136,7 +136,7 @@ def test_points_have_rows_by_predicted_name_and_by_true_object() -> None:
 def test_instances_command_has_one_row_each(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "samples.csv"
     assert main(["report", "instances", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
-    rows = samples([run]).rows
+    rows = instance_rows([run]).rows
     n_predicted = sum(row.kind == "predicted" for row in rows)
     printed = capsys.readouterr()
     assert printed.out == f"{file}: {n_predicted} predicted instances, {len(rows) - n_predicted} ground-truth\n"
@@ -158,5 +158,5 @@ def test_parquet_has_the_same_rows_and_column_descriptions(run: Path, tmp_path: 
     file = tmp_path / "samples.parquet"
     assert main(["report", "instances", str(run), "--out", str(file), "--quiet"]) == 0
     table = parquet.read_table(file)
-    assert [Sample(**row) for row in table.to_pylist()] == list(samples([run]).rows)
+    assert [InstanceRow(**row) for row in table.to_pylist()] == list(instance_rows([run]).rows)
     assert table.schema.field("best_iou").metadata[b"meaning"].startswith(b"highest IoU")

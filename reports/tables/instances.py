@@ -25,8 +25,8 @@ _KINDS: Mapping[str, Kind] = {
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A predicted or ground-truth instance under one protocol: the columns of ``samples.toml``, in order."""
+class InstanceRow:
+    """A predicted or ground-truth instance under one protocol: the columns of ``instances.toml``, in order."""
 
     run: str
     scene: str
@@ -57,7 +57,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the samples; ``may_lack``: whether cells may be empty."""
+    """A column of the table; ``may_lack``: whether cells may be empty."""
 
     name: str
     kind: Kind
@@ -65,35 +65,35 @@ class Column:
     meaning: str
 
 
-TEXTS: Mapping[str, Any] = tomllib.loads(file_text(Path(__file__).resolve().parent / "samples.toml"))
+TEXTS: Mapping[str, Any] = tomllib.loads(file_text(Path(__file__).resolve().parent / "instances.toml"))
 COLUMNS = tuple(
     Column(each.name, _KINDS[str(each.type)], "None" in str(each.type), TEXTS["columns"][each.name])
-    for each in fields(Sample)
+    for each in fields(InstanceRow)
 )
 
 
 def columns_table() -> Table:
     """Return the table that describes the columns, one per row."""
     rows = [(one.name, one.kind + (", may be empty" if one.may_lack else ""), one.meaning) for one in COLUMNS]
-    return text_table("samples", [("column", "type", "description"), *rows])
+    return text_table("instances", [("column", "type", "description"), *rows])
 
 
-def csv_of(samples: Sequence[Sample]) -> str:
+def csv_of(rows: Sequence[InstanceRow]) -> str:
     """Return a header and one line per sample: full precision, 1 and 0 for yes and no, empty for None.
 
     >>> csv_of([])[:17]
     'run,scene,method,'
     """
     names = [one.name for one in COLUMNS]
-    return csv_lines([names, *([_cell(value) for value in asdict(sample).values()] for sample in samples)])
+    return csv_lines([names, *([_cell(value) for value in asdict(row).values()] for row in rows)])
 
 
 def _cell(value: object) -> object:
     return "" if value is None else int(value) if isinstance(value, bool) else value
 
 
-def parquet_of(samples: Sequence[Sample]) -> bytes:
-    """Return the samples as a Parquet file with described columns; ``ModelMissing`` without pyarrow."""
+def parquet_of(rows: Sequence[InstanceRow]) -> bytes:
+    """Return the rows as a Parquet file with described columns; ``ModelMissing`` without pyarrow."""
     try:
         import pyarrow
         import pyarrow.parquet
@@ -113,7 +113,7 @@ def parquet_of(samples: Sequence[Sample]) -> bytes:
             for one in COLUMNS
         ]
     )
-    columns = {one.name: [getattr(sample, one.name) for sample in samples] for one in COLUMNS}
+    columns = {one.name: [getattr(row, one.name) for row in rows] for one in COLUMNS}
     stream = io.BytesIO()
     pyarrow.parquet.write_table(pyarrow.table(columns, schema=form), stream)
     return stream.getvalue()

@@ -28,7 +28,7 @@ from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.pictures.maps import names_of
-from su3d_bench.reports.tables.samples import Sample
+from su3d_bench.reports.tables.instances import InstanceRow
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
@@ -39,10 +39,10 @@ EMPTY_MAP_SIMILARITY: Box = (None,) * 6
 
 
 @dataclass(frozen=True)
-class Samples:
+class InstanceRows:
     """The rows, and ``remarks``: what has no rows and why, and caveats of the runs."""
 
-    rows: tuple[Sample, ...]
+    rows: tuple[InstanceRow, ...]
     remarks: tuple[str, ...]
 
 
@@ -55,16 +55,16 @@ class Selection:
     scenes: Sequence[str] = ()
 
 
-def samples(
+def instance_rows(
     paths: Sequence[Path],
     chosen: Selection = Selection(),
     report: Report = lambda event: None,
-) -> Samples:
+) -> InstanceRows:
     """The instances of the runs in the folders ``paths``, scene by scene, under each supported protocol.
 
     Raises ``ConfigError`` if nothing has instances or the run does not have a given name.
     """
-    rows: list[Sample] = []
+    rows: list[InstanceRow] = []
     remarks: list[str] = []
     for run in map(read_run, paths):
         methods = _chosen_methods(run, chosen, remarks)
@@ -76,7 +76,7 @@ def samples(
         remarks += run_remarks(run)
     if not rows and remarks:
         raise ConfigError(f"{remarks[0]}; there are no instances to list")
-    return Samples(tuple(rows), tuple(dict.fromkeys(remarks)))
+    return InstanceRows(tuple(rows), tuple(dict.fromkeys(remarks)))
 
 
 def _chosen_methods(run: FinishedRun, chosen: Selection, remarks: list[str]) -> list[Explained]:
@@ -104,7 +104,7 @@ def _chosen_methods(run: FinishedRun, chosen: Selection, remarks: list[str]) -> 
     return methods
 
 
-def _of_job(matched: Matched) -> Iterator[Sample]:
+def _of_job(matched: Matched) -> Iterator[InstanceRow]:
     explained, rules, prediction = matched.explained, matched.rules, matched.prediction
     has_places = explained.run.data.truth_files is None  # files have no coordinates
     where = (
@@ -129,7 +129,7 @@ def _rows(
     prediction: Instances | Partition,
     seen: SceneOfMasks,
     points: Points | None,
-) -> Iterator[Sample]:
+) -> Iterator[InstanceRow]:
     (values, masks, scoring), overlaps = seen.evaluated, seen.overlaps
     least = scoring.min_region_size
     at_25, at_50 = hits(values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, least, THRESHOLDS)
@@ -142,7 +142,7 @@ def _rows(
     true_classes = [class_of[int(one)] for one in overlaps.class_of_instance]
     for k, name in enumerate(names_of(prediction)):
         met, iou = _best(overlaps.iou[k])
-        yield Sample(
+        yield InstanceRow(
             *where, "predicted", ids[k], k, called[k], printable(name, MAX_NAME_CHARACTERS), float(masks.scores[k]),
             len(masks.masks.mask(k)), None, bool(overlaps.is_counted[k]), iou,
             None if met is None else number_of[met], "" if met is None else true_classes[met],
@@ -150,7 +150,7 @@ def _rows(
         )  # fmt: skip
     for g, members in enumerate(overlaps.members):
         met, iou = _best(overlaps.iou[:, g])
-        yield Sample(
+        yield InstanceRow(
             *where, "true", number_of[g], None, true_classes[g], "", None,
             len(members), None, True, iou, None if met is None else ids[met], "" if met is None else called[met],
             value_of[g] in at_25.values, value_of[g] in at_50.values, errors.of_instance[g], *_box(points, members),
@@ -195,7 +195,7 @@ class _OfPoints:
             self._ids = _ids(prediction, n_predictions(prediction))
             self._names = [printable(name, MAX_NAME_CHARACTERS) for name in names_of(prediction)]
 
-    def rows(self, where: tuple[str, str, str, str]) -> Iterator[Sample]:
+    def rows(self, where: tuple[str, str, str, str]) -> Iterator[InstanceRow]:
         """The predicted rows, then the ground-truth rows."""
         names, iou = self._classes, self._overlaps()
         called_as = np.array([called for called, _ in self._namings], np.int64)
@@ -206,7 +206,7 @@ class _OfPoints:
             met, best = _best(np.where(counted, iou[k], 0.0))
             of = None if met is None else self._objects[met]
             members, hit = np.flatnonzero(self._naming_of == k), hits_of[k].max(initial=0)
-            yield Sample(
+            yield InstanceRow(
                 *where, "predicted", self._ids[mask] if mask >= 0 else None, mask if mask >= 0 else None, names[called],
                 self._names[mask] if mask >= 0 else "", None, len(members), self._n_right(members),
                 bool(self._takes_part[called]), best, None if of is None or of[1] < 0 else of[1],
@@ -217,7 +217,7 @@ class _OfPoints:
             met, best = _best(iou[:, g])
             of = None if met is None else self._namings[met]
             members, hit = np.flatnonzero(self._object_of == g), hits_of[:, g].max(initial=0)
-            yield Sample(
+            yield InstanceRow(
                 *where, "true", number if number >= 0 else None, None, names[true], "", None, len(members),
                 self._n_right(members), bool(self._takes_part[true]), best,
                 None if of is None or of[1] < 0 else self._ids[of[1]],
