@@ -315,8 +315,8 @@ def test_integer_lines_reject_what_python_rejects(content: bytes) -> None:
     assert ours == expected
 
 
-PAGE = (ROOT / "docs/evaluate.md").read_text(encoding="utf-8")
-SECTIONS = dict(re.findall(r"^### `([^`]+)`\n(.*?)(?=^### |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+PAGE = (ROOT / "docs/formats.md").read_text(encoding="utf-8")
+SECTIONS = dict(re.findall(r"^## `([^`]+)`\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 
 
 def test_docs_page_has_one_section_per_format() -> None:

@@ -31,7 +31,7 @@ MORE = {
     "[Clusters](running/clusters.md) and [GPU](running/gpu.md).",
     "ablate": "Perception is computed once. `--also-methods all` adds all methods: one run gives the five tables "
     "of the paper ([Results](numbers/results.md)).",
-    "evaluate": "See [Prediction formats](evaluate.md).",
+    "evaluate": "See [Predictions of other programs](evaluate.md) and [Prediction formats](formats.md).",
     "reproduce": "See [Reproduce a paper](running/reproduce.md).",
     "report tables": "`report verify` recomputes every cell.",
     "report html": "See [HTML report](running/html-report.md).",
@@ -43,9 +43,9 @@ MORE = {
     "check": "See [Regression check in CI](running/regression-check.md).",
     "query ask": "See [Questions about a scene](questions/reasoning.md).",
     "query make": "Score maps with `--protocols rooms-retrieval`: [Several texts per object](questions/objects.md).",
-    "query audit": "See [Human evaluation](questions/human-evaluation.md).",
+    "query audit": "See [Check generated questions](questions/check-questions.md).",
     "sheets make": "Sheets do not reveal the method: [Human evaluation](questions/human-evaluation.md).",
-    "sheets score": "Tables IV and V of the paper: [Human evaluation](questions/human-evaluation.md).",
+    "sheets score": "Tables IV and V of the paper: [Scores of human evaluation](questions/human-scores.md).",
     "compare": "Sign-flip test with Holm's correction; runs with other data, rules or encoders are rejected: "
     "[Statistics](numbers/statistics.md).",
     "report power": "From the variance of finished runs: [Statistics](numbers/statistics.md).",
