@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
     "core": "shared types, interfaces, registry, settings, errors, atomic files, locks, devices",
-    "numerics": "statistics, clusters, spatial relations, Open3D's core",
+    "numerics": "statistics, clusters, spatial relations, loading Open3D",
     "store": "run folders with records and predictions; the cache",
     "formats": "readers of plain data: images, PLY, HDF5, npz, torch archives, pickles, CSV",
     "metrics": "protocols, matching and metrics: counts per scene, ratios over scenes",
@@ -33,7 +33,7 @@ PURPOSE = {
     "predictions": "prediction formats of other programs: reading and export",
     "questions": "queries and questions with known answers; reasoning over a map",
     "baselines": "one folder per method: baselines, external programs, the oracle",
-    "runs": "a request to jobs per scene, in processes or on clusters; resuming",
+    "runs": "splits a run into jobs, in processes or on clusters; resuming",
     "evaluation": "scores of predictions from files",
     "human_eval": "annotation sheets: creation, answers, scores",
     "analysis": "comparison, regression checks, rankings and attribution of finished runs",
@@ -122,7 +122,7 @@ def drawn() -> dict[str, str]:
             rows.append(f"| {number} | `{place}` | {PURPOSE[folder]} |")
             lower = [other for level in reversed(below) for other in sorted(level & graph[folder])]
             arrows.append(f"{folder:<12} -> {' '.join(lower)}" if lower else folder)
-    counts = f"{len(PURPOSE)} folders; with `__init__`, `__main__`, benchmarks and .ci {len(below)} layers, no cycle."
+    counts = f"{len(PURPOSE)} folders, {len(below)} layers with `__init__`, `__main__`, benchmarks and .ci, and no cycle."
     return {"layers": "\n".join(rows), "arrows": "\n".join([*arrows, "```", "", counts])}
 
 
