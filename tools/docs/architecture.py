@@ -122,7 +122,7 @@ def drawn() -> dict[str, str]:
             rows.append(f"| {number} | `{place}` | {PURPOSE[folder]} |")
             lower = [other for level in reversed(below) for other in sorted(level & graph[folder])]
             arrows.append(f"{folder:<12} -> {' '.join(lower)}" if lower else folder)
-    counts = f"{len(PURPOSE)} folders, {len(below)} layers with `__init__`, `__main__`, benchmarks and .ci, and no cycle."
+    counts = f"{len(PURPOSE)} folders, {len(below)} layers with `__init__`, `__main__`, benchmarks and .ci, no cycle."
     return {"layers": "\n".join(rows), "arrows": "\n".join([*arrows, "```", "", counts])}
 
 
