@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
     "core": "shared types, interfaces, registry, settings, errors, atomic files, locks, devices",
-    "numerics": "statistics, clusters, spatial relations, loading Open3D",
+    "numerics": "statistics, clustering, spatial relations, loading Open3D",
     "store": "run folders with records and predictions; the cache",
     "formats": "readers of plain data: images, PLY, HDF5, npz, torch archives, pickles, CSV",
     "metrics": "protocols, matching and metrics: counts per scene, ratios over scenes",
@@ -122,7 +122,7 @@ def drawn() -> dict[str, str]:
             rows.append(f"| {number} | `{place}` | {PURPOSE[folder]} |")
             lower = [other for level in reversed(below) for other in sorted(level & graph[folder])]
             arrows.append(f"{folder:<12} -> {' '.join(lower)}" if lower else folder)
-    counts = f"{len(PURPOSE)} folders, {len(below)} layers with `__init__`, `__main__`, benchmarks and .ci, no cycle."
+    counts = f"{len(PURPOSE)} folders, no cycle. `__init__`, `__main__`, benchmarks and .ci are above: {len(below)} layers."
     return {"layers": "\n".join(rows), "arrows": "\n".join([*arrows, "```", "", counts])}
 
 
