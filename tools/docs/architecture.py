@@ -122,9 +122,7 @@ def drawn() -> dict[str, str]:
             rows.append(f"| {number} | `{place}` | {PURPOSE[folder]} |")
             lower = [other for level in reversed(below) for other in sorted(level & graph[folder])]
             arrows.append(f"{folder:<12} -> {' '.join(lower)}" if lower else folder)
-    counts = (
-        f"{len(PURPOSE)} folders, no cycle. `__init__`, `__main__`, benchmarks and .ci are above: {len(below)} layers."
-    )
+    counts = f"{len(PURPOSE)} folders, no cycle. `__init__`, `__main__`, benchmarks and .ci are layer {len(below)}."
     return {"layers": "\n".join(rows), "arrows": "\n".join([*arrows, "```", "", counts])}
 
 
