@@ -81,8 +81,9 @@ def _notes(compared: Mapping[str, Any]) -> Sequence[str]:
     elif tests:
         how = "all sign patterns" if all(value["is_exact"] for value in tests) else "100000 random sign patterns"
         notes.append(
-            f"p: two-sided sign-flip test of the mean over scenes, {how}; adjusted p: Holm's correction over all "
-            "metrics compared here, or all classes; [..]: 95 % confidence interval (jackknife t over scenes)"
+            f"p: two-sided sign-flip test of the mean over scenes, {how}, assuming symmetric differences; adjusted p: "
+            "Holm's correction over all metrics compared here, or all classes; [..]: 95 % confidence interval "
+            "(jackknife t over scenes)"
         )
         notes += [line for line in (few_scenes(len(compared["scenes"])),) if line]
         notes += [f"{name}: {d['disagreement']}" for name, d in compared["metrics"].items() if d["disagreement"]]

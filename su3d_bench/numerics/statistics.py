@@ -91,7 +91,8 @@ def jackknife_interval(
 
     With ``has_value`` (S,), scenes that do not contribute to the number are ignored. The interval is centred on the
     value rather than on the mean of the pseudo-values, which has lower coverage with few scenes
-    (``python benchmarks coverage_of_intervals`` has both), and is clipped to ``bounds``. None for a single scene, if
+    (``python benchmarks coverage_of_intervals`` has both), and is clipped to ``bounds``. It is for the number expected
+    over as many scenes, because AP of rare classes is lower over very many. None for a single scene, if
     nothing can be scored without one scene, and if the scenes do not differ, which allows no estimate of the spread.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; the t quantile after Tukey.
 
@@ -211,7 +212,9 @@ class SignFlipTest:
 def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
     """The sign-flip test of the mean of ``differences`` against 0; ``None`` without pairs.
 
-    NaN are ignored. Up to ``MAX_EXACT_PAIRS`` pairs all 2^n patterns of signs are counted; otherwise random ones.
+    It assumes that the differences of two equally good methods are symmetric around 0: at 5 %, skewed differences
+    with mean 0 are rejected more often (docs/numbers/statistics.md has how often). NaN are ignored. Up to
+    ``MAX_EXACT_PAIRS`` pairs all 2^n patterns of signs are counted; otherwise random ones.
 
     >>> sign_flip_test(np.array([0.1, 0.2, 0.3]))
     SignFlipTest(p=0.25, smallest_p=0.25, n_pairs=3, is_exact=True)
@@ -267,7 +270,8 @@ def rank_intervals(values: Sequence[Float64Array], alpha: float = ALPHA) -> list
     """The best and the worst possible rank of each of K rows, with ``values`` (S,) over the same scenes.
 
     A row ranks below each row that is better by the sign-flip test of their paired differences, corrected by Holm over
-    all pairs; all intervals together contain the true ranks with a probability of at least 1 - ``alpha``.
+    all pairs; if differences of equally good rows are symmetric, all intervals together contain the true ranks with a
+    probability of at least 1 - ``alpha``.
     Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for Ranks, Review of Economic Studies 91 (2024).
 
     >>> far = [np.arange(10) / 100 + level for level in (0.8, 0.1)]

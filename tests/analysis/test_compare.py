@@ -83,6 +83,7 @@ def test_differences_match_the_metrics_of_both_runs() -> None:
                 assert -1 in value.interval or 1 in value.interval or middle == pytest.approx(value.difference)
             assert value.test == sign_flip_test(np.array(list(singles.values())))
     assert found.protocols[1].metrics["AP"].difference < 0
+    assert "assuming symmetric differences" in markdown(comparison_tables(found.to_json()))
 
 
 def test_interval_is_a_jackknife_over_scenes() -> None:

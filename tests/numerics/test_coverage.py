@@ -9,6 +9,9 @@ import pytest
 from benchmark_programs import benchmark_program
 from places import ROOT
 
+from su3d_bench import load_protocol
+from su3d_bench.numerics.statistics import ALPHA, sign_flip_test
+
 coverage = benchmark_program("coverage_of_intervals")
 
 PAGE = (ROOT / "docs" / "numbers" / "statistics.md").read_text(encoding="utf-8")
@@ -26,18 +29,33 @@ def test_page_matches_the_simulation_and_coverage_is_at_least_90_percent() -> No
     over_scenes = cells(shown.strip().partition("\n\n")[0])
     header = over_scenes.pop("coverage, %")
     assert {"4 scenes", "8 scenes", "20 scenes", "100 scenes"} <= set(header)
-    worlds = [name for make in coverage.WORLDS for name in make().names]
-    assert set(over_scenes) == {*worlds, *(f"{name}, difference" for name in worlds)}
+    assert set(over_scenes) == {name for make in coverage.WORLDS for name in make().names}
     values = {name: [float(value) for value in row] for name, row in over_scenes.items()}
     assert min(min(row) for row in values.values()) >= coverage.MIN_COVERAGE
     for name, row in values.items():  # a coverage outside the range is listed with its reason
         missed = [n.removesuffix(" scenes") for n, value in zip(header, row, strict=True) if not 93 <= value <= 97]
         assert not missed or f"- {name} at {', '.join(missed)} scenes: " in shown
+    rare = cells(shown.partition("AP of 48 classes")[2].partition("\n\n")[2].partition("\n\n")[0])
+    for kind, words in (("as many scenes", "at least"), ("very many", "only")):
+        lowest = min(float(value) for name, row in rare.items() if name.endswith(kind) for value in row)
+        assert f"in {words} {int(lowest)} %" in PAGE
+
+
+def test_simulated_classes_are_those_of_replica() -> None:
+    classes = load_protocol("replica-openmask3d").classes
+    assert list(benchmark_program("coverage_worlds").REPLICA) == [one.name for one in classes]
 
 
 @pytest.mark.proof
-def test_intervals_of_few_scenes_have_coverage_where_bootstrap_fails() -> None:
-    world = coverage.Shares()
-    tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["correct answers"]
-    assert 89 < (tally.per_cent(coverage.JACKKNIFE) or 0) < 98  # 93 of the page, within 3 standard errors
-    assert (tally.per_cent(coverage.BOOTSTRAP) or 100) < 88
+def test_intervals_have_coverage_of_as_many_scenes_where_bootstrap_fails() -> None:
+    world = coverage.AlikeRooms()
+    found = coverage.simulate(world, 8, 400, 0)["pooled AP"]
+    as_many, many = float(np.mean(found.values)), world.truth(np.random.default_rng(0))["pooled AP"]
+    assert found.coverage(coverage.JACKKNIFE, as_many) > 93 > 90 > found.coverage(coverage.PERCENTILE, as_many)
+    assert found.coverage(coverage.JACKKNIFE, many) < 90
+
+
+def test_sign_flip_test_is_exact_only_for_symmetric_differences() -> None:
+    for drawn, rejected in zip(coverage.DIFFERENCES.values(), (0.05, 0.10, 0.16), strict=True):
+        tests = [sign_flip_test(row) for row in drawn(np.random.default_rng(0), (1500, 8))]
+        assert np.mean([test is not None and test.p < ALPHA for test in tests]) == pytest.approx(rejected, abs=0.02)

@@ -3,8 +3,9 @@
 function compareSection() {
   if (!DATA.comparisons.length) return;
   part('compare', 'Compare', 'Difference B − A over the common scenes, in percentage points, with the 95 % confidence '
-    + 'interval (jackknife t); p of the exact sign-flip test over scenes, with the smallest possible p for this number '
-    + 'of scenes; p adjusted by Holm over all metrics of the comparison. Bold: adjusted p below 0.05.', (section) => {
+    + 'interval (jackknife t); p of the exact sign-flip test over scenes (assumes symmetric differences), with the '
+    + 'smallest possible p for this number of scenes; p adjusted by Holm over all metrics of the comparison. Bold: '
+    + 'adjusted p below 0.05.', (section) => {
     const sides = [...new Set(DATA.comparisons.flatMap((one) => [one.left, one.right].map(String)))].map((text) => {
       const at = text.indexOf(',');
       return [text, sideName(Number(text.slice(0, at)), text.slice(at + 1))];
