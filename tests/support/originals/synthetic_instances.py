@@ -26,7 +26,7 @@ Scene = dict[str, Any]
 Problem = list[Scene]
 VOID, LEFT_OUT, NO_CLASS, BEYOND = -1, -2, -3, -4
 SCORED = (0, 1, 2, 3)
-UNKNOWN = {VOID: 0, NO_CLASS: 0, BEYOND: 9999}  # the ids of what is in no list
+UNKNOWN = {VOID: 0, NO_CLASS: 0, BEYOND: 1999}  # the ids of what is in no list
 
 
 def columns_of(scene: Scene) -> tuple[Int64Array, Int64Array]:
