@@ -25,12 +25,15 @@ LISTS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class."""
+    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class or
+    points, one vertex, only void.
+    """
     rng = np.random.default_rng([seed, index, 5])
     scenes = []
     for _ in range(rng.integers(1, 4)):
         there = rng.choice(N_SLOTS, rng.integers(1, 5), replace=False)
-        truth = rng.choice([*there, *there, NONE], n := int(rng.integers(3, 18)))
+        kinds = [NONE] if rng.random() < 0.05 else [*there, *there, NONE]
+        truth = rng.choice(kinds, n := int(rng.integers(1, 18)))
         scene: dict[str, Any] = {"truth": truth.tolist()}
         if rng.random() < 0.3:
             called = np.where(rng.random(n) < 0.5, truth, rng.choice([*there, N_SLOTS - 1, NONE], n))

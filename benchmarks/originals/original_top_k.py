@@ -21,13 +21,13 @@ TOP = (1, 3)
 
 
 def drawn(seed: int, index: int) -> list[Scene]:
-    """Problem ``index``: vertices with one, several, equal or no labels, one or three ranked classes,
-    vertices that are left out, but never a single one, at which the original fails; scenes of one vertex.
+    """Problem ``index``: vertices with one, several, equal or no labels, one or three ranked classes, vertices that are
+    left out, but never a single one, at which the original fails, nor scenes of one, which it reads as several.
     """
     rng = np.random.default_rng([seed, index, 11])
     scenes = []
     for _ in range(rng.integers(1, 4)):
-        n, there = int(rng.integers(1, 40)), rng.choice(N_CLASSES, rng.integers(1, 5))
+        n, there = int(rng.integers(2, 40)), rng.choice(N_CLASSES, rng.integers(1, 5))
         labels = rng.choice(np.append(there, -1), (n, 3))
         labels = np.take_along_axis(labels, np.argsort(labels < 0, axis=1, kind="stable"), axis=1)  # none at the end
         ranked = np.where(rng.random((n, 3)) < 0.4, np.maximum(labels, 0), rng.integers(0, N_CLASSES, (n, 3)))
