@@ -31,7 +31,6 @@ import original_points
 import original_queries
 import original_segments
 import original_top_k
-import original_votes
 from original_code import STOPS, Original, silence
 
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -39,7 +38,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 LARGEST = 1e-7
 FAMILIES = (
     original_instances, original_derived, original_points, original_objects, original_boxes, original_queries,
-    original_segments, original_top_k, original_votes, original_answers,
+    original_segments, original_top_k, original_answers,
 )  # fmt: skip
 ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in family.ORIGINALS)
 

@@ -25,9 +25,7 @@ LISTS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class or
-    points, one vertex, only void.
-    """
+    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class."""
     rng = np.random.default_rng([seed, index, 5])
     scenes = []
     for _ in range(rng.integers(1, 4)):
