@@ -69,8 +69,9 @@ def values_of(scene: Scene, ids: dict[int, int], *, are_numbers: bool = False) -
 
 
 def is_text_only(rules: ProtocolRules, scene: Scene) -> bool:
-    """Whether only a text file can state the ground truth: an object of the number 0, or values without classes."""
-    return rules.class_agnostic == "numbered" or any(number == 0 and slot != VOID for slot, number, _ in scene["truth"])
+    """Whether only a text file can state the ground truth: an object of the number 0, or a value that is no number."""
+    no_number = {BEYOND} if rules.class_agnostic == "numbered" else set[int]()
+    return any(slot in no_number or (number == 0 and slot != VOID) for slot, number, _ in scene["truth"])
 
 
 def scored_text(rules: ProtocolRules, problem: Problem) -> list[SceneScore]:
