@@ -78,7 +78,8 @@ def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> t
 def test_mask_on_void_is_background_unless_void_is_ignored() -> None:
     masks, classes, scores = perfect()
     on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150, dtype=np.int32)], [*classes, 3], [*scores, 0.95])
-    for void, n in ((None, 0), ("false-positives", 1)):
+    of_rule: dict[VoidRule | None, int] = {None: 0, "false-positives": 1}
+    for void, n in of_rule.items():
         rules = ScoringRules((3, 4, 5), void=void)
         corrected = correct_scene(truth(), on_void, rules)
         assert corrected.n["background"] == n

@@ -66,7 +66,7 @@ def test_values_below_1000_are_forgiven_by_segment3d(
     )
     prediction = instances(truth.points, [one for one in found if len(one)], None)
     if is_text:
-        content = vertex_masks("a", [np.int32(one) for one in found if len(one)], len(values))
+        content = vertex_masks("a", [one.astype(np.int32) for one in found if len(one)], len(values))
         score = score_on_vertices(rules, VertexTruth(values, values // 1000, ()), "a", content, None).score
     else:
         score = score_scene(rules, truth, prediction, None)
