@@ -211,7 +211,7 @@ class Scoring:
             else:
                 not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
         if not protocols:
-            raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
+            raise PredictionError(f"nothing could be scored: {not_scored[next(iter(self.outcomes))]}")
         return tuple(protocols), dict(sorted(not_scored.items()))
 
     def _score(
