@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +40,16 @@ def test_every_protocol_states_its_original_and_its_cases_exist(name: str) -> No
     assert stated is not None
     for pattern in stated.original.cases:
         assert any(ROOT.glob(pattern)), pattern
+
+
+def test_comparison_with_more_than_the_stored_cases_has_its_program() -> None:
+    words = [sys.executable, str(ROOT / "benchmarks"), "compare_originals"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    listed = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
+    programs = {name.strip(",") for line in listed.stdout.splitlines() for name in line.split()[:-1]}
+    stated = {name: original_of(name) for name in protocol_names()}
+    many = {name for name, one in stated.items() if one is not None and one.base is None and one.original.problems > 30}
+    assert len(many) > 20 and many <= programs
 
 
 def own(folder: Path, table: str, base: str = "scannet-instance") -> str:
