@@ -22,19 +22,25 @@ from pathlib import Path
 
 import folders  # noqa: F401 - lets the next ones be found
 import numpy as np
+import original_answers
 import original_boxes
+import original_chains
+import original_challenge
+import original_derived
 import original_instances
 import original_objects
 import original_points
 import original_queries
 import original_segments
+import original_top_k
 from original_code import STOPS, Original, silence
 
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 LARGEST = 1e-7
 FAMILIES = (
-    original_instances, original_points, original_objects, original_boxes, original_queries, original_segments
+    original_instances, original_derived, original_points, original_objects, original_boxes, original_queries,
+    original_segments, original_top_k, original_answers, original_challenge, original_chains,
 )  # fmt: skip
 ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in family.ORIGINALS)
 

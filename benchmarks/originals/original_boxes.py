@@ -23,7 +23,8 @@ OFF = 0.0002  # sides of true boxes are on half millimetres
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: boxes near the true ones, next to them, duplicates, other classes, none, a missing class.
+    """Problem ``index``: boxes near the true ones, next to them, duplicates, other classes, none, a missing class, a
+    scene without a true box, rotations of either sign.
 
     No side of a predicted box coincides with one of a true box: there the original clips wrongly, and a box has an
     IoU of 3.6 with itself.
@@ -40,12 +41,13 @@ def _drawn_scene(rng: np.random.Generator, confidences: Any) -> Scene:
             "middle": _short(rng.uniform(0, 3, 3)),
             "sizes": _short(rng.uniform(0.3, 2, 3)),
         }
-        for _ in range(rng.integers(1, 6))
+        for _ in range(rng.integers(0, 6))
     ]
+    nowhere = {"slot": int(rng.choice(SLOTS)), "middle": [1.0, 1.0, 1.0], "sizes": [1.0, 1.0, 1.0]}
     found: list[dict[str, Any]] = []
     for _ in range(rng.choice([0, 1, 3, 5, 8])):
-        of = true[int(rng.integers(len(true)))]
-        away, by = rng.choice([0.02, 0.05, 0.2, 0.6], 2)
+        of = true[int(rng.integers(len(true)))] if true else nowhere
+        away, by = rng.choice([0.02, 0.05, 0.2, 0.6, 5.0], 2, p=[0.24, 0.24, 0.24, 0.24, 0.04])
         one = {
             "slot": of["slot"] if rng.random() < 0.8 else int(rng.choice(SLOTS)),
             "middle": [round(one + OFF, 4) for one in _short(of["middle"] + away * rng.normal(size=3))],
@@ -54,7 +56,7 @@ def _drawn_scene(rng: np.random.Generator, confidences: Any) -> Scene:
         if found and rng.random() < 0.15:
             one = {**found[-1]}  # the same box again, with another confidence
         found.append({**one, "score": float(next(confidences))})
-    return {"heading": float(rng.choice([0.0, round(rng.uniform(0, 3), 3)])), "true": true, "found": found}
+    return {"heading": float(rng.choice([0.0, round(rng.uniform(-4, 4), 3)])), "true": true, "found": found}
 
 
 def _short(metres: Float64Array) -> list[float]:

@@ -30,7 +30,8 @@ def drawn(seed: int, index: int) -> Problem:
     scenes = []
     for _ in range(rng.integers(1, 4)):
         there = rng.choice(N_SLOTS, rng.integers(1, 5), replace=False)
-        truth = rng.choice([*there, *there, NONE], n := int(rng.integers(3, 18)))
+        kinds = [NONE] if rng.random() < 0.05 else [*there, *there, NONE]
+        truth = rng.choice(kinds, n := int(rng.integers(1, 18)))
         scene: dict[str, Any] = {"truth": truth.tolist()}
         if rng.random() < 0.3:
             called = np.where(rng.random(n) < 0.5, truth, rng.choice([*there, N_SLOTS - 1, NONE], n))

@@ -8,16 +8,17 @@ import json
 import os
 import pickle
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from original_code import STOPS, Ask, Original, load, of_python_3, recorded, silence, without_gpu
 from places import CASES
-from synthetic_points import OTHER, VOID, Problem, classes_of, scored
+from synthetic_points import BETWEEN, BEYOND, OTHER, VOID, Problem, classes_of, ids_of, scored, scored_text
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 
@@ -28,13 +29,15 @@ OF_CONCEPTGRAPHS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` on identical points: missing classes, void, no predictions, wrong classes."""
+    """Problem ``index`` on identical points: missing classes, void, no predictions, wrong classes, ids of no class."""
     rng = np.random.default_rng([seed, index])
     scenes = []
     for _ in range(rng.integers(1, 4)):
         there = rng.choice(8, rng.integers(1, 5), replace=False)
-        truth = rng.choice([*there, *there, OTHER, VOID], n := int(rng.integers(1, 18)))
-        guess = rng.choice([*range(OTHER + 1), VOID], n)
+        truth = rng.choice([*there, *there, OTHER, BEYOND, BETWEEN, VOID], n := int(rng.integers(1, 18)))
+        guess = rng.choice([*range(BETWEEN + 1), VOID], n)
+        if rng.random() < 0.1:
+            guess = truth = np.full(n, rng.choice([OTHER, BEYOND, BETWEEN, VOID]))
         scenes.append({"truth": truth.tolist(), "called": np.where(rng.random(n) < 0.5, truth, guess).tolist()})
     return scenes
 
@@ -72,7 +75,7 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
         lists = load(code / "ScanNet200/scannet200_constants.py", [])
         module.CLASS_LABELS, module.VALID_CLASS_IDS = lists.CLASS_LABELS_200, np.array(lists.VALID_CLASS_IDS_200)
         module.UNKNOWN_ID = np.max(module.VALID_CLASS_IDS) + 1
-    of_slot = {**{k: one for k, (one, _) in classes_of(rules).items()}, VOID: 0}
+    of_slot = ids_of(rules)
 
     def ask(problem: Problem) -> Float64Array:
         confusion = np.zeros((module.UNKNOWN_ID + 1,) * 2, np.ulonglong)
@@ -87,14 +90,15 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def our_classes(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The IoU of each slot."""
-    rows = _ours(rules, problem).per_class
+    """The IoU of each slot from text files, infinite if points with labels give another."""
     names = [name for slot, (_, name) in classes_of(rules).items() if slot != OTHER]
-    return np.array([rows.get(name, {}).get("IoU", np.nan) for name in names], float)
+    rows = [_ours(rules, problem, way).per_class for way in (scored_text, scored)]
+    text, points = np.array([[of_way.get(name, {}).get("IoU", np.nan) for name in names] for of_way in rows], float)
+    return np.where((text == points) | np.isnan(text) & np.isnan(points), text, np.inf)
 
 
-def _ours(rules: ProtocolRules, problem: Problem) -> ProtocolResult:
-    return combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
+def _ours(rules: ProtocolRules, problem: Problem, way: Callable[..., SceneScore] = scored) -> ProtocolResult:
+    return combine(rules, {str(s): way(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
 
 
 def conceptgraphs(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:

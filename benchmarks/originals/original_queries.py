@@ -19,15 +19,18 @@ ASKED, OTHER = 3, 4  # labels of the two classes; other objects are not void, so
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: objects of several queries or none, equal cosines, duplicate or empty masks."""
+    """Problem ``index``: objects of several queries or none, equal cosines, duplicate or empty masks, queries without
+    an object, large ids, scenes without one.
+    """
     rng = np.random.default_rng([seed, index])
     scenes = []
     for _ in range(rng.integers(1, 3)):
-        ids = [int(one) for one in rng.permutation(rng.integers(2, 7))]
-        objects = [[one if rng.random() < 0.85 else -1, int(rng.integers(1, 12))] for one in ids]
+        ids = [int(one) for one in rng.permutation(rng.integers(1, 7)) + rng.choice([0, 0, 900])]
+        share = 0.85 if rng.random() < 0.95 else 0.0
+        objects = [[one if rng.random() < share else -1, int(rng.integers(1, 12))] for one in ids]
         starts = np.cumsum([0, *(length for _, length in objects)]).tolist()
         there = [one for one, _ in objects if one >= 0] or [99]  # an object without points
-        queries = [sorted(rng.choice(there, min(len(there), n), replace=False).tolist()) for n in rng.integers(1, 4, 3)]
+        queries = [sorted(rng.choice(there, min(len(there), n), replace=False).tolist()) for n in rng.integers(0, 4, 3)]
         masks: list[list[int]] = []
         for _ in range(rng.choice([0, 2, 4, 7])):
             run = int(rng.integers(len(objects)))
@@ -35,7 +38,7 @@ def drawn(seed: int, index: int) -> Problem:
             end = int(rng.integers(start + 1, starts[run + 1] + 3))
             near = [min(start, starts[-1] - 1), min(max(end, start + 1), starts[-1])]
             masks.append(masks[-1] if masks and rng.random() < 0.15 else near)
-        cosines = np.round(rng.uniform(-1, 1, (len(masks), len(queries))), 1).tolist()
+        cosines = np.round(rng.uniform(-1, 1, (len(masks), len(queries))), rng.choice([0, 1, 12])).tolist()
         scenes.append({"objects": objects, "queries": queries, "masks": masks, "cosines": cosines})
     return scenes
 

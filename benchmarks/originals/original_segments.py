@@ -1,4 +1,4 @@
-"""panopticapi, the evaluator of COCO's panoptic task, on synthetic problems of labelled points."""
+"""panopticapi, the evaluator of COCO's panoptic task, and SemanticKITTI's, on synthetic problems of labelled points."""
 
 from __future__ import annotations
 
@@ -27,16 +27,21 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 FILE = "panopticapi/evaluation.py"
+KITTI = "mmdet3d/evaluation/functional/panoptic_seg_eval.py"
 OVERALL = ("pq", "sq", "rq")
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: crowds, void, excluded points, masks without a scored class, overlaps of one half."""
+    """Problem ``index``: crowds, void, excluded points, masks without a scored class, overlaps of one half; numbers
+    that restart with each class or are large, things in several parts, shuffled points, scenes of one point or of void.
+    """
     rng = np.random.default_rng([seed, index, 7])
     scenes = []
     for _ in range(rng.integers(1, 4)):
-        sizes = rng.integers(1, 7, rng.integers(2, 8))
-        of_part = rng.choice([0, 0, 1, 2, 3, 3, 4, OTHER, UNLABELLED, LEFT_OUT], len(sizes))
+        sizes = rng.integers(1, 7, rng.integers(2, 8)) if rng.random() < 0.95 else np.ones(1, int)
+        kinds = [UNLABELLED] if rng.random() < 0.05 else [0, 0, 1, 2, 3, 3, 4, OTHER, UNLABELLED, LEFT_OUT]
+        of_part = rng.choice(kinds, len(sizes))
+        number = rng.choice([1, 2, 300, 999], len(sizes)) if rng.random() < 0.5 else np.arange(len(sizes)) + 1
         is_crowd = rng.random(len(sizes)) < 0.25
         part = np.repeat(np.arange(len(sizes)), sizes)
         owner = np.where(
@@ -45,13 +50,13 @@ def drawn(seed: int, index: int) -> Problem:
         there, owner = np.unique(np.append(owner, -1), return_inverse=True)
         guess = rng.integers(0, OTHER + 1, len(sizes))
         called = np.where((rng.random(len(sizes)) < 0.7) & (of_part >= 0), of_part, guess)[there[1:]]
+        number = np.where(is_crowd | (of_part < 0) | (of_part >= N_THINGS), 0, number)
+        order = rng.permutation(len(part)) if rng.random() < 0.3 else np.arange(len(part))
         scenes.append(
             {
-                "truth": of_part[part].tolist(),
-                "instance": np.where(is_crowd | (of_part < 0) | (of_part >= N_THINGS), 0, np.arange(len(sizes)) + 1)[
-                    part
-                ].tolist(),
-                "owner": (owner[:-1] - 1).tolist(),
+                "truth": of_part[part][order].tolist(),
+                "instance": number[part][order].tolist(),
+                "owner": (owner[:-1] - 1)[order].tolist(),
                 "called": called.tolist(),
             }
         )
@@ -110,6 +115,34 @@ def panopticapi(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     return ask
 
 
+def semantic_kitti(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """mmdetection3d's evaluator of classes by index, with one class more for void, which it ignores."""
+    module = load(checkout / KITTI, [checkout], absent=["mmengine", "mmengine.logging"])
+    names = [entry.name for entry in rules.scored]
+    things = [name for name in names if name not in rules.stuff]
+    at = [names.index(name) for _, name in list(classes_of(rules).values())[:N_SCORED]]
+    index_of = np.array([*at, *[len(names)] * 3])  # of OTHER, -2 and -1: void
+
+    def ask(problem: Problem) -> Float64Array:
+        judge = module.EvalPanoptic(
+            [*names, "void"], things, list(rules.stuff), rules.min_region_size, 1 << 20, {}, [len(names)]
+        )
+        true, found = [], []
+        for scene in problem:
+            owner = np.array(scene["owner"])
+            slots = np.array(scene["truth"]), np.append(scene["called"], UNLABELLED).astype(int)[owner]
+            for kept, slot, number in zip((true, found), slots, (np.array(scene["instance"]), owner + 1), strict=True):
+                number = np.where((slot < 0) | (slot >= N_THINGS), 0, number)  # stuff is one segment
+                kept.append({"pts_semantic_mask": index_of[slot], "pts_instance_mask": number})
+        answer = judge.evaluate(true, found)
+        keys = ["pq", "sq_mean", "rq_mean", *(f"{name}_{part}" for part in ("things", "stuff") for name in OVERALL)]
+        means = [answer[key] for key in keys]
+        each = judge.get_pq()[3:]
+        return np.array([*means, *(values[k] for k in at for values in each)], float)
+
+    return ask
+
+
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
     """The original's answers to the first ``n`` problems with a new answer."""
     file = CASES / "panoptic03_labelled_points.json"
@@ -131,4 +164,8 @@ def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
     file.write_text("{" + ",\n".join(blocks) + "}\n")
 
 
-ORIGINALS = (Original(("scannetpp-panoptic", "hm3dsem-panoptic"), FILE, panopticapi, drawn, our_qualities, keep),)
+API = ("rooms", "replica", "scannet", "scannet200", "scannetpp", "hm3dsem")
+ORIGINALS = (
+    Original(tuple(f"{name}-panoptic" for name in API), FILE, panopticapi, drawn, our_qualities, keep),
+    Original(("scannet-panoptic-oneformer3d",), KITTI, semantic_kitti, drawn, our_qualities, keep),
+)

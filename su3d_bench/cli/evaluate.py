@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "use those of the protocol or of the file (default: protocol; ScanNet text: file)",
+        "use those of the protocol or of the file (default: protocol; ScanNet text and MaskClustering: file)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

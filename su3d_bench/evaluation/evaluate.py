@@ -30,6 +30,8 @@ from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, 
 from su3d_bench.predictions.formats import Source, open_sources
 from su3d_bench.predictions.run_predictions import OWN_RUNS
 
+RANKED_BY_FILE = {"scannet-text", "maskclustering"}  # formats whose own evaluators use the confidences in the files
+
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "warnings_of"]
 
 
@@ -114,7 +116,7 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
     """Whether confidences in the files are used where a protocol sets 1 for every mask."""
     if request.confidences is not None:
         return request.confidences == "file"
-    return all(source.reader.name == "scannet-text" for source in sources)
+    return all(source.reader.name in RANKED_BY_FILE for source in sources)
 
 
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
@@ -201,12 +203,15 @@ class Scoring:
         not_scored = dict(self.unfit)
         protocols = []
         for name, kept in self.outcomes.items():
-            if kept.scores:
-                protocols.append(formed(self.rules[name], kept, file_confidences=self._file_confidences))
+            rules = self.rules[name]
+            if rules.names_masks and not self._is_named and 0 < kept.n_masks == kept.n_of_class_0:
+                not_scored[name] = "needs classes, every mask has class 0"
+            elif kept.scores:
+                protocols.append(formed(rules, kept, file_confidences=self._file_confidences))
             else:
                 not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
         if not protocols:
-            raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
+            raise PredictionError(f"nothing could be scored: {not_scored[next(iter(self.outcomes))]}")
         return tuple(protocols), dict(sorted(not_scored.items()))
 
     def _score(
@@ -237,6 +242,7 @@ class Scoring:
             kept.labels = given
         kept.n_masks += facts.n
         kept.n_several += facts.n_several
+        kept.n_of_class_0 += 0 if facts.class_ids is None else int((facts.class_ids == 0).sum())
         return self._score_content(rules, scene, prediction.content, encoder)
 
     def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:

@@ -28,9 +28,9 @@ class Request:
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
     ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default all that fit.
     ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
-    the values in the files ("file"); None: those in the files for the official script's format, as that script does,
-    and the protocol's rule for all others. ``queries``: a file of texts and the objects that they refer to, for
-    ``query-ap``.
+    the values in the files ("file"); None: those in the files for the formats of ScanNet's and MaskClustering's
+    scripts, as these do, and the protocol's rule for all others. ``queries``: a file of texts and the objects that they
+    refer to, for ``query-ap``.
     """
 
     predictions: tuple[Path, ...]
@@ -86,6 +86,7 @@ class SceneOutcomes:
     labels: str | None = None
     n_masks: int = 0
     n_several: int = 0
+    n_of_class_0: int = 0
 
     def add(self, scene: str, outcome: SceneOutcome) -> None:
         self.scores[scene] = outcome.score

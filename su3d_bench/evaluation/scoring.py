@@ -94,7 +94,7 @@ def score_on_vertices(
         return SceneOutcome(score, ceiling, warnings=tuple(warnings))
     assert isinstance(content, VertexMasks)
     if rules.class_agnostic is not None:
-        values = encode_without_classes(rules, labels, values % instance_ap.INSTANCES_PER_CLASS)
+        values = encode_without_classes(rules, values)
     ids, named = _ids_of_masks(rules, content, labels, encoder)
     facts = checks.mask_facts(content, content.scores, len(values))
     warnings = [
@@ -169,7 +169,7 @@ def _instance_counts(
         _class_ids(rules),
         rules.min_region_size,
         rules.thresholds,
-        forgives_void=rules.void is None,
+        void=rules.void,
     )
 
 

@@ -293,10 +293,10 @@ def places(n: int) -> Float32Array:
 
 
 def _at_places(rules: ProtocolRules, truth: VertexTruth, scene: str) -> GroundTruth:
-    """Instances keep their numbers if a protocol uses them; otherwise they are numbered consecutively."""
+    """Instances keep their numbers if a protocol uses only these; otherwise they are numbered consecutively."""
     instance = truth.values % INSTANCES_PER_CLASS
-    if rules.class_agnostic is None:
-        is_object = truth.values >= INSTANCES_PER_CLASS
+    if rules.class_agnostic not in {"everything", "numbered"}:
+        is_object = truth.values >= (1 if rules.void == "groups" else INSTANCES_PER_CLASS)
         distinct, number = np.unique(truth.values[is_object], return_inverse=True)
         if len(distinct) >= INSTANCES_PER_CLASS:
             raise ConfigError(f"{printable(scene, 100)}: has {len(distinct)} objects; at most 999 are supported")

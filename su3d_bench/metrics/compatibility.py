@@ -251,15 +251,13 @@ def _naming_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str 
         is_map = content.has_own_points
         what = "the instances have neither labels" if is_map else "the masks have neither classes"
         return f"needs classes, {what} nor features"
-    if content.form == "vertex-masks" and content.class_ids is not None and not content.class_ids.any():
-        return "needs classes, every mask has class 0"
     return None
 
 
 def class_id_incompatibility(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why class ids cannot be those of a protocol, if its label space has two lists of ids."""
     ids = content.class_ids
-    if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS or ids is None or not len(ids):
+    if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS or ids is None or not ids.any():
         return None
     largest = int(ids.max())
     variant = list_of_ids(largest)

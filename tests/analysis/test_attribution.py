@@ -31,7 +31,7 @@ from su3d_bench.metrics.attribution.overlaps import (
 )
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules, VoidRule
 from su3d_bench.metrics.scoring import metric_of
 from su3d_bench.metrics.semantic import confusion as semantic
 
@@ -78,11 +78,12 @@ def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> t
 def test_mask_on_void_is_background_unless_void_is_ignored() -> None:
     masks, classes, scores = perfect()
     on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150, dtype=np.int32)], [*classes, 3], [*scores, 0.95])
-    for forgives, n in ((True, 0), (False, 1)):
-        rules = ScoringRules((3, 4, 5), forgives_void=forgives)
+    of_rule: dict[VoidRule | None, int] = {None: 0, "false-positives": 1}
+    for void, n in of_rule.items():
+        rules = ScoringRules((3, 4, 5), void=void)
         corrected = correct_scene(truth(), on_void, rules)
         assert corrected.n["background"] == n
-        assert (instance_ap.combine([corrected.as_is]).ap50 < 1) == (not forgives)
+        assert (instance_ap.combine([corrected.as_is]).ap50 < 1) == (n == 1)
         assert instance_ap.combine([corrected.all]).ap50 == 1
 
 
@@ -231,10 +232,10 @@ def reported(rules: ProtocolRules, counts: Sequence[instance_ap.InstanceCounts])
 
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
-@pytest.mark.parametrize("forgives_void", [True, False])
-def test_gain_of_a_corrected_mask_equals_that_of_a_full_evaluation(aggregate: str, forgives_void: bool) -> None:
+@pytest.mark.parametrize("void", [None, "false-positives", "groups"])
+def test_gain_of_a_corrected_mask_equals_that_of_a_full_evaluation(aggregate: str, void: VoidRule | None) -> None:
     rules = MASK_RULES.model_copy(update={"aggregate": aggregate})
-    scored = replace(scoring(rules), forgives_void=forgives_void)
+    scored = replace(scoring(rules), void=void)
     kinds = dict.fromkeys(KINDS, 0)
     for seed in range(10):
         scenes = [made_scene(1000 * seed + k) for k in range(3)]

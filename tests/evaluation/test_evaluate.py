@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -116,6 +117,32 @@ def test_masks_in_other_formats_score_like_the_text_format(tmp_path: Path) -> No
         assert numbers(tmp_path / name)["metrics"] == expected
 
 
+def test_scores_of_maskclustering_rank_its_masks_as_in_the_text_format(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    wrong_first = scene([CHAIR, np.arange(120, 320)], [5, 5], [0.5, 0.9])
+    write_scannet_text(tmp_path / "pred", wrong_first)
+    of_text = numbers(tmp_path, "class-agnostic-segment3d")
+    shutil.rmtree(tmp_path / "pred")
+    write_maskclustering(tmp_path / "pred", wrong_first)
+    found = {
+        form: numbers(tmp_path, "class-agnostic-segment3d", confidences=form) for form in (None, "file", "protocol")
+    }
+    assert found[None]["metrics"] == found["file"]["metrics"] == of_text["metrics"] != found["protocol"]["metrics"]
+    assert printed(found[None], "the confidences in the files are used") and "are ignored" in str(found["protocol"])
+    write_maskclustering(tmp_path / "pred", wrong_first | {"scores": np.ones(2)})
+    assert printed(numbers(tmp_path, "class-agnostic-segment3d"), "all confidences are 1")
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_scene_whose_masks_all_have_class_0_is_scored(tmp_path: Path, is_named: bool) -> None:
+    for name, labels in (("scene0001_00", [0, 0]), ("scene0002_00", [5, 7])):
+        write_truth(tmp_path / "gt", name)
+        write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], labels) | {"name": name})
+    found = numbers(tmp_path) if is_named else document(tmp_path, None)["protocols"]["scannet-instance"]
+    assert found["per_scene"]["scene0001_00"]["ap"] == 0 and found["per_scene"]["scene0002_00"]["ap"] == 1
+    assert printed(found, "scene0001_00: 2 of 2 masks have a class that is not scored")
+
+
 def test_instance_numbers_that_restart_with_each_class_stay_separate_objects_as_in_the_original(
     tmp_path: Path,
 ) -> None:
@@ -179,3 +206,11 @@ def test_custom_protocol_counts_missing_scenes(tmp_path: Path) -> None:
     found = evaluate(request).to_json()["protocols"]["mine"]
     assert found["metrics"]["ap"] == 0.5
     assert found["missed_scenes"] == ["scene0001_01"]
+
+
+def test_last_attribute_of_openscan_type_is_void(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([1001, 96001, 2001], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [1, 96]))
+    found = numbers(tmp_path, "openscan-type")
+    assert (found["metrics"]["ap"], found["per_class"]["This term is a baggage"]["ap"]) == (0.5, 1.0)
+    assert "This term is a a container for letters" not in found["per_class"]

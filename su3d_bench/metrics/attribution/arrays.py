@@ -140,9 +140,9 @@ class _CorrectedClasses:
             rows = np.flatnonzero(is_large & (corrected.class_ids == rules.class_ids[index]))
             one = scene_counts.overlaps_of_class(
                 rules.class_ids[index], rows, shared[rows], size[rows], self._value, self._size, rules.class_ids,
-                rules.min_region_size,
+                rules.min_region_size, rules.void,
             )  # fmt: skip
-            answer[index] = one.counts(index, corrected.scores, rules.thresholds, forgives_void=rules.forgives_void)
+            answer[index] = one.counts(index, corrected.scores, rules.thresholds)
         return answer
 
     def _shared_by(self, points: IntArray) -> Int64Array:
@@ -239,8 +239,7 @@ def scored_masks(
     assert rules.min_region_size is not None
     scored = masks_on_truth(rules, truth, prediction, encoder)
     masks = LabelledMasks(scored.masks, scored.labels.astype(np.int64), scored.scores)
-    class_ids, forgives_void = tuple(scored.class_ids), rules.void is None
-    scoring = ScoringRules(class_ids, rules.min_region_size, rules.thresholds, forgives_void)
+    scoring = ScoringRules(tuple(scored.class_ids), rules.min_region_size, rules.thresholds, rules.void)
     return scored.values, masks, scoring
 
 

@@ -131,7 +131,7 @@ def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules
         rules.class_ids,
         rules.min_region_size,
         rules.thresholds,
-        forgives_void=rules.forgives_void,
+        void=rules.void,
     )
 
 

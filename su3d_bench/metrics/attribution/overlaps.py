@@ -12,6 +12,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Arra
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
+from su3d_bench.metrics.protocols.model import VoidRule
 
 HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match only one instance
 
@@ -27,13 +28,13 @@ class LabelledMasks:
 
 @dataclass(frozen=True)
 class ScoringRules:
-    """The evaluator's settings: the scored class ids, the minimum size in points, the IoU thresholds, and whether it
-    drops void masks."""
+    """The evaluator's settings: the scored class ids, the minimum size in points, the IoU thresholds, and its rule for
+    void masks."""
 
     class_ids: tuple[int, ...]
     min_region_size: int = instance_ap.MIN_REGION_SIZE
     thresholds: tuple[float, ...] = instance_ap.THRESHOLDS
-    forgives_void: bool = True
+    void: VoidRule | None = None
 
 
 @dataclass(frozen=True)
@@ -189,5 +190,5 @@ def measure_overlaps(instances: TrueInstances, predicted: LabelledMasks, rules: 
         is_merged=((cover > HALF).sum(axis=1) > 1) & (has_own_class & (np.maximum(inside, cover) > HALF)).any(axis=1),
         is_large=is_large,
         is_counted=is_large & np.isin(predicted.class_ids, rules.class_ids),
-        is_ignored=rules.forgives_void & (n_ignored > max(rules.thresholds) * at_least_one[:, 0]),
+        is_ignored=(rules.void != "false-positives") & (n_ignored > max(rules.thresholds) * at_least_one[:, 0]),
     )

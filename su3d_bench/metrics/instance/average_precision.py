@@ -240,10 +240,12 @@ def ap_columns(thresholds: Sequence[float]) -> Int64Array:
 
 
 def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
-    """One value per point, label * 1000 + instance, or 0 (unannotated) if either is 0.
+    """One value per point, label * 1000 + instance, or 0 (unannotated) without an instance.
+
+    Instances without a label keep values below 1000, which are void, but not the same as 0 in every original.
 
     >>> encode_ground_truth(np.array([5, 5, 0, 7]), np.array([1, 2, 3, 0])).tolist()
-    [5001, 5002, 0, 0]
+    [5001, 5002, 3, 0]
     """
     if len(instance) and (instance.min() < 0 or semantic.min() < 0):
         worst = min(int(instance.min()), int(semantic.min()))
@@ -254,7 +256,7 @@ def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
             f"number the instances of a scene from 1 to {INSTANCES_PER_CLASS - 1}"
         )
     value = np.asarray(semantic, np.int64) * INSTANCES_PER_CLASS + instance
-    value[(np.asarray(instance) == 0) | (np.asarray(semantic) == 0)] = 0
+    value[np.asarray(instance) == 0] = 0
     return value
 
 

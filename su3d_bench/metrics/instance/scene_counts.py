@@ -14,6 +14,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.protocols.model import VoidRule
 
 _MAX_VALUE = 10_000 * instance_ap.INSTANCES_PER_CLASS  # ScanNet's largest label is 1357
 
@@ -28,15 +29,16 @@ def per_scene(
     min_region_size: int = instance_ap.MIN_REGION_SIZE,
     thresholds: Sequence[float] = instance_ap.THRESHOLDS,
     *,
-    forgives_void: bool = True,
+    void: VoidRule | None = None,
 ) -> instance_ap.InstanceCounts:
     """The additive counts of one scene.
 
     ``ground_truth`` (N,) has label * 1000 + instance per point, 0 if unannotated; prediction k covers the points
     ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their
     order matters for AP25 only, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
-    Without ``labels`` every mask is listed once under each class. Unless it ``forgives_void``, a mask without a match
-    is a false positive no matter how much of it is void or in small instances.
+    Without ``labels`` every mask is listed once under each class. ``void``: with ``false-positives`` a mask without a
+    match is one no matter how much of it is void or in small instances; with ``groups`` points of values 1 to 999 are
+    void, those of a value with less than the minimum size twice.
 
     >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.array([3001] * 200 + [0] * 50)
@@ -51,10 +53,8 @@ def per_scene(
     ([2, 2], [True, False, True, False, True, False, True, False])
     """
     _check_predictions(len(ground_truth), indptr, indices, len(scores) if labels is None else len(labels), scores)
-    classes = class_overlaps(ground_truth, indptr, indices, labels, class_ids, min_region_size)
-    return instance_ap.stacked(
-        [one.counts(index, scores, thresholds, forgives_void=forgives_void) for index, one in enumerate(classes)]
-    )
+    classes = class_overlaps(ground_truth, indptr, indices, labels, class_ids, min_region_size, void)
+    return instance_ap.stacked([one.counts(index, scores, thresholds) for index, one in enumerate(classes)])
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class ClassOverlaps:
     """One class of a scene: the indices of its ``predictions`` (R,) of at least the minimum size, and its instances.
 
     ``values`` (G,) are those of the instances, ascending; ``iou`` (R, G); ``takes_part`` (G,) marks those of at least
-    the minimum size; ``ignored_share`` (R,): the share of a prediction that is void or in smaller instances.
+    the minimum size; ``ignored_share`` (R,): the share of a prediction that is void or in smaller instances, 0 if these
+    are not forgiven.
     """
 
     predictions: Int64Array
@@ -71,16 +72,14 @@ class ClassOverlaps:
     takes_part: BoolArray
     ignored_share: Float64Array
 
-    def counts(
-        self, class_index: int, scores: Float64Array, thresholds: Sequence[float], *, forgives_void: bool
-    ) -> instance_ap.InstanceCounts:
+    def counts(self, class_index: int, scores: Float64Array, thresholds: Sequence[float]) -> instance_ap.InstanceCounts:
         """The counts of the class; ``scores`` (K,) are those of all masks, in order."""
         return count_class(
             class_index,
             iou=self.iou,
             takes_part=self.takes_part,
             scores=scores[self.predictions],
-            ignored_share=forgives_void * self.ignored_share,
+            ignored_share=self.ignored_share,
             thresholds=thresholds,
         )
 
@@ -92,6 +91,7 @@ def class_overlaps(
     labels: IntArray | None,
     class_ids: Sequence[int],
     min_region_size: int,
+    void: VoidRule | None = None,
 ) -> Iterator[ClassOverlaps]:
     """The classes of one scene in the order of ``class_ids``; the arrays are those of ``per_scene``."""
     if any(class_id < 1 for class_id in class_ids):
@@ -107,7 +107,7 @@ def class_overlaps(
         rows = np.flatnonzero(is_listed[c, kept])
         yield overlaps_of_class(
             class_id, kept[rows], intersection[rows], size[kept[rows]], segment_value, segment_size, class_ids,
-            min_region_size,
+            min_region_size, void,
         )  # fmt: skip
 
 
@@ -120,18 +120,23 @@ def overlaps_of_class(
     segment_size: Int64Array,
     class_ids: Sequence[int],
     min_region_size: int,
+    void: VoidRule | None,
 ) -> ClassOverlaps:
     """The ``predictions`` (R,) of one class; ``intersection`` (R, S) with all segments, by ascending value."""
     segment_label = segment_value // instance_ap.INSTANCES_PER_CLASS
     columns = np.flatnonzero(segment_label == class_id)  # ascending value, as in the original's loop
-    n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
-    shared, is_small = intersection[:, columns], segment_size[columns] < min_region_size
+    n_times = (~np.isin(segment_label, class_ids)).astype(np.int64)  # that a point of each segment counts as ignored
+    is_small = segment_size < min_region_size
+    if void == "groups":
+        n_times += is_small & (segment_label == 0) & (segment_value > 0)
+    n_times[columns] += is_small[columns]
+    shared = intersection[:, columns]
     return ClassOverlaps(
         predictions=predictions,
         values=segment_value[columns],
         iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
-        takes_part=~is_small,
-        ignored_share=(n_void + shared[:, is_small].sum(axis=1)) / n_points,
+        takes_part=~is_small[columns],
+        ignored_share=(void != "false-positives") * (intersection @ n_times) / n_points,
     )
 
 

@@ -96,7 +96,7 @@ class InstanceMetric(CurveMetric):
             scored.class_ids,
             rules.min_region_size,
             rules.thresholds,
-            forgives_void=rules.void is None,
+            void=rules.void,
         )
         wanted = np.isin(scored.values // instance_ap.INSTANCES_PER_CLASS, scored.class_ids)
         warnings = [None if rules.class_agnostic else labelling.encoder_warning(rules, prediction, encoder)]
@@ -162,9 +162,8 @@ def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64A
 
 def encode_truth(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
     """One value per point, label * 1000 + instance, or 0 if void."""
-    if rules.class_agnostic is not None:
-        return encode_without_classes(rules, semantic, instance)
-    return instance_ap.encode_ground_truth(semantic, instance)
+    values = instance_ap.encode_ground_truth(semantic, instance)
+    return values if rules.class_agnostic is None else encode_without_classes(rules, values)
 
 
 def named_classes(
@@ -177,39 +176,39 @@ def named_classes(
     return np.where(classes >= 0, ids[classes], 0)
 
 
-def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
-    """One value per point, 1000 + its object number, or 0 if void, by the rule ``class_agnostic``.
+def encode_without_classes(rules: ProtocolRules, values: Int64Array) -> Int64Array:
+    """One value per point, 1000 + its object number, or below 1000 if void, by the rule ``class_agnostic``.
 
-    ``scored``: points without a scored class are void. ``annotated``: only points without an instance are. Both number
-    the objects from 1 by class and then by instance number, the order in which the originals match them; equal instance
-    numbers of two classes are two objects. ``numbered``: equal instance numbers are one object, and objects are ordered
-    by number. ``everything``: the same, because the original takes values modulo 1000, and nothing is void, because
-    points without an instance are one more object, of the value 1000.
+    ``values`` (N,) are label * 1000 + instance, 0 for none. ``scored``: points without a scored class are void, 0.
+    ``annotated``: only values below 1000 are void, and are kept. Both number the objects from 1 by class and then by
+    instance number, the order in which the originals match them; equal instance numbers of two classes are two objects.
+    ``numbered``: equal instance numbers are one object, and objects are ordered by number. ``everything``: the same,
+    because the original takes values modulo 1000, and nothing is void, because points without an instance are one more
+    object, of the value 1000.
 
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
-    >>> semantic, instance = np.array([0, 1, 5, 2, 5]), np.array([0, 1, 1, 3, 2])  # 1 is the wall
+    >>> values = np.array([0, 1001, 5001, 2003, 5002, 7])  # 1 is the wall
     >>> names = ("open3dis", "segment3d", "maskclustering")
     >>> each = [load_protocol(f"class-agnostic-{name}") for name in names]
-    >>> [encode_without_classes(rules, semantic, instance).tolist() for rules in each]
-    [[0, 0, 1002, 1001, 1003], [0, 1001, 1003, 1002, 1004], [1000, 1001, 1001, 1003, 1002]]
+    >>> [encode_without_classes(rules, values).tolist() for rules in each]
+    [[0, 0, 1002, 1001, 1003, 0], [0, 1001, 1003, 1002, 1004, 7], [1000, 1001, 1001, 1003, 1002, 1007]]
     """
-    values = instance_ap.encode_ground_truth(np.full(len(instance), OBJECT), instance)
-    if rules.class_agnostic == "everything":
-        values[np.asarray(instance) == 0] = OBJECT * instance_ap.INSTANCES_PER_CLASS
+    label, number = np.divmod(values, instance_ap.INSTANCES_PER_CLASS)
+    coded = number + OBJECT * instance_ap.INSTANCES_PER_CLASS
     if rules.class_agnostic in {"everything", "numbered"}:
-        return values
-    label = np.asarray(semantic, np.int64)
+        return coded if rules.class_agnostic == "everything" else np.where(number > 0, coded, 0)
+    coded = np.where(label == 0, values, 0)
+    is_object = label > 0
     if rules.class_agnostic == "scored":
-        label = labelling.class_index_of_ids(rules, label)
-        values[~np.append(labelling.scored_classes(rules), False)[label]] = 0
-    is_object = values > 0
-    key = label[is_object] * instance_ap.INSTANCES_PER_CLASS + np.asarray(instance)[is_object]
-    distinct, number = np.unique(key, return_inverse=True)
+        label, coded = labelling.class_index_of_ids(rules, label), np.zeros_like(coded)
+        is_object = np.append(labelling.scored_classes(rules), False)[label]
+    key = label[is_object] * instance_ap.INSTANCES_PER_CLASS + number[is_object]
+    distinct, row = np.unique(key, return_inverse=True)
     if len(distinct) >= instance_ap.INSTANCES_PER_CLASS:
         most = instance_ap.INSTANCES_PER_CLASS - 1
         raise DataError(f"ground truth: has {len(distinct)} objects; without classes a scene may have {most}")
-    values[is_object] = OBJECT * instance_ap.INSTANCES_PER_CLASS + 1 + number
-    return values
+    coded[is_object] = OBJECT * instance_ap.INSTANCES_PER_CLASS + 1 + row
+    return coded
 
 
 def score_of_masks(

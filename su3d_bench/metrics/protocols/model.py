@@ -21,6 +21,7 @@ MetricName = Literal[
     "hovsg-objects", "hovsg-places", "retrieval", "pope", "annotation", "reasoning",
 ]  # fmt: skip
 ValuesOfMetric = Mapping[MetricName, tuple[str, ...]]
+VoidRule = Literal["false-positives", "groups"]
 BOX_AXES = Literal["truth", "world", "aligned"]
 CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
 # The fields that not every kind has.
@@ -123,9 +124,10 @@ class ProtocolRules(_Strict):
     ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or the cosine rescaled to 0..1
     over the scene's masks for each query. ``top_k``: the number of labels of a point, or masks of a query, that count;
     all if absent. ``class_agnostic`` drops the labels: the true instances are those of the ``scored`` classes (the rest
-    is void), all ``annotated`` ones, ``numbered``, where a number identifies an object, whatever its class, or
+    is void), ``annotated``, all with a class, ``numbered``, where a number identifies an object, whatever its class, or
     ``everything``, with the unannotated points as one more. ``void``: masks on it are ``false-positives``; if absent,
-    they are dropped at every threshold below their share of void, as in ScanNet's script. ``labels``: whether the same
+    they are dropped at every threshold below their share of void, as in ScanNet's script; with ``groups``, those of
+    values below 1000, points of a group of less than the minimum size count twice in it. ``labels``: whether the same
     mask may occur with several labels (``top-k``) or only with ``one``; if absent, both are scored, but not mixed in a
     ranking. ``box_axes``: the box of an instance is the smallest around its points along the axes of the ``truth``'s
     box that it is compared with, or along those of the ``world``, or of the ``aligned`` world, rotated along the walls
@@ -146,7 +148,7 @@ class ProtocolRules(_Strict):
     classes: tuple[ClassEntry, ...] = ()
     class_numbers: Literal["ids", "lines"] = "ids"
     class_agnostic: Literal["scored", "annotated", "numbered", "everything"] | None = None
-    void: Literal["false-positives"] | None = None
+    void: VoidRule | None = None
     stuff: tuple[str, ...] = ()
     unnamed: str | None = None
     labels: Literal["one", "top-k"] | None = None

@@ -13,10 +13,13 @@ from scored_room import instances
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.evaluation.ground_truth import VertexTruth
+from su3d_bench.evaluation.scoring import score_on_vertices
 from su3d_bench.metrics.instance.scene_counts import per_scene
-from su3d_bench.metrics.instance.score import encode_without_classes
+from su3d_bench.metrics.instance.score import encode_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.predictions.base import vertex_masks
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
 CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is not one of the 200
@@ -40,6 +43,34 @@ def masks(truth: GroundTruth, *ids: int, scores: list[float] | None = None) -> I
 def ap_of(name: str, truth: GroundTruth, prediction: Instances | Partition) -> float:
     rules = load_protocol(name)
     return combine(rules, {"a": score_scene(rules, truth, prediction, None)}).metrics["AP"]
+
+
+@pytest.mark.parametrize(
+    ("sizes", "mask", "ap50"),
+    [
+        ((200, 200, 200), (0, 0), 1.0),  # two perfect masks: the object of value 7 is not missed
+        ((200, 200, 200), (0, 200), 1.0),  # a mask on it is dropped
+        ((90, 200, 200), (0, 150), 1.0),  # 90 of 150 points, counted twice since they are fewer than 100
+        ((90, 200, 200), (70, 200), 5 / 6),  # 20 of 130, counted twice: a false positive
+    ],
+)
+@pytest.mark.parametrize("is_text", [True, False])
+def test_values_below_1000_are_forgiven_by_segment3d(
+    sizes: tuple[int, ...], mask: tuple[int, int], ap50: float, is_text: bool
+) -> None:
+    rules = load_protocol("class-agnostic-segment3d")
+    values = np.repeat([7, 3000 if is_text else 3001, 3002], sizes)
+    found = [np.arange(*mask), *(np.flatnonzero(values == one) for one in (3000, 3001, 3002))]
+    truth = GroundTruth(
+        scan().points[: len(values)], values // 1000, values % 1000, LABELS, "scannet200-vertices", "made for a test"
+    )
+    prediction = instances(truth.points, [one for one in found if len(one)], None)
+    if is_text:
+        content = vertex_masks("a", [one.astype(np.int32) for one in found if len(one)], len(values))
+        score = score_on_vertices(rules, VertexTruth(values, values // 1000, ()), "a", content, None).score
+    else:
+        score = score_scene(rules, truth, prediction, None)
+    assert combine(rules, {"a": score}).metrics["AP50"] == pytest.approx(ap50)
 
 
 @pytest.mark.parametrize(("name", "n_instances"), list(zip(NAMES, (5, 2, 4), strict=True)), ids=NAMES)
@@ -86,11 +117,11 @@ def test_both_ground_truth_forms_of_maskclustering_give_equal_counts(is_own_writ
 def test_instance_id_or_number_of_objects_beyond_the_encoding_is_refused() -> None:
     rules = load_protocol("class-agnostic-segment3d")
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
-        encode_without_classes(rules, np.array([CHAIR]), np.array([1000]))
+        encode_truth(rules, np.array([CHAIR]), np.array([1000]))
     number = np.arange(1000)
-    assert encode_without_classes(rules, 1 + number[:999] // 500, 1 + number[:999] % 500).tolist()[-1] == 1999
+    assert encode_truth(rules, 1 + number[:999] // 500, 1 + number[:999] % 500).tolist()[-1] == 1999
     with pytest.raises(DataError, match="has 1000 objects; without classes a scene may have 999"):
-        encode_without_classes(rules, 1 + number // 500, 1 + number % 500)
+        encode_truth(rules, 1 + number // 500, 1 + number % 500)
 
 
 # ---- answers of the originals if the order of objects matters, or if numbers restart with each class

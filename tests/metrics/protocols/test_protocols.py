@@ -19,7 +19,6 @@ from su3d_bench.metrics.compatibility import (
     Form,
     TruthFacts,
     class_id_incompatibility,
-    content_incompatibility,
     list_of_ids,
     n_feature_dimensions,
     truth_incompatibility,
@@ -150,14 +149,10 @@ def test_every_kind_has_rules_and_a_metric_and_every_metric_belongs_to_a_kind() 
     assert set(names) == set(get_args(MetricName))
 
 
-def test_one_name_or_class_is_enough_for_scoring() -> None:
+def test_one_name_is_enough_for_scoring() -> None:
     mask, points = np.arange(2, dtype=np.int32), np.zeros((2, 3), np.float32)
     for labels, has_names in ((["chair", ""], True), (["", ""], False)):
         assert ContentFacts.of(instances(points, [mask, mask], labels)).has_names == has_names
-    rules = load_protocol("scannet-instance")
-    for class_ids, reason in (([0, 3], None), ([0, 0], "needs classes, every mask has class 0")):
-        content = ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array(class_ids))
-        assert content_incompatibility(rules, content) == reason
 
 
 MESH = TruthFacts("truth", "replica", ("mesh-vertices",))

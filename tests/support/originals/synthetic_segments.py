@@ -1,4 +1,4 @@
-"""Synthetic problems of labelled points in segments of things and stuff, for both panopticapi and this program.
+"""Synthetic problems of labelled points in segments of things and stuff, for both the originals and this program.
 
 A problem is a list of scenes. A scene has the ``truth`` of every point, its ``instance`` (0 for none), its ``owner``
 among the predicted masks (-1 for none) and the class ``called`` of each mask. 0-2 are things, 3-4 stuff, 5 is a class
@@ -28,9 +28,9 @@ def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
     """A protocol's id and name of each slot of a class."""
     things = [entry for entry in rules.scored if entry.name not in rules.stuff]
     stuff = [entry for entry in rules.scored if entry.name in rules.stuff]
-    left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
-    chosen = [*(things[(7 * k + 2) % len(things)] for k in range(N_THINGS)), *stuff[: N_SCORED - N_THINGS], left[0]]
-    return {slot: (entry.id, entry.name) for slot, entry in enumerate(chosen)}
+    left = [(entry.id, entry.name) for entry in rules.classes if rules.is_ignored(entry.name)]
+    chosen = [*(things[(7 * k + 2) % len(things)] for k in range(N_THINGS)), *stuff[: N_SCORED - N_THINGS]]
+    return dict(enumerate([*((entry.id, entry.name) for entry in chosen), *(left[:1] or [(9999, "none such")])]))
 
 
 def has_left_out(rules: ProtocolRules) -> bool:
