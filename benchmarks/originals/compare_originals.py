@@ -24,6 +24,7 @@ import folders  # noqa: F401 - lets the next ones be found
 import numpy as np
 import original_boxes
 import original_instances
+import original_maps
 import original_objects
 import original_points
 import original_queries
@@ -34,7 +35,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 
 LARGEST = 1e-7
 FAMILIES = (
-    original_instances, original_points, original_objects, original_boxes, original_queries, original_segments
+    original_instances, original_points, original_objects, original_maps, original_boxes, original_queries,
+    original_segments,
 )  # fmt: skip
 ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in family.ORIGINALS)
 

@@ -149,23 +149,27 @@ class CategoriesMetric(Metric[ObjectCounts]):
 
     def per_scene(self, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
-        points, unit_of_point = _units(prediction, rules.transfer.evaluation_voxel_m)
+        points, units = _units(prediction, rules.transfer.evaluation_voxel_m)
         is_ranking = rules.metric == "openlex3d-ranking"
         ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
         object_row = transfer.rows_of(np.array(ids, np.int64), truth.object_of_point)
         scored = object_row >= 0
         cap_m = rules.transfer.cap_m
         reach_m = np.inf if cap_m is None else max(cap_m, *transfer.COVERAGE_RADII_M)
-        unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
-        distance[scored], nearest = transfer.nearest(points, truth.points[scored], reach_m)
-        unit[scored] = np.append(unit_of_point, -1)[nearest]
+        unit, distance, n_tied = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf), 0
+        if len(points):
+            distance[scored], nearest, n_tied = transfer.nearest_as_found(
+                transfer.ball_tree, points, units, truth.points[scored], reach_m
+            )
+            unit[scored] = np.append(units, -1)[nearest]
         if cap_m is not None:
             unit[distance > cap_m] = -1
         # the units with points, ascending, and each point's index among them, -1 for none
         used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
         counts = count(rules, truth, prediction, encoder, ids, object_row, used, transfer.rows_of(used, unit))
-        warnings = (labelling.encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
+        tied = f"points as near to one object as to another: {n_tied}; in the original chance decides" if n_tied else None
+        warnings = (labelling.encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction), tied)
         return self.score(counts, prediction, distance[scored], warnings)
 
     @property
@@ -183,7 +187,8 @@ class CategoriesMetric(Metric[ObjectCounts]):
 def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64Array]:
     """The points (M, 3) that belong to a unit (an instance or a point of a dense map), and the unit (M,) of each.
 
-    Downsampled to the mean of the points in each voxel, with the unit of the point nearest to it.
+    Downsampled to the mean of the points in each voxel, with the unit of the point nearest to it; voxels in the order of
+    their first points, as from Open3D with one thread. With several threads it has another order each time.
     """
     if isinstance(prediction, DenseFeatures):
         unit = np.where(has_feature(prediction), np.arange(len(prediction.points)), -1)
@@ -195,7 +200,7 @@ def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64A
     if not len(points) or voxel_m <= 0:
         return points, unit
     means = voxel_means(points, voxel_m)
-    _, nearest = transfer.nearest(points, means)
+    _, nearest, _ = transfer.nearest_as_found(transfer.chosen_tree, points, unit, means)
     return means, unit[nearest]
 
 
@@ -203,12 +208,13 @@ def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
     """The mean of the points in each voxel of a grid at the world's origin, as in Open3D's tensor point clouds.
 
     Cells, sums and means are float32, equal to those of Open3D 0.19 in every bit: with two points in a voxel, only
-    this rounding decides which one the mean is nearer to.
+    this rounding decides which one the mean is nearer to. In the order of the first points.
 
     >>> voxel_means(np.array([[0.01, 0, 0], [0.03, 0, 0], [0.06, 0, 0]], np.float32), 0.05)[:, 0].tolist()
     [0.019999999552965164, 0.05999999865889549]
     """
     voxel = transfer.row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
+    voxel = np.argsort(np.argsort(transfer.first_rows(voxel[:, None])))[voxel]
     sums = np.zeros((int(voxel.max()) + 1, 3), np.float32)
     np.add.at(sums, voxel, points)
     return sums / np.bincount(voxel).astype(np.float32)[:, None]
