@@ -5,6 +5,8 @@ Open3D orders the voxels of a cloud by chance, unless it has one thread as here.
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import itertools
 import json
 import os
@@ -27,7 +29,12 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine
 
 HYDRA = {"hydra": {"main": lambda **_: lambda function: function}}
-HOVSG_VALUES = {"mIoU": "mean_iou", "F-mIoU": "frequency_weighted_iou", "mAcc": "mean_accuracy", "pAcc": "pixel_accuracy"}
+HOVSG_VALUES = {
+    "mIoU": "mean_iou",
+    "F-mIoU": "frequency_weighted_iou",
+    "mAcc": "mean_accuracy",
+    "pAcc": "pixel_accuracy",
+}
 
 
 def _mesh(rng: np.random.Generator) -> tuple[Scene, Int64Array]:
@@ -93,8 +100,8 @@ def drawn_for_openlex3d(seed: int, index: int) -> Problem:
 def hovsg(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     """Its main function on the files of each scene; the features of objects and classes are axes."""
     others = ["omegaconf", "open_clip", "segment_anything", "torchmetrics", "cv2", "matplotlib.pyplot", "PIL"]
-    sklearn = {"sklearn.manifold": {"TSNE": None}}
-    module = load(checkout / "application/eval/evaluate_sem_seg.py", [checkout], absent=others, replaced=HYDRA | sklearn)
+    script = checkout / "application/eval/evaluate_sem_seg.py"
+    module = load(script, [checkout], absent=others, replaced=HYDRA | {"sklearn.manifold": {"TSNE": None}})
     model = types.SimpleNamespace(eval=lambda: None)
     module.open_clip = types.SimpleNamespace(create_model_and_transforms=lambda *_, **__: (model, None, None))
     axis = {"background": 0, **dict(zip(replica_label_set().names, replica_label_set().ids, strict=True))}
@@ -105,29 +112,21 @@ def hovsg(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     clip = types.SimpleNamespace(type="ViT-H-14", checkout="", checkpoint="")
 
     def ask(problem: Problem) -> Float64Array:
-        os.chdir(root := emptied(folder / "files"))  # it writes a file of colours here
-        for name in written(root, problem):
-            words = {"feature_map_path": root / "maps" / name, "replica_color_map": colours, "device": "cpu"}
-            place = {"replica_dataset_gt_path": str(root / ORIGINAL), "scene_name": name.replace("room", "room_")}
-            main = types.SimpleNamespace(**words, **place, dataset="replica")
-            module.main(types.SimpleNamespace(main=main, models=types.SimpleNamespace(clip=clip)))
-        rows = np.array([[one.pop(0) for one in answers] for _ in problem], float)
+        root = emptied(folder / "files")
+        for one in answers:
+            one.clear()
+        with contextlib.chdir(root):  # it writes a file of colours
+            for name in written(root, problem):
+                words = {"feature_map_path": root / "maps" / name, "replica_color_map": colours, "device": "cpu"}
+                place = {"replica_dataset_gt_path": str(root / ORIGINAL), "scene_name": name.replace("room", "room_")}
+                main = types.SimpleNamespace(**words, **place, dataset="replica")
+                module.main(types.SimpleNamespace(main=main, models=types.SimpleNamespace(clip=clip)))
+        rows = np.array(answers, float).T
         if not np.isfinite(rows).all():
             raise ArithmeticError("it divides by zero")
         return rows
 
-    return _answers_forgotten(ask, answers)
-
-
-def _answers_forgotten(ask: Ask, answers: list[list[Any]]) -> Ask:
-    """``ask`` without the answers to a problem at which the original stopped."""
-
-    def again(problem: Problem) -> Float64Array:
-        for one in answers:
-            one.clear()
-        return ask(problem)
-
-    return again
+    return ask
 
 
 def openlex3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
@@ -137,7 +136,7 @@ def openlex3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     colours = {"seaborn": {"color_palette": lambda *_, n_colors: [(0.0, 0.0, 0.0)] * n_colors}}
     script = checkout / "openlex3d/scripts/evaluate_segmentation.py"
     module = load(script, [checkout], absent=["omegaconf"], replaced=HYDRA | colours)
-    base: Any = sys_module("openlex3d.models.base").VisualLanguageEncoder
+    base: Any = importlib.import_module("openlex3d.models.base").VisualLanguageEncoder
     texts = {"compute_text_features": lambda self, prompts, **_: PromptEncoder().encode_texts(prompts)}
     module.load_model = lambda _: type("Given", (base,), texts)()
     results: list[dict[str, Any]] = []
@@ -159,12 +158,6 @@ def openlex3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
         return np.array([[found[part][name] for name in rules.value_names] for found in results[before:]], float)
 
     return ask
-
-
-def sys_module(name: str) -> Any:
-    import importlib
-
-    return importlib.import_module(name)
 
 
 def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:

@@ -25,8 +25,10 @@ LISTS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class, numbered
-    in any order; points of a map that coincide or are as far from a vertex as others."""
+    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class.
+
+    Objects are numbered in any order; points of the map coincide or are as far from a vertex as others.
+    """
     rng = np.random.default_rng([seed, index, 5])
     scenes = []
     for _ in range(rng.integers(1, 4)):

@@ -182,6 +182,7 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
 
 
 Search = Callable[[Points], Callable[[Points, int], IntArray]]  # of points: of queries (Q, 3) and k, rows (Q, k)
+_MAX_EQUAL = 32  # positions at one distance among which values are compared; 24 of a cubic lattice can be
 ROUNDING_M = 1e-9  # smaller differences of distances are ties, because a tree's bounds are rounded
 
 
@@ -224,8 +225,10 @@ def nearest_as_found(
     tree = cKDTree(points[kept], balanced_tree=False, compact_nodes=False)
     distances, rows = tree.query(queries, k=2, distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
     index = np.append(kept, -1)[rows[:, 0]]
-    tied = np.flatnonzero(distances[:, 1] <= distances[:, 0] + ROUNDING_M)
-    tied = tied[np.isfinite(distances[tied, 0])]
+    tied = np.flatnonzero(np.isfinite(distances[:, 1]) & (distances[:, 1] <= distances[:, 0] + ROUNDING_M))
+    equal, rows = tree.query(queries[tied], k=_MAX_EQUAL, workers=1)
+    of_row = np.append(values[kept], -1)[rows]
+    tied = tied[((of_row != of_row[:, :1]) & (equal <= equal[:, :1] + ROUNDING_M)).any(axis=1)]
     if len(tied):
         index[tied] = search(points)(queries[tied], 1)[:, 0]
     return distances[:, 0], index, len(tied)

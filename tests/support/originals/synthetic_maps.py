@@ -31,7 +31,10 @@ from su3d_bench.predictions.hovsg import hovsg
 
 Scene = dict[str, Any]
 Problem = list[Scene]
-PROMPTS = tuple("chair|arm chair|table|tv stand|lamp|book|pot|cat|flower|bin|sofa|ledge|floor|window ledge".split("|"))
+PROMPTS = (
+    "chair", "arm chair", "table", "tv stand", "lamp", "book", "pot", "cat", "flower", "bin", "sofa", "ledge", "floor",
+    "window ledge",
+)  # fmt: skip
 DIMENSIONS = 6
 RELEASE, ORIGINAL = "gt_openlex3d", "replica_v1"
 
@@ -69,9 +72,7 @@ def written(root: Path, problem: Problem) -> list[str]:
             clouds = {k: metres(scene, cloud) for k, cloud in enumerate(scene["clouds"])}
             write_hovsg(root / "maps" / name, clouds, features)
             continue
-        write_openlex(
-            root / "maps" / name, metres(scene, scene["cloud"]), np.array(scene["index"]), _features(scene)
-        )
+        write_openlex(root / "maps" / name, metres(scene, scene["cloud"]), np.array(scene["index"]), _features(scene))
         folder = root / RELEASE / "replica" / name
         folder.mkdir(parents=True)
         (folder.parent / "prompt_list.txt").write_text("\n".join(PROMPTS) + "\n")
