@@ -205,7 +205,7 @@ def chosen_tree(points: Points) -> Callable[[Points, int], IntArray]:
     """The search of OpenLex3D's reader of maps: scikit-learn chooses it by the number of points."""
     from sklearn.neighbors import NearestNeighbors
 
-    return partial(NearestNeighbors().fit(points).kneighbors, return_distance=False)
+    return partial(NearestNeighbors(n_neighbors=1).fit(points).kneighbors, return_distance=False)
 
 
 def nearest_as_found(

@@ -51,13 +51,14 @@ class PromptEncoder:
         raise AssertionError("scoring looks at no image")
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
-        table = np.random.default_rng(7).normal(size=(len(PROMPTS), DIMENSIONS)).astype(np.float32)
+        table: Float32Array = np.random.default_rng(7).normal(size=(len(PROMPTS), DIMENSIONS)).astype(np.float32)
         table /= np.linalg.norm(table, axis=1, keepdims=True)
-        return np.asarray(table[[PROMPTS.index(text) for text in texts]])
+        return table[[PROMPTS.index(text) for text in texts]]
 
 
 def metres(scene: Scene, places: Sequence[Sequence[int]]) -> Float32Array:
-    return (np.array(places, np.float64).reshape(-1, 3) / scene["per_m"]).astype(np.float32)
+    in_metres: Float32Array = (np.array(places, np.float64).reshape(-1, 3) / scene["per_m"]).astype(np.float32)
+    return in_metres
 
 
 def written(root: Path, problem: Problem) -> list[str]:
@@ -115,10 +116,10 @@ def scored(rules: ProtocolRules, problem: Problem, root: Path) -> dict[str, Scen
         if "clouds" in scene:
             mesh = read_annotated_mesh(root / ORIGINAL / original_name(name), name)
             called = tuple(labels.name_of(one) if one else "background" for one in scene["called"])
-            found, _ = hovsg(root / "maps" / name, name)
+            found: Any = hovsg(root / "maps" / name, name)[0]
             scores[name] = score_scene(rules, corner_truth(mesh), replace(found, labels=called), None)
         else:
             truth = truth_below(root, "replica", name, rules.ground_truth)
-            found, _ = openlex3d(root / "maps" / name, name)
+            found = openlex3d(root / "maps" / name, name)[0]
             scores[name] = score_scene(rules, truth, found, PromptEncoder())
     return scores
