@@ -52,7 +52,7 @@ def test_votes_equal_brute_force_with_ties_broken_by_the_original_search(
 @pytest.mark.parametrize("n", [3, 9, 200])
 def test_nearest_points_of_several_values_are_those_of_the_original_search(search: Search, n: int) -> None:
     rng = np.random.default_rng(n)
-    points, targets, values = rng.integers(0, 2, (n, 3)) / 8, rng.integers(0, 3, (90, 3)) / 16, rng.integers(0, 3, n)
+    points, targets, values = rng.integers(0, 2, (n, 3)) / 8, rng.integers(0, 3, (90, 3)) / 16, np.arange(n)
     distance, index, n_tied = nearest_as_found(search, points, values, targets, 0.2)
     exact, _ = nearest(points, targets, 0.2)
     assert distance.tolist() == exact.tolist() and n_tied > 0
