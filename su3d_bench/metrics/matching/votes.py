@@ -62,7 +62,7 @@ def transfer_votes(
         return value, distance
     places, place_of_target = _distinct_places(targets[wanted_rows])
     of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
-    found = _Neighbours(points, neighbours, search)
+    found = _Search(points, neighbours, search)
     step = max(1, _MAX_CELLS // (neighbours + 1))
     for start in range(0, len(places), step):
         rows = slice(start, start + step)
@@ -80,7 +80,7 @@ def _neighbours_of_all(
 ) -> tuple[Int64Array, Float64Array, Int64Array]:
     """The row of every target's position, and for each position the distances and indices of its nearest points."""
     places, place_of_target = _distinct_places(targets)
-    neighbours_of = _Neighbours(points, neighbours, search)
+    neighbours_of = _Search(points, neighbours, search)
     step = max(1, _MAX_CELLS // (neighbours + 1))
     found = [neighbours_of.nearest(places[start : start + step]) for start in range(0, len(places), step)]
     distances, indices = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -107,10 +107,10 @@ def _most_votes(votes: Int64Array) -> Int64Array:
     return np.asarray(np.where(has_most, votes, votes.max()).min(axis=1))
 
 
-class _Neighbours:
+class _Search:
     """The ``k`` nearest of a list of points, exact in float64; those that ``search`` finds on ties."""
 
-    def __init__(self, points: Points, k: int, search: Search) -> None:
+    def __init__(self, points: Points, k: int, search: Search = ball_tree) -> None:
         from scipy.spatial import cKDTree
 
         self.points = np.asarray(points, np.float64)
