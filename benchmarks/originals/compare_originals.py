@@ -28,6 +28,7 @@ import original_chains
 import original_challenge
 import original_derived
 import original_instances
+import original_maps
 import original_objects
 import original_points
 import original_queries
@@ -39,8 +40,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 
 LARGEST = 1e-7
 FAMILIES = (
-    original_instances, original_derived, original_points, original_objects, original_boxes, original_queries,
-    original_segments, original_top_k, original_answers, original_challenge, original_chains,
+    original_instances, original_derived, original_points, original_objects, original_maps, original_boxes,
+    original_queries, original_segments, original_top_k, original_answers, original_challenge, original_chains,
 )  # fmt: skip
 ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in family.ORIGINALS)
 

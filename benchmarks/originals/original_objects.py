@@ -25,7 +25,10 @@ LISTS = {
 
 
 def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class."""
+    """Problem ``index`` in slots, the last for unnamed objects: void, missing classes, objects without a class.
+
+    Objects are numbered in any order; points of the map coincide or are as far from a vertex as others.
+    """
     rng = np.random.default_rng([seed, index, 5])
     scenes = []
     for _ in range(rng.integers(1, 4)):
@@ -37,14 +40,19 @@ def drawn(seed: int, index: int) -> Problem:
             called = np.where(rng.random(n) < 0.5, truth, rng.choice([*there, N_SLOTS - 1, NONE], n))
             scenes.append(scene | {"called": called.tolist()})
             continue
-        n_objects, n_points = int(rng.integers(1, 6)), int(rng.integers(7, 20))
+        n_objects, n_points = int(rng.integers(1, 6)), int(rng.integers(7, 60))
         owner = rng.integers(-1, n_objects, n_points)
         owner[:5] = rng.integers(0, n_objects, 5)  # it fails if fewer than five points vote
+        step = int(rng.choice([1, 125, 250]))
+        places = rng.integers(0, 1000 // step, (n, 3)) * step
+        own = rng.integers(-100 // step, 1100 // step, (n_points, 3)) * step
+        own = np.where(rng.random((n_points, 1)) < 0.3, own[rng.integers(0, n_points, n_points)], own)
         scenes.append(
             scene
             | {
-                "places_mm": rng.integers(0, 1000, (n, 3)).tolist(),
-                "own_mm": rng.integers(-100, 1100, (n_points, 3)).tolist(),
+                "places_mm": places.tolist(),
+                "own_mm": own.tolist(),
+                "ids": rng.choice(99, n_objects, replace=False).tolist(),
                 "owner": owner.tolist(),
                 "of_object": rng.choice([*there, *there, rng.integers(N_SLOTS), NONE], n_objects).tolist(),
             }
@@ -69,10 +77,11 @@ def ovo(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     def labels_of(scene: dict[str, Any]) -> Float64Array:
         if "called" in scene:
             return place[scene["called"]]
-        owner = torch.tensor(scene["owner"])
-        own, seen = (np.array(scene[key]) / 1000 for key in ("own_mm", "places_mm"))
+        ids = np.array([*scene["ids"], -1])
+        own, seen = ((np.array(scene[key]) / 1000).astype(np.float32) for key in ("own_mm", "places_mm"))
+        owner = torch.tensor(ids[scene["owner"]])
         of_vertex, *_ = module.match_labels_to_vtx(owner, torch.tensor(own), torch.tensor(seen))
-        return place[np.array(scene["of_object"])[of_vertex.numpy()]]
+        return place[[scene["of_object"][scene["ids"].index(one)] for one in of_vertex.tolist()]]
 
     def ask(problem: Problem) -> Float64Array:
         problem = slots_of(rules, problem)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -20,7 +19,7 @@ from pydantic import AfterValidator, Field, Strict
 
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted, printable
-from su3d_bench.core.types import Float32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
@@ -30,7 +29,7 @@ from su3d_bench.formats.json_models import FileModel, checked_json, read_json
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_files import read_torch
-from su3d_bench.metrics.matching.nearest import nearest
+from su3d_bench.metrics.matching.nearest import ball_tree, nearest_as_found
 from su3d_bench.metrics.open_vocabulary.openlex3d import SPACE as LABELS
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import SPACE as QUERIES
@@ -199,12 +198,13 @@ MAX_OBJECTS = 2**16  # the original keeps ids in 16 bits
 class LabelledPoints:
     """``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64 object numbers of the base data, -1 for none.
 
-    ``source`` names the data.
+    ``source`` names the data; ``is_listed`` (N,): whether the scene's list has the object.
     """
 
     points: Float32Array
     object_of_point: Int64Array
     source: str
+    is_listed: BoolArray | bool = True
 
 
 def points_of(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
@@ -224,14 +224,12 @@ def _of_replica(data_root: Path, scene: str) -> LabelledPoints:
 
 
 def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
-    """The corners of all faces (a vertex of four faces four times); every object counts, with or without a class.
-
-    The original assigns a face whose object is not in the scene's list to object 0; here it keeps its number.
-    """
+    """The corners of all faces (a vertex of four faces four times); every object counts, with or without a class."""
     return LabelledPoints(
         mesh.vertices[mesh.corners.values],
         np.repeat(mesh.object_of_face, mesh.corners.lengths).astype(np.int64),
         f"the faces of {MESH_NAME}",
+        np.repeat(mesh.is_listed, mesh.corners.lengths),
     )
 
 
@@ -329,15 +327,17 @@ def categories_truth(files: OpenLexFiles, labelled: LabelledPoints) -> OpenLexTr
     """Ground truth of ``openlex3d-topn`` and ``openlex3d-ranking``: visible points with the nearest point's object.
 
     Points without a labelled point within 5 cm have no object. Without a cloud of visible points, a scene of
-    ``ALL_SEEN`` is scored on all labelled points, as the original does.
+    ``ALL_SEEN`` is scored on all labelled points, as the original does. Objects that the scene's list lacks are object
+    0 here, though not in queries, also as in the original.
     """
+    objects = np.where(labelled.is_listed, labelled.object_of_point, 0)
     if files.dataset in ALL_SEEN and not files.has_visible_points:
-        points, objects, name = labelled.points, labelled.object_of_point, "all points"
+        points, name = labelled.points, "all points"
     else:
         points, name = files.visible_points(), VISIBLE_NAME
-        distance, nearest_rows = nearest(labelled.points, points, VISIBLE_RADIUS_M)
-        nearest_rows[distance >= VISIBLE_RADIUS_M] = -1
-        objects = np.append(labelled.object_of_point, -1)[nearest_rows]
+        distance, rows, _ = nearest_as_found(ball_tree, labelled.points, objects, points, VISIBLE_RADIUS_M)
+        rows[distance >= VISIBLE_RADIUS_M] = -1
+        objects = np.append(objects, -1)[rows]
     return OpenLexTruth(
         points,
         objects,
@@ -384,7 +384,7 @@ class OpenLexRelease:
     def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
         """The ground truth of a scene; ``GroundTruthMissing`` if one of its files is missing."""
         files = OpenLexFiles(self.folder, self.dataset, scene)
-        labelled = _kept_points(self.dataset, self.data_root, scene)
+        labelled = points_of(self.dataset, self.data_root, scene)
         if variant == VISIBLE:
             return categories_truth(files, labelled)
         return queries_truth(files, labelled, QUERY_LEVEL)
@@ -429,9 +429,3 @@ def _find(root: Path, dataset: str, scene: str) -> tuple[OpenLexRelease, str] | 
 def _names(scene: str) -> tuple[str, ...]:
     """Possible names of a scene in the release: for HM3D walks, the number before the hyphen."""
     return tuple(dict.fromkeys((scene, scene.partition("-")[0])))
-
-
-@lru_cache(maxsize=1)
-def _kept_points(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
-    """The points of a scene; the last ones are cached, because every protocol asks for them again."""
-    return points_of(dataset, data_root, scene)

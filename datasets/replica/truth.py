@@ -22,7 +22,7 @@ from pydantic import Field
 
 from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.system.files import opened
-from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import check_finite, face_corners, fans, scalar_column, vertex_positions
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
 from su3d_bench.formats.hdf5 import largest_column, read_rows
@@ -40,7 +40,8 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class AnnotatedMesh:
     """``vertices`` (V, 3); ``corners`` of F polygons; ``object_of_face`` (F,) as in the file; per face its class and
-    instance id (F,), 0 if void; ``class_of_instance`` of every object that has a class."""
+    instance id (F,), 0 if void; ``class_of_instance`` of every object that has a class; ``is_listed`` (F,): whether
+    the object has an entry in info_semantic.json."""
 
     vertices: Float32Array
     corners: ListColumn
@@ -48,6 +49,7 @@ class AnnotatedMesh:
     semantic_of_face: Int32Array
     instance_of_face: Int32Array
     class_of_instance: Mapping[int, int]
+    is_listed: BoolArray
 
 
 def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
@@ -59,9 +61,9 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     semantic = np.array([known.get(int(number), 0) for number in ids], np.int32)[face_rows]
     instance = np.array([int(number) + 1 if int(number) in known else 0 for number in ids], np.int32)[face_rows]
     _warn_void_objects(ids, np.bincount(face_rows, minlength=len(ids)), class_of_object, where)
-    return AnnotatedMesh(
-        vertices, corners, objects, semantic, instance, {number + 1: known[number] for number in sorted(known)}
-    )
+    is_listed = np.array([int(number) in class_of_object for number in ids], bool)[face_rows]
+    of_instance = {number + 1: known[number] for number in sorted(known)}
+    return AnnotatedMesh(vertices, corners, objects, semantic, instance, of_instance, is_listed)
 
 
 class InfoClass(FileModel):

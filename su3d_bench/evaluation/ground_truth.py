@@ -241,6 +241,7 @@ class OpenLexTruths(SceneTruths):
         self._path, self.dataset_name = request.ground_truth, None
         self.where = shown(request.ground_truth)
         self._release = _labelled_release(request, sources)
+        self._kept: dict[tuple[str, str], Truth] = {}
         known = self._release.scenes()
         self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
         requested = self.scenes if request.scenes else ()
@@ -260,7 +261,10 @@ class OpenLexTruths(SceneTruths):
         return None if rules.ground_truth in (VISIBLE, FACE_CORNERS) else f"{NOT_INTENDED} the labels of OpenLex3D"
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
-        return self._release.truth(scene, rules.ground_truth)
+        if (scene, rules.ground_truth) not in self._kept:
+            self._kept = {key: truth for key, truth in self._kept.items() if key[0] == scene}
+            self._kept[scene, rules.ground_truth] = self._release.truth(scene, rules.ground_truth)
+        return self._kept[scene, rules.ground_truth]
 
 
 def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRelease:

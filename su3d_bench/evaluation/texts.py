@@ -130,12 +130,12 @@ def _real_encoder(name: str) -> Encoder | None:
 
     entry = encoder_known_as(name)
     forms = () if entry is None else model_state(entry).files
-    folder = next((files.folder for files in forms if files.form.form == "transformers"), None)
-    return None if entry is None or folder is None else _loaded(entry.name, folder)
+    found = next((files for files in forms if files.form.form == "transformers"), None)
+    return None if entry is None or found is None else _loaded(entry.name, found.folder, found.state)
 
 
 @lru_cache(maxsize=2)
-def _loaded(name: str, folder: Path) -> Encoder:
+def _loaded(name: str, folder: Path, state: object) -> Encoder:
     """The encoder in ``folder``, cached with the features of the texts that it has encoded."""
     from su3d_bench.perception.models.config import ModelsConfig
     from su3d_bench.perception.models.loading import load_encoder

@@ -1,4 +1,4 @@
-"""Votes of several neighbours and masks that include near points: exact, independent of the tree, with fixed ties."""
+"""Votes of several neighbours and masks that include near points: exact, with ties as in the original searches."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.core.maps import Masks
+from su3d_bench.metrics.matching.nearest import Search, ball_tree, chosen_tree, kd_tree, nearest, nearest_as_found
 from su3d_bench.metrics.matching.votes import transfer_each_mask, transfer_votes
 
 
-def plain_votes(points: np.ndarray, values: np.ndarray, targets: np.ndarray, k: int, cap_m: float) -> list[int]:
+def plain_votes(indices: np.ndarray, squared: np.ndarray, values: np.ndarray, cap_m: float) -> list[int]:
     answer = []
-    for target in targets.astype(np.float64):
-        squared = ((points.astype(np.float64) - target) ** 2).sum(axis=1)
-        nearest = np.lexsort((np.arange(len(points)), squared))[:k]
-        counted = Counter(int(values[i]) for i in nearest if squared[i] <= cap_m**2)
+    for row, chosen in enumerate(indices):
+        counted = Counter(int(values[i]) for i in chosen if squared[row, i] <= cap_m**2)
         answer.append(min(counted, key=lambda value: (-counted[value], value)) if counted else -1)
     return answer
 
@@ -30,9 +29,10 @@ def plain_votes(points: np.ndarray, values: np.ndarray, targets: np.ndarray, k: 
     k=st.integers(2, 7),
     on_a_grid=st.booleans(),
     cap_m=st.sampled_from([np.inf, 0.5]),
+    search=st.sampled_from([ball_tree, kd_tree]),
 )
-def test_votes_equal_brute_force_with_the_lowest_indices_on_ties(
-    seed: int, n: int, k: int, on_a_grid: bool, cap_m: float
+def test_votes_equal_brute_force_with_ties_broken_by_the_original_search(
+    seed: int, n: int, k: int, on_a_grid: bool, cap_m: float, search: Search
 ) -> None:
     rng = np.random.default_rng(seed)
     if on_a_grid:  # few positions, many points at each, so that there are ties beyond the last neighbour
@@ -40,29 +40,24 @@ def test_votes_equal_brute_force_with_the_lowest_indices_on_ties(
     else:
         points, targets = rng.random((n, 3)), rng.random((30, 3))
     values = rng.integers(0, 4, n)
-    ours, distance = transfer_votes(points, values, targets, np.ones(30, bool), k, cap_m)
-    assert ours.tolist() == plain_votes(points, values, targets, k, cap_m)
-    exact = np.sqrt(((points[None] - targets[:, None]) ** 2).sum(axis=2)).min(axis=1)
+    squared = ((points[None] - targets[:, None]) ** 2).sum(axis=2)
+    indices = search(points)(targets, min(k, n)).reshape(30, -1) if on_a_grid else squared.argsort(axis=1)[:, :k]
+    ours, distance = transfer_votes(points, values, targets, np.ones(30, bool), k, cap_m, search)
+    assert ours.tolist() == plain_votes(indices, squared, values, cap_m)
+    exact = np.sqrt(squared).min(axis=1)
     np.testing.assert_allclose(distance, np.where(exact > cap_m, np.inf, exact), rtol=1e-12)
 
 
-def test_lowest_indices_vote_among_more_ties_than_one_request() -> None:
-    points = np.zeros((5000, 3), np.float32)
-    values = np.array([8, 9, 9] + [1] * 4997)
-    value, _ = transfer_votes(points, values, np.zeros((2, 3), np.float32), np.array([True, True]), 3)
-    assert value.tolist() == [9, 9]
-
-
-@pytest.mark.parametrize("first", [-1.0, 1.0])
-def test_lowest_indices_vote_in_any_search_order(first: float) -> None:
-    points = np.zeros((82, 3))
-    points[:40, 0], points[40:80, 0] = first, -first  # more of each than one request returns
-    values = np.repeat([5, 4, 3], [3, 37, 42])
-    value, _ = transfer_votes(points[:80], values[:80], np.zeros((2, 3)), np.ones(2, bool), 3)
-    assert value.tolist() == [5, 5]
-    values[80:] = 4, 5  # the last two are nearer, and the third vote decides
-    value, _ = transfer_votes(points, values, np.zeros((2, 3)), np.ones(2, bool), 3)
-    assert value.tolist() == [5, 5]
+@pytest.mark.parametrize("search", [ball_tree, chosen_tree])
+@pytest.mark.parametrize("n", [3, 9, 200])
+def test_nearest_points_of_several_values_are_those_of_the_original_search(search: Search, n: int) -> None:
+    rng = np.random.default_rng(n)
+    points, targets, values = rng.integers(0, 2, (n, 3)) / 8, rng.integers(0, 3, (90, 3)) / 16, np.arange(n)
+    distance, index, n_tied = nearest_as_found(search, points, values, targets, 0.2)
+    exact, _ = nearest(points, targets, 0.2)
+    assert distance.tolist() == exact.tolist() and n_tied > 0
+    found = np.where(np.isfinite(exact), search(points)(targets, 1)[:, 0], -1)
+    assert np.append(values, -1)[index].tolist() == np.append(values, -1)[found].tolist()
 
 
 def test_smallest_value_wins_on_equal_votes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
+from places import CASES
+from synthetic_maps import written as written_maps
 from test_openlex3d_original import write_visible
 
 from su3d_bench.core.errors import DataError
@@ -96,14 +99,30 @@ def test_a_visible_point_far_from_every_corner_has_no_object(tmp_path: Path) -> 
     assert truth.object_of_point.tolist() == [7, -1]
 
 
-def test_corners_of_a_replica_mesh_keep_all_object_numbers() -> None:
+def test_objects_that_the_list_of_a_replica_scene_lacks_are_object_0_for_labels_but_not_for_queries(
+    tmp_path: Path,
+) -> None:
     vertices = np.arange(12, dtype=np.float32).reshape(4, 3)
     faces = ListColumn(np.array([0, 3, 6]), np.array([0, 1, 2, 1, 2, 3]))
     without_class = np.zeros(2, np.int32)
-    mesh = AnnotatedMesh(vertices, faces, np.array([7, 0]), without_class, without_class, {})
+    mesh = AnnotatedMesh(vertices, faces, np.array([7, 12]), without_class, without_class, {}, np.array([True, False]))
     found = release.face_corners_of(mesh)
-    assert found.object_of_point.tolist() == [7, 7, 7, 0, 0, 0]
+    assert found.object_of_point.tolist() == [7, 7, 7, 12, 12, 12]
     assert found.points[3].tolist() == vertices[1].tolist()
+    files = written(tmp_path)
+    write_visible(tmp_path / "replica/room0", vertices[[0, 3]])
+    assert release.categories_truth(files, found).object_of_point.tolist() == [7, 0]
+    assert release.queries_truth(files, found, "all").object_of_point.tolist() == [7, 7, 7, 12, 12, 12]
+
+
+def test_a_mesh_that_changes_within_the_process_is_read_again(tmp_path: Path) -> None:
+    scene = json.loads((CASES / "originals_maps.json").read_text())["openlex3d-topn"][0]["scenes"][0]
+    for number in (7, 8):
+        shutil.rmtree(tmp_path / "root", ignore_errors=True)
+        changed = scene | {"owner": [number] * len(scene["faces"]), "listed": {str(number): 1}}
+        written_maps(tmp_path / "root", [changed])
+        truth = release.truth_below(tmp_path / "root", "replica", "room0", release.VISIBLE)
+        assert set(truth.object_of_point.tolist()) - {-1} == {number}
 
 
 # ---- errors

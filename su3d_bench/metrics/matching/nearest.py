@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -179,6 +179,59 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     ([1.0, 1.0], [0, 1])
     """
     return Candidates(candidates).nearest(queries, cap_m)
+
+
+Search = Callable[[Points], Callable[[Points, int], IntArray]]  # of points: of queries (Q, 3) and k, rows (Q, k)
+_MAX_EQUAL = 32  # positions at one distance among which values are compared; 24 of a cubic lattice can be
+ROUNDING_M = 1e-9  # smaller differences of distances are ties, because a tree's bounds are rounded
+
+
+def ball_tree(points: Points) -> Callable[[Points, int], IntArray]:
+    """The search of HOV-SG and OpenLex3D, with scikit-learn's ball tree."""
+    from sklearn.neighbors import BallTree
+
+    return partial(BallTree(points).query, return_distance=False)
+
+
+def kd_tree(points: Points) -> Callable[[Points, int], IntArray]:
+    """The search of OVO, with SciPy's k-d tree."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+    return lambda queries, k: tree.query(queries, k)[1]
+
+
+def chosen_tree(points: Points) -> Callable[[Points, int], IntArray]:
+    """The search of OpenLex3D's reader of maps: scikit-learn chooses it by the number of points."""
+    from sklearn.neighbors import NearestNeighbors
+
+    return partial(NearestNeighbors(n_neighbors=1).fit(points).kneighbors, return_distance=False)
+
+
+def nearest_as_found(
+    search: Search, points: Points, values: Int64Array, queries: Points, cap_m: float = np.inf
+) -> tuple[Float64Array, Int64Array, int]:
+    """``nearest``, except that ``search`` decides between points of different ``values`` (N,) at the same distance.
+
+    Also the number of queries at which it does.
+
+    >>> points, values = np.array([[0.0, 0, 0], [2, 0, 0], [2, 0, 0]]), np.array([5, 7, 7])
+    >>> [part for part in nearest_as_found(ball_tree, points, values, np.array([[2.0, 0, 1]]))]
+    [array([1.]), array([1]), 0]
+    """
+    from scipy.spatial import cKDTree
+
+    kept = first_rows(np.column_stack([points, values]))  # without the corners that faces of one object share
+    tree = cKDTree(points[kept], balanced_tree=False, compact_nodes=False)
+    distances, rows = tree.query(queries, k=2, distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
+    index = np.append(kept, -1)[rows[:, 0]]
+    tied = np.flatnonzero(np.isfinite(distances[:, 1]) & (distances[:, 1] <= distances[:, 0] + ROUNDING_M))
+    equal, rows = tree.query(queries[tied], k=_MAX_EQUAL, workers=1)
+    of_row = np.append(values[kept], -1)[rows]
+    tied = tied[((of_row != of_row[:, :1]) & (equal <= equal[:, :1] + ROUNDING_M)).any(axis=1)]
+    if len(tied):
+        index[tied] = search(points)(queries[tied], 1)[:, 0]
+    return distances[:, 0], index, len(tied)
 
 
 def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array, order: Int64Array) -> Int64Array:

@@ -6,26 +6,42 @@ OpenLex3D's queries.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.maps import Masks
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
+from su3d_bench.metrics.matching.nearest import (
+    ROUNDING_M,
+    Points,
+    Search,
+    ball_tree,
+    is_remembering,
+    remembered,
+    row_ids,
+)
 
 _MAX_CELLS = 4_000_000  # neighbours in memory at once
 _MAX_KEPT = 12_000_000  # cached neighbours, of 16 bytes each, if they may be needed again
 
 
 def transfer_votes(
-    points: Points, values: Int64Array, targets: Points, wanted: BoolArray, neighbours: int, cap_m: float = np.inf
+    points: Points,
+    values: Int64Array,
+    targets: Points,
+    wanted: BoolArray,
+    neighbours: int,
+    cap_m: float = np.inf,
+    search: Search = ball_tree,
 ) -> tuple[Int64Array, Float64Array]:
     """The majority value of the ``neighbours`` nearest points, and the distance of the nearest, for each wanted target.
 
-    Each of ``points`` (V, 3) has one vote, ``values`` (V,) from 0; among points at the same distance the lower indices
-    vote, among values with equal votes the smallest wins. -1 and infinity if no point is within ``cap_m`` or the
-    target is not wanted.
+    Each of ``points`` (V, 3) has one vote, ``values`` (V,) from 0; among points at the same distance those vote that
+    ``search`` finds, among values with equal votes the smallest wins. -1 and infinity if no point is within ``cap_m``
+    or the target is not wanted.
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
     >>> value, distance = transfer_votes(points, np.array([4, 7, 7, 4]), points[:1], np.array([True]), 3)
@@ -38,7 +54,7 @@ def transfer_votes(
         return value, distance
     if is_remembering() and len(targets) * neighbours <= _MAX_KEPT:
         # another protocol needs other targets, and other values of the points
-        place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours)
+        place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours, search)
         place = place_of_all[wanted_rows]
         votes = np.where(all_distances <= cap_m, values[all_indices], -1)
         value[wanted_rows], distance[wanted_rows] = _most_votes(votes)[place], all_distances.min(axis=1)[place]
@@ -46,11 +62,11 @@ def transfer_votes(
         return value, distance
     places, place_of_target = _distinct_places(targets[wanted_rows])
     of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
-    search = _Search(points, neighbours)
+    found = _Search(points, neighbours, search)
     step = max(1, _MAX_CELLS // (neighbours + 1))
     for start in range(0, len(places), step):
         rows = slice(start, start + step)
-        distances, indices = search.nearest(places[rows])
+        distances, indices = found.nearest(places[rows])
         votes = np.where(distances <= cap_m, values[indices], -1)
         of_place[rows], nearest_m[rows] = _most_votes(votes), distances.min(axis=1)
     value[wanted_rows], distance[wanted_rows] = of_place[place_of_target], nearest_m[place_of_target]
@@ -59,12 +75,14 @@ def transfer_votes(
 
 
 @remembered
-def _neighbours_of_all(points: Points, targets: Points, neighbours: int) -> tuple[Int64Array, Float64Array, Int64Array]:
+def _neighbours_of_all(
+    points: Points, targets: Points, neighbours: int, search: Search
+) -> tuple[Int64Array, Float64Array, Int64Array]:
     """The row of every target's position, and for each position the distances and indices of its nearest points."""
     places, place_of_target = _distinct_places(targets)
-    search = _Search(points, neighbours)
+    neighbours_of = _Search(points, neighbours, search)
     step = max(1, _MAX_CELLS // (neighbours + 1))
-    found = [search.nearest(places[start : start + step]) for start in range(0, len(places), step)]
+    found = [neighbours_of.nearest(places[start : start + step]) for start in range(0, len(places), step)]
     distances, indices = (np.concatenate(each) for each in zip(*found, strict=True))
     return place_of_target, distances, indices
 
@@ -90,14 +108,19 @@ def _most_votes(votes: Int64Array) -> Int64Array:
 
 
 class _Search:
-    """The ``k`` nearest of a list of points, exact in float64; the lower indices on ties."""
+    """The ``k`` nearest of a list of points, exact in float64; those that ``search`` finds on ties."""
 
-    def __init__(self, points: Points, k: int) -> None:
+    def __init__(self, points: Points, k: int, search: Search = ball_tree) -> None:
         from scipy.spatial import cKDTree
 
         self.points = np.asarray(points, np.float64)
         self.k = min(k, len(points))
         self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+        self.search = search
+
+    @cached_property
+    def found(self) -> Callable[[Points, int], IntArray]:
+        return self.search(self.points)
 
     def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
         """Distances in metres and indices (Q, k), in no particular order."""
@@ -105,32 +128,11 @@ class _Search:
         distances, indices = self.tree.query(queries, k=min(k + 1, n), workers=1)
         distances, indices = distances.reshape(len(queries), -1), indices.reshape(len(queries), -1).astype(np.int64)
         if k < n:
-            tied = np.flatnonzero(distances[:, k - 1] == distances[:, k])
+            tied = np.flatnonzero(distances[:, k] <= distances[:, k - 1] + ROUNDING_M)
             indices = indices[:, :k]
-            indices[tied] = self._lowest_of_equals(queries[tied])
+            if len(tied):
+                indices[tied] = self.found(queries[tied], k)
         return distances[:, :k], indices
-
-    def _lowest_of_equals(self, queries: Float64Array) -> Int64Array:
-        """Indices (Q, k) if there are ties beyond the k-th neighbour; the distances are those of the tree."""
-        answer = np.empty((len(queries), self.k), np.int64)
-        open_rows = np.arange(len(queries))
-        n_asked = self.k
-        while len(open_rows):
-            n_asked = min(8 * n_asked, len(self.points))
-            unfinished = [open_rows[:0]]
-            step = max(1, _MAX_CELLS // n_asked)
-            for start in range(0, len(open_rows), step):
-                rows = open_rows[start : start + step]
-                _, indices = self.tree.query(queries[rows], k=n_asked, workers=1)
-                offset = self.points[indices] - queries[rows][:, None, :]
-                squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
-                order = np.lexsort((indices, squared))
-                answer[rows] = np.take_along_axis(indices, order, axis=1)[:, : self.k]
-                if n_asked < len(self.points):
-                    ranked = np.take_along_axis(squared, order, axis=1)
-                    unfinished.append(rows[ranked[:, self.k - 1] == ranked[:, -1]])
-            open_rows = np.concatenate(unfinished)
-        return answer
 
 
 def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: float) -> Masks:

@@ -149,23 +149,32 @@ class CategoriesMetric(Metric[ObjectCounts]):
 
     def per_scene(self, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
-        points, unit_of_point = _units(prediction, rules.transfer.evaluation_voxel_m)
+        points, units = _units(prediction, rules.transfer.evaluation_voxel_m)
         is_ranking = rules.metric == "openlex3d-ranking"
         ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
         object_row = transfer.rows_of(np.array(ids, np.int64), truth.object_of_point)
         scored = object_row >= 0
         cap_m = rules.transfer.cap_m
         reach_m = np.inf if cap_m is None else max(cap_m, *transfer.COVERAGE_RADII_M)
-        unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
-        distance[scored], nearest = transfer.nearest(points, truth.points[scored], reach_m)
-        unit[scored] = np.append(unit_of_point, -1)[nearest]
+        unit, distance, n_tied = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf), 0
+        if len(points):
+            distance[scored], nearest, n_tied = transfer.nearest_as_found(
+                transfer.ball_tree, points, units, truth.points[scored], reach_m
+            )
+            unit[scored] = np.append(units, -1)[nearest]
         if cap_m is not None:
             unit[distance > cap_m] = -1
         # the units with points, ascending, and each point's index among them, -1 for none
         used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
-        counts = count(rules, truth, prediction, encoder, ids, object_row, used, transfer.rows_of(used, unit))
-        warnings = (labelling.encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
+        of_point = transfer.rows_of(used, unit)
+        counts, n_equal = count(rules, truth, prediction, encoder, ids, object_row, used, of_point)
+        ties = {"points as near to one object as to another": n_tied, "objects with labels of equal cosine": n_equal}
+        warnings = (
+            labelling.encoder_warning(rules, prediction, encoder),
+            _shared_points_warning(prediction),
+            *(f"{what}: {n}; the original may choose otherwise" for what, n in ties.items() if n),
+        )
         return self.score(counts, prediction, distance[scored], warnings)
 
     @property
@@ -195,7 +204,7 @@ def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64A
     if not len(points) or voxel_m <= 0:
         return points, unit
     means = voxel_means(points, voxel_m)
-    _, nearest = transfer.nearest(points, means)
+    _, nearest, _ = transfer.nearest_as_found(transfer.chosen_tree, points, unit, means)
     return means, unit[nearest]
 
 
@@ -203,12 +212,14 @@ def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
     """The mean of the points in each voxel of a grid at the world's origin, as in Open3D's tensor point clouds.
 
     Cells, sums and means are float32, equal to those of Open3D 0.19 in every bit: with two points in a voxel, only
-    this rounding decides which one the mean is nearer to.
+    this rounding decides which one the mean is nearer to. The means are in the order of the voxels' first points, as
+    there with one thread; with several their order is another each time.
 
     >>> voxel_means(np.array([[0.01, 0, 0], [0.03, 0, 0], [0.06, 0, 0]], np.float32), 0.05)[:, 0].tolist()
     [0.019999999552965164, 0.05999999865889549]
     """
     voxel = transfer.row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
+    voxel = np.argsort(np.argsort(transfer.first_rows(voxel[:, None])))[voxel]
     sums = np.zeros((int(voxel.max()) + 1, 3), np.float32)
     np.add.at(sums, voxel, points)
     return sums / np.bincount(voxel).astype(np.float32)[:, None]
@@ -223,9 +234,10 @@ def _count_categories(
     object_row: Int64Array,
     used: Int64Array,
     of_point: Int64Array,
-) -> ObjectCounts:
+) -> tuple[ObjectCounts, int]:
+    """The counts, and the number of units whose last label counts only because it is listed before an equal one."""
     assert rules.top_k is not None
-    labels = getattr(prediction, "labels", None)
+    labels, n_equal = getattr(prediction, "labels", None), 0
     if not len(used):
         vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
     elif labels is not None and labelling.has_every_label(prediction):
@@ -233,12 +245,15 @@ def _count_categories(
         top = np.array([[vocabulary.index(labels[row])] for row in used], np.int64).reshape(-1, 1)
     else:
         vocabulary = list(truth.prompts)
-        n_top = min(rules.top_k, len(vocabulary))
-        blocks = _similarity_blocks(rules, truth, prediction, encoder, used)
-        top = np.concatenate([openlex3d.top_labels(block, n_top) for block in blocks])
+        n_top, tops = min(rules.top_k, len(vocabulary)), []
+        for block in _similarity_blocks(rules, truth, prediction, encoder, used):
+            tops.append(openlex3d.top_labels(block, n_top))
+            is_as_near = block >= np.take_along_axis(block, tops[-1][:, -1:], axis=1)
+            n_equal += int((is_as_near.sum(axis=1) > n_top).sum())
+        top = np.concatenate(tops)
     table = openlex3d.category_table(truth.objects, ids, vocabulary)
     category = openlex3d.point_categories(object_row, of_point, top, table)
-    return openlex3d.count_categories(object_row, category, len(ids))
+    return openlex3d.count_categories(object_row, category, len(ids)), n_equal
 
 
 def _count_ranks(
@@ -250,24 +265,26 @@ def _count_ranks(
     object_row: Int64Array,
     used: Int64Array,
     of_point: Int64Array,
-) -> ObjectCounts:
+) -> tuple[ObjectCounts, int]:
+    """The counts, and the number of units with equal cosines, whose ranks follow the list."""
     labels = [openlex3d.ranked_labels(truth.objects[object_id], truth.prompts) for object_id in ids]
     rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
     if len(units) == 0 and (object_row >= 0).any():  # no prediction: no label has a rank, each counts 0
         n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
         has = np.array([(len(ranked.synonyms) > 0, len(ranked.secondary) > 0) for ranked in labels])
         totals = np.where(np.column_stack([has.any(axis=1), has]), 0.0, np.nan)
-        return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
+        return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0]), 0
     scores = np.full((len(rows), 3), np.nan)
-    start = 0
+    start, n_equal = 0, 0
     for similarity in _similarity_blocks(rules, truth, prediction, encoder, used) if len(used) else ():
         ranks = openlex3d.rank_of_labels(similarity)
+        n_equal += int((np.diff(np.sort(similarity, axis=1), axis=1) == 0).any(axis=1).sum())
         here = (units >= start) & (units < start + len(ranks))
         for row in np.unique(rows[here]):
             mine = np.flatnonzero(here & (rows == row))
             scores[mine] = labels[row].scores(ranks[units[mine] - start])
         start += len(ranks)
-    return openlex3d.count_ranks(object_row, of_point, scores, len(ids))
+    return openlex3d.count_ranks(object_row, of_point, scores, len(ids)), n_equal
 
 
 def _similarity_blocks(

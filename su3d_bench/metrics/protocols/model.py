@@ -50,7 +50,8 @@ class TransferRules(_Strict):
     clouds), ``map-points`` (all points of the map; no instance if the nearest is background) or ``each-mask`` (a point
     is in every mask that has a point nearer than the cap). ``neighbours``: above 1 a point takes the majority class of
     that many nearest object points, or with ``votes`` of ``masks`` that of the object that most of them belong to, the
-    first on ties; overlapping objects vote separately.
+    first on ties; overlapping objects vote separately. Of equally near points, those vote that the original's search
+    finds: scikit-learn's ball tree, for votes of masks SciPy's k-d tree.
     ``cap_m``: farther neighbours do not count, no cap if absent; a point without a neighbour has no prediction.
     If ``evaluation_voxel_m`` is above 0, each mask is first downsampled to one point per voxel; for kind ``categories``
     the whole cloud is, to the mean of the points. With a single neighbour, and with votes of masks, predictions on the

@@ -248,11 +248,14 @@ def transfer_votes(
     Objects without a class do not vote.
     """
     point, owner = _points_and_owners(prediction)
-    votes = classes[owner] >= 0
+    votes = np.flatnonzero(classes[owner] >= 0)
+    is_one_cloud = rules.transfer.votes == "masks"  # as in OVO; HOV-SG has the clouds of all objects one after another
+    votes = votes[np.argsort((point if is_one_cloud else owner)[votes], kind="stable")]
     points, owner = prediction.points[point[votes]], owner[votes]
     cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
     values = owner if of_masks else classes[owner]
-    return neighbours.transfer_votes(points, values, targets, wanted, rules.transfer.neighbours, cap_m)
+    search = transfer.kd_tree if is_one_cloud else transfer.ball_tree
+    return neighbours.transfer_votes(points, values, targets, wanted, rules.transfer.neighbours, cap_m, search)
 
 
 def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:

@@ -53,10 +53,20 @@ class ModelFiles:
     folder: Path
     weights: Path
 
+    def _own(self) -> list[Path]:
+        """The weights and every settings file next to them."""
+        names = dict.fromkeys((self.weights.name, *SETTINGS))
+        return [path for name in names if (path := self.folder / name).is_file()]
+
     def digests(self) -> dict[str, str]:
         """SHA-256 by file name of the weights and of every settings file next to them."""
-        names = dict.fromkeys((self.weights.name, *SETTINGS))
-        return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
+        return {path.name: file_sha256(path) for path in self._own()}
+
+    @property
+    def state(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, size and modification time of these files, for whatever keeps their content in memory."""
+        states = [(path.name, path.stat()) for path in self._own()]
+        return tuple((name, status.st_size, status.st_mtime_ns) for name, status in states)
 
     def wrong_digests(self) -> list[str]:
         """One line per file whose digest differs from the published one."""
@@ -307,8 +317,7 @@ _kept: OrderedDict[tuple[object, ...], object] = OrderedDict()
 
 def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) -> Loaded:
     """The result of ``load`` for ``files`` at ``place``, from memory if they are unchanged since the last call."""
-    status = files.weights.stat()
-    key = (files.entry.name, str(files.weights), status.st_size, status.st_mtime_ns, *place)
+    key = (files.entry.name, str(files.weights), files.state, *place)
     if key not in _kept:
         while len(_kept) >= MAX_KEPT:
             _kept.popitem(last=False)

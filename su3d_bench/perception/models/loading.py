@@ -83,7 +83,7 @@ def _torch_encoder(
 ) -> FoundationEncoder:
     device = device_for(config.device, job_index)
     precision = precision_for(config.precision, device)
-    load_towers = partial(_torch_towers, files, config.runtime, device, precision, config.batch)
+    load_towers = partial(_torch_towers, files, files.state, config.runtime, device, precision, config.batch)
 
     def identity() -> Mapping[str, Any]:
         kind = device.partition(":")[0]
@@ -111,7 +111,7 @@ def _onnx_encoder(
     def identity() -> Mapping[str, Any]:
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
 
-    load_towers = partial(_onnx_towers, files, provider, device_index, config.batch)
+    load_towers = partial(_onnx_towers, files, files.state, provider, device_index, config.batch)
     device = CPU if provider == "cpu" else f"cuda:{device_index}"
     tokeniser = _tokeniser_of(files, spec)
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
@@ -119,14 +119,16 @@ def _onnx_encoder(
 
 # A worker creates a new encoder for each method and scene; the towers, which take gigabytes, are cached.
 @lru_cache(maxsize=1)
-def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
+def _torch_towers(
+    files: ModelFiles, state: object, runtime: Runtime, device: str, precision: str, batch: int
+) -> Towers:
     if runtime == "open_clip":
         return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
     return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
 
 
 @lru_cache(maxsize=1)
-def _onnx_towers(files: ModelFiles, provider: Provider, device_index: int, batch: int) -> Towers:
+def _onnx_towers(files: ModelFiles, state: object, provider: Provider, device_index: int, batch: int) -> Towers:
     return encoders.OnnxTowers(files, provider, device_index, batch)
 
 

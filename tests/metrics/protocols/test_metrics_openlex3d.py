@@ -300,6 +300,21 @@ def test_points_in_several_instances_are_reported() -> None:
     assert f"points in several instances, counted for the first of them: {len(whole.mask(0))}" in result
 
 
+@pytest.mark.parametrize("rules", [TOPN, RANKING], ids=lambda rules: str(rules.name))
+def test_ties_that_the_original_may_break_otherwise_are_counted(rules: Any) -> None:
+    points = np.array([[-0.03125, 0, 0], [0.03125, 0, 0]], np.float32)
+    middle = replace(lex_truth(), points=np.zeros((3, 3), np.float32), object_of_point=np.array([7, 7, -1]))
+    differing = WordEncoder().feature({word: 1 - 0.01 * k for k, word in enumerate(PROMPTS)})
+    for feature, owner, ties in (
+        (differing, [0, 1], ["points as near to one object as to another: 2"]),
+        (differing, [0, 0], []),
+        (np.zeros_like(differing), [0, 0], ["objects with labels of equal cosine: 1"]),
+    ):
+        found = Partition(points, np.array(owner, np.int32), np.stack([feature, feature]))
+        _, *warnings = score_scene(rules, middle, found, ENCODER).warnings  # the first is on the encoder
+        assert warnings == [f"{tie}; the original may choose otherwise" for tie in ties]
+
+
 def test_a_prediction_without_features_cannot_be_ranked() -> None:
     truth = lex_truth()
     named = instances_with(truth.points, masks_of(perfect(truth)), None, labels=labels_of(truth))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import synthetic_boxes
 import synthetic_instances
+import synthetic_maps
 import synthetic_objects
 import synthetic_points
 import synthetic_queries
@@ -156,6 +157,20 @@ def test_generated_point_problem_equals_the_original(name: str, number: int) -> 
         assert {key: row[key] for key in of_original} == pytest.approx(
             of_original, rel=0, abs=ROUNDING.get(name, 2.3e-16)
         )
+
+
+# ---- of maps and meshes in files, with ties
+
+OF_MAPS = json.loads((CASES / "originals_maps.json").read_text())
+
+
+@pytest.mark.parametrize(("name", "number"), [(name, k) for name in OF_MAPS for k in range(len(OF_MAPS[name]))])
+def test_generated_files_of_maps_score_as_in_the_original(name: str, number: int, tmp_path: Path) -> None:
+    rules, problem = load_protocol(name), OF_MAPS[name][number]
+    found = combine(rules, synthetic_maps.scored(rules, problem["scenes"], tmp_path), with_intervals=False).per_scene
+    names = ("mIoU", "F-mIoU", "mAcc", "pAcc") if rules.metric == "hovsg" else rules.value_names
+    ours = [[row[key] for key in names] for row in found.values()]
+    np.testing.assert_allclose(ours, np.array(problem["answer"], float), rtol=0, atol=1e-15)
 
 
 # ---- of boxes, and of text queries

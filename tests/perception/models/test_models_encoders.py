@@ -130,6 +130,14 @@ def test_text_features_are_cached_on_disk(tmp_path: Path) -> None:
     assert later.n_texts == 0
 
 
+def test_weights_replaced_within_the_process_are_read_again(tmp_path: Path) -> None:
+    def feature(seed: int) -> Float32Array:
+        write_tiny_clip(tmp_path / "clip-vit-h-14", seed=seed)
+        return load_encoder(config(tmp_path)).encode_texts(["chair"])
+
+    assert not np.allclose(feature(0), feature(1))
+
+
 # ---- invalid files
 
 

@@ -169,6 +169,7 @@ def write_torch(path: Path, value: Any, *, is_stream: bool = False) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"{path.stem}/data.pkl", stream.getvalue())
         archive.writestr(f"{path.stem}/byteorder", b"little")
+        archive.writestr(f"{path.stem}/version", b"3\n")
         for key, array in storages.items():
             archive.writestr(f"{path.stem}/data/{key}", array.tobytes())
 

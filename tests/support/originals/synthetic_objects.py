@@ -2,19 +2,24 @@
 
 A problem is a list of scenes. A scene has the ``truth`` of every vertex, a class index or -1 (void). Either a
 class is ``called`` on each vertex, or ``places_mm`` are the vertex positions, ``own_mm`` the points of a map,
-``owner`` the object of each (-1 for none), and ``of_object`` the class of each object. Predicted -1 is no class.
+``owner`` the object of each (-1 for none), ``ids`` the numbers of the objects in the map's file, and ``of_object`` the
+class of each. Predicted -1 is no class.
 """
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from prediction_files import write_ovo
 
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.predictions.dense import ovo
 
 Problem = list[dict[str, Any]]
 N_SLOTS, NONE = 8, -1
@@ -52,7 +57,7 @@ def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
         own, owner, of_object = places, np.array(scene["called"]), [*range(len(rules.classes)), NONE]
         owner = np.where(owner < 0, len(rules.classes), owner)
     else:
-        own, owner, of_object = np.array(scene["own_mm"]) / 1000, np.array(scene["owner"]), scene["of_object"]
+        own, owner, of_object = _read_again(np.array(scene["own_mm"]) / 1000, scene)
     there = sorted(set(owner.tolist()) - {-1})
     labels = LabelSet(
         rules.label_space, tuple(entry.id for entry in rules.classes), tuple(entry.name for entry in rules.classes)
@@ -70,3 +75,12 @@ def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
     return score_scene(
         rules, truth, Instances.of(own.astype(np.float32), masks, [1.0] * len(masks), labels=names), None
     )
+
+
+def _read_again(own: Float64Array, scene: dict[str, Any]) -> tuple[Any, Any, list[int]]:
+    """The points, the row of the object of each, and the class of each row, from the file of such a map."""
+    numbers, axes = np.array([*scene["ids"], -1]), np.eye(len(scene["ids"]), dtype=np.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        write_ovo(Path(folder), own, numbers[scene["owner"]], dict(zip(scene["ids"], axes, strict=True)))
+        found: Any = ovo(Path(folder), "made")[0]
+    return found.points, found.instance, [scene["of_object"][k] for k in found.features.argmax(axis=1)]
