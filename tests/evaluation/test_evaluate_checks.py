@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,43 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
 def test_cloud_in_other_units_or_position_is_refused(points: Any, line: str) -> None:
     with pytest.raises(PredictionError, match=line):
         check_cloud("a", points.astype(np.float32), BOX)
+
+
+# ---- lists of masks
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (" 5 1.0", " 5 nan", "pred/scene0001_00.txt:1: confidence 'nan' is not a finite number"),
+        (" 5 1.0", " 3.5 1.0", "pred/scene0001_00.txt:1: '3.5' is not a class id"),
+        (" 5 1.0", ",5,1.0", "pred/scene0001_00.txt:1: 1 field in 'masks/scene0001_00_0.txt,5,1.0'; expected 'mask f"),
+        (" 5 1.0", " chair", "scene0001_00.txt:1: 'masks/scene0001_00_0.txt chair' is neither 'mask file, class id, c"),
+        (" 7 1.0", " 7,1.0", "pred/scene0001_00.txt:2: 2 fields in 'masks/scene0001_00_1.txt 7,1.0'; expected 'mask"),
+    ],
+)
+def test_malformed_line_of_a_list_is_refused_with_file_line_and_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_truth(Path("gt"))
+    write_scannet_text(Path("pred"), scene([CHAIR, TABLE], [5, 7]))
+    file = Path("pred/scene0001_00.txt")
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(PredictionError, match=re.escape(line)):
+        numbers(Path())
+
+
+@pytest.mark.parametrize("name", ["README.txt", "readme.txt", "LICENSE.txt"])
+def test_tabs_byte_order_marks_and_readmes_do_not_matter(tmp_path: Path, name: str) -> None:
+    write_truth(tmp_path / "gt")
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [5, 7]))
+    plain = numbers(tmp_path)
+    for file in (tmp_path / "gt", tmp_path / "pred"):
+        (file / name).write_text("Results of the second run\n")
+    for file in tmp_path.rglob("scene*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b" ", b"\t"))
+    assert numbers(tmp_path) == plain
 
 
 # ---- hostile files
