@@ -16,11 +16,12 @@ from su3d_bench.store.records import UnscoredRecord
 
 # A count, and the text up to the first named item. Counts of classes are not summed, because scenes share classes.
 _COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>(?!class)[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
+_DETAIL = re.compile(r" \([^()]*\)")  # equal sentences may differ in these
 _PLURAL = {"mask": "masks", "pair": "pairs", "has": "have", "counts": "count", "is": "are"}
 
 
 def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, list[str]]]:
-    """Group equal warnings of several ``scenes`` and add up their counts.
+    """Group equal warnings of several ``scenes``, apart from details in brackets, and add up their counts.
 
     A warning begins with its scene and a colon, or belongs to no scene.
 
@@ -28,6 +29,8 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
     [('3 empty masks', ['a', 'b']), ('c', [])]
     >>> summed(["a: 1 of 4 masks has no class: 1 of class 7", "b: 2 of 6 masks have no class: 2 of class 9"], "ab")
     [('3 of 10 masks have no class', ['a', 'b'])]
+    >>> summed(["a: little is covered (3 %)", "b: little is covered (7 %)"], "ab")
+    [('little is covered', ['a', 'b'])]
     """
     groups: dict[str, list[tuple[str, str, re.Match[str] | None]]] = {}
     for line in warnings:
@@ -36,13 +39,16 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
             groups.setdefault(line, []).append(("", line, None))
             continue
         found = _COUNTED.fullmatch(sentence)
-        groups.setdefault(sentence if found is None else _in_plural(found["what"]), []).append((scene, sentence, found))
+        key = _DETAIL.sub("", sentence) if found is None else _in_plural(found["what"])
+        groups.setdefault(key, []).append((scene, sentence, found))
     return [(_sentence(key, group), [scene for scene, _, _ in group if scene]) for key, group in groups.items()]
 
 
 def _sentence(key: str, group: Sequence[tuple[str, str, re.Match[str] | None]]) -> str:
     counts = [found for _, _, found in group if found is not None]
-    if len(group) == 1 or not counts:
+    if not counts:
+        return group[0][1] if len({sentence for _, sentence, _ in group}) == 1 else key
+    if len(group) == 1:
         return group[0][1]
     total = f"{sum(int(found['n']) for found in counts)} "
     if all(found["of"] for found in counts):

@@ -61,16 +61,16 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
 @pytest.mark.parametrize(
     ("points", "line"),
     [
-        (BOX * 500, "a: the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
-        (BOX * 100, "a: the cloud spans 640, the scene 6.4 m: centimetres\\?"),
-        (BOX * 1e-3, "a: the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
-        (BOX + 50, "a: no point of the cloud is in the box of the scene"),
-        (np.array([[0, 0, 0], [1, np.nan, 1]]), "a: point 1 is at \\[1.0, nan, 1.0\\]; coordinates must be finite"),
+        (BOX * 500, "the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
+        (BOX * 100, "the cloud spans 640, the scene 6.4 m: centimetres\\?"),
+        (BOX * 1e-3, "the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
+        (BOX + 50, "no point of the cloud is in the box of the scene"),
+        (np.array([[0, 0, 0], [1, np.nan, 1]]), "point 1 is at \\[1.0, nan, 1.0\\]; coordinates must be finite"),
     ],
 )
 def test_cloud_in_other_units_or_position_is_refused(points: Any, line: str) -> None:
     with pytest.raises(PredictionError, match=line):
-        check_cloud("a", points.astype(np.float32), BOX)
+        check_cloud(points.astype(np.float32), BOX)
 
 
 # ---- lists of masks
