@@ -79,6 +79,8 @@ FEW_PERCENT = (1, 99)  # the extent without stray points
 NEAR_M = 0.1  # margin around the scene's box in which a point still counts as inside
 MIN_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
 MIN_COVERED = 0.5  # of the scored points, within the largest radius; less means the same, or a very incomplete map
+MIN_NEAR = 0.9  # of a map's points within 10 cm of the ground truth: it is where it should be
+N_SAMPLED = 10_000  # points of the map for that
 LEAST_IOU = 0.25  # the lowest threshold of the originals: at least one mask of a scene is above it
 ROUNDING = 1e-6  # of confidences in single precision
 NOTHING = "the prediction is empty, without any mask or point: nothing in the scene is found"
@@ -146,11 +148,10 @@ def map_warnings(
     is_whole = rules.names_points or rules.needs_instances or rules.kind == "categories"
     share = 1 - int(score.n_farther[-1]) / score.n_scored if score.n_scored else 1.0
     if is_whole and share < MIN_COVERED and not transfer.are_same_points(prediction.points, points):
-        return [
-            *lines,
-            f"{LOW_COVERAGE} ({100 * share:.0f} %): unless the map is incomplete, it is of another scene, rotated, "
-            "scaled or shifted",
-        ]
+        sample = prediction.points[:: -(-len(prediction.points) // N_SAMPLED)]
+        is_near = np.isfinite(transfer.nearest(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
+        why = "the map is incomplete" if is_near else "is it of another scene, rotated, scaled or shifted?"
+        return [*lines, f"{LOW_COVERAGE} ({100 * share:.0f} %): {why}"]
     if rules.needs_instances and isinstance(truth, GroundTruth) and not isinstance(prediction, DenseFeatures):
         lines += overlap_warnings(score, truth.instance, lambda: _moved(rules, prediction, truth))
     return lines
@@ -183,7 +184,7 @@ def overlap_warnings(score: SceneScore, objects: IntArray, moved: Callable[[], M
     ids, column, sizes = np.unique(np.maximum(objects, 0), return_inverse=True, return_counts=True)
     shared = intersections(column, len(ids), masks.indptr, masks.indices, np.arange(len(masks)))
     iou = (shared / (sizes + masks.sizes[:, None] - shared))[:, ids > 0]
-    if not iou.size or iou.max() >= LEAST_IOU:
+    if not iou.size or iou.max() >= LEAST_IOU or not len(masks.indices):
         return []
     return [
         f"no mask reaches IoU 0.25 with any object (the highest is {iou.max():.2f}): are the points in the order and "
@@ -207,7 +208,7 @@ def _label_warnings(rules: ProtocolRules, labels: Sequence[str] | None, names: C
         return []
     first = strange[0]
     meant = nearest(first.strip().lower(), classes)
-    return [f"{len(strange)} of {len(given)} {NO_CLASSES}, such as '{printable(first, 60)}'{meant}"]
+    return [f"{len(strange)} of {len(given)} {NO_CLASSES}, such as {first[:60]!r}{meant}"]
 
 
 def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
