@@ -77,7 +77,7 @@ class Scores(Printable):
         >>> any("all confidences are 1" in line for line in su3d.load_run("runs/demo").remarks)
         True
         """
-        notes = [line for part in self._tables() for line in getattr(part, "notes", ())]
+        notes = [line for part in self._parts() for line in getattr(part, "notes", ())]
         return tuple(dict.fromkeys((*self._remarks, *map(printable, notes))))
 
     @property
@@ -125,16 +125,13 @@ class Scores(Printable):
         protocols = dict.fromkeys(result.protocol for result in self._record.results)
         return f"Scores: {some(list(methods), MAX_NAMED)} under {some(list(protocols), MAX_NAMED)}"
 
-    def _tables(self) -> Sequence[Table | Prose]:
+    def _parts(self) -> Sequence[Table | Prose]:
+        from su3d_bench.formats.tables.table import Prose
         from su3d_bench.reports.tables.run import run_tables
         from su3d_bench.store.records import plain
 
-        return run_tables(plain(self._record))
-
-    def _parts(self) -> Sequence[Table | Prose]:
-        from su3d_bench.formats.tables.table import Prose
-
-        return [*self._tables(), *([Prose(self._remarks, is_list=True)] if self._remarks else [])]
+        remarks = [Prose(self._remarks, is_list=True)] if self._remarks else []
+        return [*run_tables(plain(self._record)), *remarks]
 
 
 class Run(Scores):

@@ -100,9 +100,10 @@ def score_on_vertices(
     ids, encoded = _ids_of_masks(rules, content, labels, encoder)
     facts = checks.mask_facts(content, content.scores, len(values))
     score = _instance_score(rules, values, content, content.scores, ids)
-    objects = np.where(truth.values < instance_ap.INSTANCES_PER_CLASS, 0, truth.values)
     shared = checks.mask_warnings(rules, content, content.scores, content.keys)
-    shared += checks.overlap_warnings(score, objects, lambda: content)
+    if not score.counts.has_match:
+        is_object = truth.values >= instance_ap.INSTANCES_PER_CLASS
+        shared += checks.overlap_warnings(content, np.where(is_object, truth.values, 0))
     warnings = [
         *checks.duplicate_warnings(scene, facts, content.keys),
         *checks.class_warnings(scene, rules, content.class_numbers, ids),

@@ -65,14 +65,12 @@ def _scenes(path: Path) -> Mapping[str, Path]:
 def first_line(path: Path) -> tuple[Path, str] | None:
     """The first file whose first line is not empty, and this line, which is empty if all are; None without files."""
     files = _scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
-    found = None
+    lines = []
     for file in list(files)[:MAX_INSPECTED]:
         with suppress(OSError), opened(file) as stream:
-            line = stream.readline(MAX_FIRST_LINE).decode("utf-8-sig", "replace").rstrip("\r\n")
-            found = found if found is not None and not line else (file, line)
-        if found is not None and found[1]:
-            break
-    return found
+            line = stream.readline(MAX_FIRST_LINE).decode("utf-8-sig", "replace")
+            lines.append((file, line.rstrip("\r\n")))
+    return next((pair for pair in lines if pair[1]), lines[0] if lines else None)
 
 
 # ---- masks

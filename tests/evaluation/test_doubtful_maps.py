@@ -15,7 +15,7 @@ from prediction_files import write_scannet_text
 import su3d_bench as su3d
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.maps import DenseFeatures, Instances
+from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.scoring import score_located
 
@@ -44,8 +44,8 @@ def with_points(points: Any) -> Instances:
     return Instances.of(points.astype(np.float32), SETS, SCORES, labels=NAMES)
 
 
-def warnings_of(prediction: Instances | DenseFeatures, protocol: str = "rooms-instance") -> tuple[str, ...]:
-    return score_located(su3d.load_protocol(protocol), TRUTH, prediction, None).warnings
+def warnings_of(prediction: Instances) -> tuple[str, ...]:
+    return score_located(RULES, TRUTH, prediction, None).warnings
 
 
 @pytest.mark.parametrize(
@@ -90,16 +90,13 @@ def test_map_in_other_units_is_refused(factor: float, unit: str) -> None:
         warnings_of(with_points(POINTS * factor))
 
 
-def test_dense_map_without_points_is_called_empty_and_class_agnostic_protocols_accept_any_label() -> None:
-    nothing = DenseFeatures(POINTS[:0], np.zeros((0, 4), np.float16))
-    encoder = type("Zeros", (), {"name": "zeros", "encode_texts": lambda _, texts: np.zeros((len(texts), 4))})()
-    semantic = su3d.load_protocol("rooms-semantic")
-    truth = replace(TRUTH, variant=semantic.ground_truth)
-    assert [line[:23] for line in score_located(semantic, truth, nothing, encoder).warnings[-1:]] == [
-        "the prediction is empty"
-    ]
+def test_class_agnostic_protocols_accept_any_label_and_partitions_can_be_empty() -> None:
     free = RULES.model_copy(update={"class_agnostic": "scored"})
     assert not score_located(free, TRUTH, replace(MAP, labels=("a", "b", "c")), None).warnings
+    for points in (POINTS[:0], POINTS):
+        nothing = Partition(points, np.full(len(points), -1, np.int32), np.zeros((int(not len(points)), 4), np.float32))
+        (line,) = score_located(free, TRUTH, nothing, None).warnings
+        assert line.startswith("the prediction is empty")
 
 
 # ---- masks on vertices

@@ -49,9 +49,9 @@ def test_mask_facts_are_exact() -> None:
     assert (facts.near, facts.identical) == (((0, 1),), ((0, 1),))
     assert (facts.n_covered, facts.n_contested) == (4, 3)
     assert (facts.lowest_score, facts.highest_score) == (0.25, 1.0)
-    assert (facts.n_masks, facts.n_empty) == (3, 0)
+    assert facts.n_masks == 3
     none = mask_facts(Masks(np.zeros(2, np.int64), np.zeros(0, np.int32)), np.zeros(0), 0)
-    assert (none.n_masks, none.n_empty, none.n_covered, none.n_contested) == (1, 1, 0, 0)
+    assert (none.n_masks, none.n_covered, none.n_contested) == (1, 0, 0)
     assert (none.near, none.lowest_score, none.highest_score) == ((), None, None)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, counted, nearest, printable
-from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, IntArray
 from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching import nearest as transfer
@@ -97,7 +97,6 @@ class MaskFacts:
     """
 
     n_masks: int
-    n_empty: int
     near: tuple[tuple[int, int], ...] | None
     identical: tuple[tuple[int, int], ...]
     lowest_score: float | None
@@ -114,7 +113,6 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
         near = tuple(duplicate_pairs(masks, n_points, NEAR_IOU))
     return MaskFacts(
         n_masks=len(masks),
-        n_empty=int((masks.sizes == 0).sum()),
         near=near,
         identical=tuple((k, m) for k, m in near or () if np.array_equal(masks.mask(k), masks.mask(m))),
         lowest_score=float(scores.min()) if len(scores) else None,
@@ -125,10 +123,7 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
 
 
 def map_warnings(
-    rules: ProtocolRules,
-    truth: GroundTruth | Float32Array,
-    prediction: Prediction,
-    score: SceneScore,
+    rules: ProtocolRules, truth: GroundTruth | Float32Array, prediction: Prediction, score: SceneScore
 ) -> list[str]:
     """What makes the ``score`` of a map doubtful: the map is empty, elsewhere, or has strange labels or confidences.
 
@@ -139,21 +134,22 @@ def map_warnings(
     lines: list[str] = []
     if isinstance(prediction, Instances):
         names = truth.labels.names if isinstance(truth, GroundTruth) else ()
-        lines += [*mask_warnings(rules, prediction, prediction.scores, prediction.names)]
+        lines += mask_warnings(rules, prediction, prediction.scores, prediction.names)
         lines += _label_warnings(rules, prediction.labels, names)
-    elif not score.n_predictions:
-        lines.append(NOTHING)
-    if not score.n_predictions:
-        return lines
+    if not score.n_predictions or not len(prediction.points):
+        return lines or [NOTHING]
     is_whole = rules.names_points or rules.needs_instances or rules.kind == "categories"
     share = 1 - int(score.n_farther[-1]) / score.n_scored if score.n_scored else 1.0
     if is_whole and share < MIN_COVERED and not transfer.are_same_points(prediction.points, points):
-        sample = prediction.points[:: -(-len(prediction.points) // N_SAMPLED)]
+        sample = prediction.points[:: 1 + len(prediction.points) // N_SAMPLED]
         is_near = np.isfinite(transfer.nearest(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
         why = "the map is incomplete" if is_near else "is it of another scene, rotated, scaled or shifted?"
         return [*lines, f"{LOW_COVERAGE} ({100 * share:.0f} %): {why}"]
-    if rules.needs_instances and isinstance(truth, GroundTruth) and not isinstance(prediction, DenseFeatures):
-        lines += overlap_warnings(score, truth.instance, lambda: _moved(rules, prediction, truth))
+    if rules.needs_instances and not score.counts.has_match and isinstance(truth, GroundTruth):
+        assert not isinstance(prediction, DenseFeatures)
+        masks, cap_m, voxel_m = transfer.masks_of(prediction), rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+        moved = transfer.transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
+        lines += overlap_warnings(moved, truth.instance)
     return lines
 
 
@@ -173,14 +169,8 @@ def mask_warnings(rules: ProtocolRules, masks: Masks, scores: Float64Array, keys
     return lines
 
 
-def overlap_warnings(score: SceneScore, objects: IntArray, moved: Callable[[], Masks]) -> list[str]:
-    """A warning if no mask reaches IoU 0.25 with any of ``objects``, the object of each point (N,), 0 for none.
-
-    ``moved`` returns the masks on these points; only needed if no mask has matched.
-    """
-    if score.counts.has_match:
-        return []
-    masks = moved()
+def overlap_warnings(masks: Masks, objects: IntArray) -> list[str]:
+    """A warning if no mask reaches IoU 0.25 with any of ``objects``, the object of each point (N,), 0 for none."""
     ids, column, sizes = np.unique(np.maximum(objects, 0), return_inverse=True, return_counts=True)
     shared = intersections(column, len(ids), masks.indptr, masks.indices, np.arange(len(masks)))
     iou = (shared / (sizes + masks.sizes[:, None] - shared))[:, ids > 0]
@@ -190,11 +180,6 @@ def overlap_warnings(score: SceneScore, objects: IntArray, moved: Callable[[], M
         f"no mask reaches IoU 0.25 with any object (the highest is {iou.max():.2f}): are the points in the order and "
         "frame of reference of the ground truth?"
     ]
-
-
-def _moved(rules: ProtocolRules, prediction: Instances | Partition, truth: GroundTruth) -> Masks:
-    masks, cap_m, voxel_m = transfer.masks_of(prediction), rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-    return transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
 
 
 def _label_warnings(rules: ProtocolRules, labels: Sequence[str] | None, names: Collection[str]) -> list[str]:
