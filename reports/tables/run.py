@@ -16,13 +16,12 @@ from su3d_bench.store.records import UnscoredRecord
 
 # A count, and the text up to the first named item. Counts of classes are not summed, because scenes share classes.
 _COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>(?!class)[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
-_DETAIL = re.compile(r" \([^()]*\)")  # equal sentences may differ in these
 EXAMPLE = ", such as "  # begins the part of a counted sentence that holds for several scenes
 _PLURAL = {"mask": "masks", "pair": "pairs", "has": "have", "counts": "count", "is": "are"}
 
 
 def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, list[str]]]:
-    """Group equal warnings of several ``scenes``, apart from details in brackets, and add up their counts.
+    """Group equal warnings of several ``scenes`` and add up their counts.
 
     A warning begins with its scene and a colon, or belongs to no scene.
 
@@ -32,8 +31,6 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
     [('3 of 10 masks have no class', ['a', 'b'])]
     >>> summed(["a: 2 of 4 labels are no classes, such as 'A'", "b: 1 of 6 labels are no classes, such as 'B'"], "ab")
     [("3 of 10 labels are no classes, such as 'A'", ['a', 'b'])]
-    >>> summed(["a: little is covered (3 %)", "b: little is covered (7 %)"], "ab")
-    [('little is covered', ['a', 'b'])]
     """
     groups: dict[str, list[tuple[str, str, re.Match[str] | None]]] = {}
     for line in warnings:
@@ -42,16 +39,13 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
             groups.setdefault(line, []).append(("", line, None))
             continue
         found = _COUNTED.fullmatch(sentence)
-        key = _DETAIL.sub("", sentence) if found is None else _in_plural(found["what"])
-        groups.setdefault(key, []).append((scene, sentence, found))
+        groups.setdefault(sentence if found is None else _in_plural(found["what"]), []).append((scene, sentence, found))
     return [(_sentence(key, group), [scene for scene, _, _ in group if scene]) for key, group in groups.items()]
 
 
 def _sentence(key: str, group: Sequence[tuple[str, str, re.Match[str] | None]]) -> str:
     counts = [found for _, _, found in group if found is not None]
-    if not counts:
-        return group[0][1] if len({sentence for _, sentence, _ in group}) == 1 else key
-    if len(group) == 1:
+    if len(group) == 1 or not counts:
         return group[0][1]
     total = f"{sum(int(found['n']) for found in counts)} "
     if all(found["of"] for found in counts):

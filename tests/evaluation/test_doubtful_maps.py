@@ -36,7 +36,7 @@ TRUTH = GroundTruth(
 SCORES = [0.9, 0.8, 0.7]
 MAP = Instances.of(POINTS, SETS, SCORES, labels=NAMES)
 SHUFFLED = np.random.default_rng(1).permutation(600)
-LOW = "few of the scored points have a predicted point within 10 cm"
+LOW = "less than half of the scored points have a predicted point within 10 cm: "
 TURNED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float32)
 
 
@@ -66,22 +66,17 @@ def warnings_of(prediction: Instances) -> tuple[str, ...]:
         (replace(MAP, scores=np.array([90.0, 80, 70])), "3 of 3 confidences are negative or above 1 (70 to 90): "),
         (replace(MAP, scores=np.array([1 + 1e-7, 0.8, 0.7])), None),
         (Instances.of(POINTS, [np.sort(SHUFFLED[k::9]) for k in range(3)], SCORES, labels=NAMES),
-         "no mask reaches IoU 0.25 with any object (the highest is 0."),
-        (with_points(POINTS / 2), f"{LOW} ("),
-        (with_points(POINTS @ TURNED), f"{LOW} ("),
-        (with_points(POINTS + 2.5), f"{LOW} (0 %): is it of another scene, rotated, scaled or shifted?"),
-        (Instances.of(POINTS[:200], SETS[:1], labels=NAMES[:1]), f"{LOW} ("),
+         "no mask reaches IoU 0.25 with any object: "),
+        (with_points(POINTS / 2), f"{LOW}is it of another scene, "),
+        (with_points(POINTS @ TURNED), f"{LOW}is it of another scene, "),
+        (with_points(POINTS + 2.5), f"{LOW}is it of another scene, "),
+        (Instances.of(POINTS[:200], SETS[:1], labels=NAMES[:1]), f"{LOW}the map is incomplete"),
     ],
 )  # fmt: skip
 def test_doubtful_map_has_one_warning_and_a_good_one_none(prediction: Instances, line: str | None) -> None:
     found = warnings_of(prediction)
     assert len(found) == (line is not None), found
     assert line is None or found[0].startswith(line)
-
-
-def test_low_coverage_by_a_map_in_the_right_place_is_called_incomplete() -> None:
-    part = Instances.of(POINTS[:200], SETS[:1], labels=NAMES[:1])
-    assert warnings_of(part)[0].endswith(" %): the map is incomplete")
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres"), (0.001, "kilometres")])

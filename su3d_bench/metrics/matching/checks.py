@@ -84,7 +84,7 @@ N_SAMPLED = 10_000  # points of the map for that
 LEAST_IOU = 0.25  # the lowest threshold of the originals: at least one mask of a scene is above it
 ROUNDING = 1e-6  # of confidences in single precision
 NOTHING = "the prediction is empty, without any mask or point: nothing in the scene is found"
-LOW_COVERAGE = "few of the scored points have a predicted point within 10 cm"
+LOW_COVERAGE = "less than half of the scored points have a predicted point within 10 cm"
 NO_CLASSES = "labels are not classes of the protocol"
 
 
@@ -144,7 +144,7 @@ def map_warnings(
         sample = prediction.points[:: 1 + len(prediction.points) // N_SAMPLED]
         is_near = np.isfinite(transfer.nearest(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
         why = "the map is incomplete" if is_near else "is it of another scene, rotated, scaled or shifted?"
-        return [*lines, f"{LOW_COVERAGE} ({100 * share:.0f} %): {why}"]
+        return [*lines, f"{LOW_COVERAGE}: {why}"]
     if rules.needs_instances and not score.counts.has_match and isinstance(truth, GroundTruth):
         assert not isinstance(prediction, DenseFeatures)
         masks, cap_m, voxel_m = transfer.masks_of(prediction), rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
@@ -177,8 +177,8 @@ def overlap_warnings(masks: Masks, objects: IntArray) -> list[str]:
     if not iou.size or iou.max() >= LEAST_IOU or not len(masks.indices):
         return []
     return [
-        f"no mask reaches IoU 0.25 with any object (the highest is {iou.max():.2f}): are the points in the order and "
-        "frame of reference of the ground truth?"
+        "no mask reaches IoU 0.25 with any object: are the points in the order and frame of reference of the ground "
+        "truth?"
     ]
 
 
@@ -186,14 +186,13 @@ def _label_warnings(rules: ProtocolRules, labels: Sequence[str] | None, names: C
     """A warning on labels that are neither classes of the protocol nor among ``names``; '' is no label."""
     if rules.n_labels is None or not rules.classes:
         return []
-    classes = [entry.name for entry in rules.classes]
-    known, given = {*classes, *names}, [label for label in labels or () if label]
+    known = dict.fromkeys([*(entry.name for entry in rules.classes), *names])
+    given = [label for label in labels or () if label]
     strange = [label for label in given if label not in known]
     if not strange:
         return []
-    first = strange[0]
-    meant = nearest(first.strip().lower(), classes)
-    return [f"{len(strange)} of {len(given)} {NO_CLASSES}, such as {first[:60]!r}{meant}"]
+    meant = nearest(strange[0].strip().lower(), known)
+    return [f"{len(strange)} of {len(given)} {NO_CLASSES}, such as {strange[0][:60]!r}{meant}"]
 
 
 def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
@@ -287,7 +286,7 @@ def check_cloud(points: Float32Array, truth: Float32Array) -> list[str]:
         )
     if share < MIN_INSIDE:
         return [
-            f"only few points of the cloud are in the box of the scene ({100 * share:.0f} %; the first outside is "
-            f"point {int(np.argmin(is_inside))}): is the frame of reference right?"
+            f"only {100 * share:.0f} % of the cloud is in the box of the scene (the first outside is point "
+            f"{int(np.argmin(is_inside))}); is the frame of reference right?"
         ]
     return []
