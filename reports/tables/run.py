@@ -16,6 +16,7 @@ from su3d_bench.store.records import UnscoredRecord
 
 # A count, and the text up to the first named item. Counts of classes are not summed, because scenes share classes.
 _COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>(?!class)[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
+EXAMPLE = ", such as "  # begins the part of a counted sentence that holds for several scenes
 _PLURAL = {"mask": "masks", "pair": "pairs", "has": "have", "counts": "count", "is": "are"}
 
 
@@ -28,6 +29,8 @@ def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[tuple[str, 
     [('3 empty masks', ['a', 'b']), ('c', [])]
     >>> summed(["a: 1 of 4 masks has no class: 1 of class 7", "b: 2 of 6 masks have no class: 2 of class 9"], "ab")
     [('3 of 10 masks have no class', ['a', 'b'])]
+    >>> summed(["a: 2 of 4 labels are no classes, such as 'A'", "b: 1 of 6 labels are no classes, such as 'B'"], "ab")
+    [("3 of 10 labels are no classes, such as 'A'", ['a', 'b'])]
     """
     groups: dict[str, list[tuple[str, str, re.Match[str] | None]]] = {}
     for line in warnings:
@@ -47,7 +50,9 @@ def _sentence(key: str, group: Sequence[tuple[str, str, re.Match[str] | None]]) 
     total = f"{sum(int(found['n']) for found in counts)} "
     if all(found["of"] for found in counts):
         total += f"of {sum(int(found['of']) for found in counts)} "
-    return total + key
+    _, sentence, found = group[0]
+    rest = sentence[found.end("what") :] if found is not None else ""
+    return total + key + (rest if rest.startswith(EXAMPLE) else "")
 
 
 def _in_plural(words: str) -> str:

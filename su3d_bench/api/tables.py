@@ -57,8 +57,6 @@ class Scores(Printable):
     """The numbers of methods under protocols, as returned by ``evaluate``; those in a folder are a ``Run``.
 
     All values are fractions in full precision, ``n_...`` are counts, NaN is an undefined value.
-    ``remarks`` are lines that must be reported with the numbers: formats, missing scenes, partial runs.
-
     >>> import su3d_bench as su3d
     >>> scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
     >>> float(scores.metrics.set_index("metric")["value"]["AP50"])
@@ -69,7 +67,18 @@ class Scores(Printable):
 
     def __init__(self, metrics: MetricsRecord, remarks: Sequence[str] = ()) -> None:
         self._record = metrics
-        self.remarks = tuple(printable(line) for line in remarks)
+        self._remarks = tuple(printable(line) for line in remarks)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Lines that must be reported with the numbers: formats, missing scenes, partial runs, and every warning.
+
+        >>> import su3d_bench as su3d
+        >>> any("all confidences are 1" in line for line in su3d.load_run("runs/demo").remarks)
+        True
+        """
+        notes = [line for part in self._parts() for line in getattr(part, "notes", ())]
+        return tuple(dict.fromkeys((*self._remarks, *map(printable, notes))))
 
     @property
     def metrics(self) -> pandas.DataFrame:
@@ -121,7 +130,7 @@ class Scores(Printable):
         from su3d_bench.reports.tables.run import run_tables
         from su3d_bench.store.records import plain
 
-        remarks = [Prose(self.remarks, is_list=True)] if self.remarks else []
+        remarks = [Prose(self._remarks, is_list=True)] if self._remarks else []
         return [*run_tables(plain(self._record)), *remarks]
 
 

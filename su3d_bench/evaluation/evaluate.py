@@ -195,7 +195,8 @@ class Scoring:
                 if reason is not None:
                     raise DataError(f"{name}: {reason}")
                 if scene not in kept.unscored:
-                    kept.missed.append(scene)
+                    kept.missed.append(scene)  # which says more than the warnings on an empty prediction
+                    kept.scores[scene] = replace(kept.scores[scene], warnings=())
         return nothing
 
     def results(self) -> tuple[tuple[ProtocolEvaluation, ...], dict[str, str]]:

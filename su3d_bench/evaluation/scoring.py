@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from su3d_bench.core import registry
@@ -28,11 +30,11 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
+from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_located, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, visible_truth
 from su3d_bench.metrics.semantic.score import with_unnamed
-from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks, ids_of
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks, ids_of, named
 
 NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
 
@@ -95,18 +97,22 @@ def score_on_vertices(
     assert isinstance(content, VertexMasks)
     if rules.class_agnostic is not None:
         values = encode_without_classes(rules, values)
-    ids, named = _ids_of_masks(rules, content, labels, encoder)
+    ids, encoded = _ids_of_masks(rules, content, labels, encoder)
     facts = checks.mask_facts(content, content.scores, len(values))
+    score = _instance_score(rules, values, content, content.scores, ids)
+    shared = checks.mask_warnings(rules, content, content.scores, content.keys)
+    if not score.counts.has_match:
+        is_object = truth.values >= instance_ap.INSTANCES_PER_CLASS
+        shared += checks.overlap_warnings(content, np.where(is_object, truth.values, 0))
     warnings = [
-        *checks.empty_warnings(scene, facts, content, content.keys),
         *checks.duplicate_warnings(scene, facts, content.keys),
         *checks.class_warnings(scene, rules, content.class_numbers, ids),
         *_melted(scene, rules, truth.values),
-        *named,
+        *encoded,
     ]
     has_bound = rules.names_masks and bool(rules.confidences)
     return SceneOutcome(
-        _instance_score(rules, values, content, content.scores, ids),
+        replace(score, warnings=tuple(shared)),
         _instance_ceiling(rules, truth, values),
         _instance_counts(rules, values, content, content.scores, None) if has_bound else None,
         facts,
@@ -217,22 +223,23 @@ def score_on_truth(
 ) -> SceneOutcome:
     """The outcome against a dataset's ground truth; content without its own points uses those of the ground truth."""
     prediction = map_of(content, truth.points, rules)
+    with named(scene):
+        score = score_located(rules, truth, prediction, encoder)
+    warnings = list[str]()
     if isinstance(content, VertexMasks):
         warnings = checks.class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
     elif isinstance(content, VertexLabels):
         warnings = checks.label_warnings(scene, rules, ids_of(content.class_ids, content.numbering, rules))
-    else:
-        warnings = checks.check_cloud(scene, content.points, truth.points)
+    if warnings:  # these say the same of numbers
+        score = replace(score, warnings=tuple(line for line in score.warnings if checks.NO_CLASSES not in line))
     facts = bound = None
     if not isinstance(prediction, DenseFeatures):
         masks, scores = masks_and_scores(prediction)
         if not isinstance(content, VertexLabels):
             facts = checks.mask_facts(masks, scores, len(prediction.points))
-            warnings += checks.empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
         if rules.names_masks and rules.confidences:
             values, moved, scores = without_labels(rules, truth, prediction)
             bound = _instance_counts(rules, values, moved, scores, None)
-    score = score_scene(rules, truth, prediction, encoder)
     return SceneOutcome(score, _oracle_score(rules, truth), bound, facts, tuple(warnings))
 
 
@@ -264,12 +271,10 @@ def score_on_objects(
     Labels n' are those of the vote, because a file next to a run's map is not part of a prediction.
     """
     prediction: Prediction = NOTHING if isinstance(content, VertexMasks | VertexLabels) else content
-    base = truth.scene if isinstance(truth, QuestionTruth) else truth
-    warnings = checks.check_cloud(scene, prediction.points, base.points)
+    with named(scene):
+        score = score_located(rules, truth, prediction, encoder)
     facts = None
     if isinstance(prediction, Instances):
         facts = checks.mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
-        warnings += checks.empty_warnings(scene, facts, prediction, prediction.names)
-    if (remark := metric_of(rules).ceiling_remark) is not None:
-        warnings.append(remark)
-    return SceneOutcome(score_scene(rules, truth, prediction, encoder), facts=facts, warnings=tuple(warnings))
+    remark = metric_of(rules).ceiling_remark
+    return SceneOutcome(score, facts=facts, warnings=() if remark is None else (remark,))

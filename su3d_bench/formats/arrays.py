@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from codecs import BOM_UTF8
 from pathlib import Path
 from typing import Any
 
@@ -195,13 +196,15 @@ LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the beginning of a 
 
 
 def integer_lines(content: bytes, where: str) -> IntegerArray:
-    """The integer of each line; the last newline is optional. ``PredictionError`` names the first line without one.
+    """The integer of each line; the last newline and a byte-order mark are optional. ``PredictionError`` names the
+    first line without one.
 
     >>> integer_lines(b"0\\n1\\n0\\n", "mask.txt").tolist()
     [0, 1, 0]
     >>> integer_lines(b"12\\n-1", "labels.txt").tolist()
     [12, -1]
     """
+    content = content.removeprefix(BOM_UTF8)
     if b"\r" in content:
         if b"\r" in content.replace(b"\r\n", b""):
             return _any_numbers(content, where)  # a single carriage return also ends a line

@@ -86,6 +86,11 @@ class Counts:
         return None
 
     @property
+    def has_match(self) -> bool:
+        """Whether any mask matched an object; True for kinds that do not match masks."""
+        return True
+
+    @property
     def sizes(self) -> dict[str, int]:
         """The length of each axis."""
         return {

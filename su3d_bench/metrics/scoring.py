@@ -9,7 +9,7 @@ import io
 import json
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from su3d_bench.metrics.graphs import ObjectMetric, PlaceMetric
 from su3d_bench.metrics.instance.boxes import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.checks import LOW_COVERAGE, check_cloud, map_warnings
 from su3d_bench.metrics.metric import MAX_COUNTED, Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric, QueryTruth
@@ -108,7 +109,19 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
     if reason:
         raise PredictionError(reason)
     _check_points(rules, prediction)
-    return metric.per_scene(truth, prediction, encoder)
+    score = metric.per_scene(truth, prediction, encoder)
+    warnings = map_warnings(rules, base if isinstance(base, GroundTruth) else base.points, prediction, score)
+    return replace(score, warnings=(*score.warnings, *warnings))
+
+
+def score_located(rules: ProtocolRules, truth: Truth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
+    """``score_scene`` of a map in the frame of the ground truth; ``PredictionError`` if it cannot be."""
+    base = truth.scene if isinstance(truth, QuestionTruth) else truth
+    outside = check_cloud(prediction.points, base.points)
+    score = score_scene(rules, truth, prediction, encoder)
+    if any(line.startswith(LOW_COVERAGE) for line in score.warnings):  # says the same
+        return score
+    return replace(score, warnings=(*score.warnings, *outside))
 
 
 def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:

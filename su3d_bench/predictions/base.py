@@ -263,13 +263,16 @@ def folder_format(
 
 
 def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The files with one of ``suffixes`` in a folder, or one file, by their names without it, in alphabetical order."""
+    """The files with one of ``suffixes`` in a folder, or one file, by their names without it, in alphabetical order.
+
+    Hidden files, READMEs and licences are not scenes.
+    """
     with reading(shown(path)):
         files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
     of_scene = {}
     for file in files:
         suffix = next((suffix for suffix in suffixes if file.name.endswith(suffix) and file.name != suffix), None)
-        if suffix is not None and not file.name.startswith("."):
+        if suffix is not None and file.name.split(".")[0].lower() not in ("", "readme", "license", "licence"):
             of_scene[file.name.removesuffix(suffix)] = file
     return of_scene
 

@@ -86,7 +86,9 @@ def recognise(path: Path, format: str | None = None) -> Reader:
     if len(fitting) == 1:
         return READERS[next(iter(fitting))]
     if not fitting:
-        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}); name it with --format")
+        file, line = text.first_line(path) or (path, "")
+        why = f"; {shown(file)}:1: '{printable(line, 80)}' is neither {text.LIST_FORM} nor a class id" if line else ""
+        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}){why}; name it with --format")
     reasons = "; ".join(f"{name}: {why}" for name, why in fitting.items())
     raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --format")
 

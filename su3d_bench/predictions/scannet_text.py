@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import stat
+from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -31,6 +33,7 @@ MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last
 MASK_OF_RUNS = ".json"  # ScanNet++'s
 TOP = 3  # classes per vertex if a line of ScanNet++ has several: eval_semantic.py accepts 1 or the largest of its k
 SEPARATOR = ","  # between them
+LIST_FORM = "'mask file, class id, confidence' separated by single spaces"
 MAX_FIRST_LINE = 4096
 MAX_INSPECTED = 50
 
@@ -48,8 +51,8 @@ def text_format(name: str, looks: Callable[[str], str | None], parse: Parse) -> 
     """A format with one text file per scene; ``looks`` states why the first non-empty line is of this format."""
 
     def recognise(path: Path) -> str | None:
-        lines = _first_lines(path)
-        return looks(next(filter(None, lines), "")) if lines else None
+        found = first_line(path)
+        return None if found is None else looks(found[1])
 
     return Reader(name, recognise, _scenes, parse)
 
@@ -59,14 +62,15 @@ def _scenes(path: Path) -> Mapping[str, Path]:
     return {name: file for name, file in scene_files(folder, (".txt",)).items() if name != EVALUATOR_OUTPUT}
 
 
-def _first_lines(path: Path) -> list[str]:
-    """The first line of some files, empty for empty ones."""
-    lines = []
+def first_line(path: Path) -> tuple[Path, str] | None:
+    """The first file whose first line is not empty, and this line, which is empty if all are; None without files."""
     files = _scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
+    lines = []
     for file in list(files)[:MAX_INSPECTED]:
         with suppress(OSError), opened(file) as stream:
-            lines.append(stream.readline(MAX_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
-    return lines
+            line = stream.readline(MAX_FIRST_LINE).decode("utf-8-sig", "replace")
+            lines.append((file, line.rstrip("\r\n")))
+    return next((pair for pair in lines if pair[1]), lines[0] if lines else None)
 
 
 # ---- masks
@@ -75,25 +79,28 @@ def _first_lines(path: Path) -> list[str]:
 def looks_like_list(line: str) -> str | None:
     if not line:
         return "its .txt files are empty lists"
-    is_list = _is_list(line) and not line.split(" ")[0].endswith(MASK_OF_RUNS)
+    is_list = _is_list(line) and not _fields(line)[0].endswith(MASK_OF_RUNS)
     return "its .txt files list a mask file, a class and a confidence per line" if is_list else None
 
 
 def looks_like_scannetpp(line: str) -> str | None:
-    is_list = _is_list(line) and line.split(" ")[0].endswith(MASK_OF_RUNS)
+    is_list = _is_list(line) and _fields(line)[0].endswith(MASK_OF_RUNS)
     return "its .txt files list a .json mask, a class and a confidence per line" if is_list else None
 
 
 def looks_like_opensun3d(line: str) -> str | None:
-    words = line.split()
-    is_list = len(words) == 2 and _number(words[0]) is None and _number(words[1]) is not None
-    return "its .txt files list a mask file and a confidence per line" if is_list else None
+    return "its .txt files list a mask file and a confidence per line" if _is_list(line, n_numbers=1) else None
 
 
-def _is_list(line: str) -> bool:
-    """Whether a line has a mask file, a class and a confidence."""
-    words = line.split(" ")
-    return len(words) == 3 and None not in map(_number, words[1:])
+def _is_list(line: str, n_numbers: int = 2) -> bool:
+    """Whether a line is meant to be a mask file, a class and a confidence, even if ``read_list`` rejects it."""
+    file, *numbers = _fields(line)
+    is_file = _number(file) is None or (n_numbers == 2 and SEPARATOR not in line)
+    return is_file and len(numbers) == n_numbers and all(map(_is_number, numbers))
+
+
+def _fields(line: str) -> list[str]:
+    return re.split(r"[\s,;]+", line.strip())
 
 
 def scannet_masks(place: Path, scene: str, numbering: Numbering = "id") -> Parsed:
@@ -184,22 +191,22 @@ def _ranked_numbers(content: bytes, where: str) -> Int32Array:
 def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
     """The lines of a list of masks, each as required by the official script: three fields separated by single spaces.
 
-    Without classes, as OpenSUN3D's script reads them with numpy: two fields separated by blanks, no empty lines and
-    no text after a #; the class is then 0.
+    A tab is also read as a space. Without classes, as OpenSUN3D's script reads them with numpy: two fields separated
+    by blanks, no empty lines and no text after a #; the class is then 0.
     """
     where, lines = shown(file), []
-    form = "mask file, class id, confidence' separated by single spaces" if has_classes else "mask file, confidence'"
-    for number, raw in enumerate(_content(file, where).splitlines(), 1):
+    form = LIST_FORM if has_classes else "'mask file, confidence'"
+    for number, raw in enumerate(_content(file, where).removeprefix(BOM_UTF8).splitlines(), 1):
         text = raw.decode("utf-8", "replace")
-        words = text.split(" ") if has_classes else text.partition("#")[0].split()
+        words = text.replace("\t", " ").split(" ") if has_classes else text.partition("#")[0].split()
         if not words:
             continue
         if len(words) != 2 + has_classes:
             raise PredictionError(
-                f"{where}:{number}: {len(words)} fields in '{printable(text, 120)}'; expected '{form}"
+                f"{where}:{number}: {counted(len(words), 'field')} in '{printable(text, 120)}'; expected {form}"
             )
         label, score = _number(words[1]) if has_classes else 0, _number(words[-1])
-        if label is None or not -(1 << 31) < label < 1 << 31:
+        if label is None or not -(1 << 31) < label < 1 << 31 or label != int(label):
             raise PredictionError(f"{where}:{number}: '{printable(words[1], 60)}' is not a class id")
         if score is None:
             raise PredictionError(f"{where}:{number}: confidence '{printable(words[-1], 60)}' is not a finite number")
@@ -282,6 +289,11 @@ def _number(word: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def _is_number(word: str) -> bool:
+    """Whether a word is a number, or NaN or infinite."""
+    return _number(word) is not None or word.lower().lstrip("+-") in ("nan", "inf", "infinity")
 
 
 def _content(file: Path, where: str) -> bytes:

@@ -26,7 +26,7 @@ from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
+from su3d_bench.metrics.scoring import Truth, pack_scores, score_located
 from su3d_bench.perception.language.chat import ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
@@ -327,7 +327,7 @@ class _Scene:
             self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
             configured = jobs.with_visible_truth(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
-            scores[rules.name] = score_scene(rules, known, configured, encoder)
+            scores[rules.name] = score_located(rules, known, configured, encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:

@@ -307,7 +307,7 @@ def test_run_scores_a_program_logs_its_output_and_rejects_another_version(
 import sys
 import numpy as np
 print("hello from the program", file=sys.stderr)
-points = np.zeros((1, 3), "f4")
+points = np.array([[1, 1, 2]], "f4")
 np.savez(sys.argv[1] + "/prediction.npz", kind="Partition", points=points, instance=np.zeros(1, "i4"),
          features=np.ones((1, 8), "f4"))
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,9 @@ def test_mask_facts_are_exact() -> None:
     assert (facts.near, facts.identical) == (((0, 1),), ((0, 1),))
     assert (facts.n_covered, facts.n_contested) == (4, 3)
     assert (facts.lowest_score, facts.highest_score) == (0.25, 1.0)
-    assert (facts.n_masks, facts.n_empty) == (3, 0)
+    assert facts.n_masks == 3
     none = mask_facts(Masks(np.zeros(2, np.int64), np.zeros(0, np.int32)), np.zeros(0), 0)
-    assert (none.n_masks, none.n_empty, none.n_covered, none.n_contested) == (1, 1, 0, 0)
+    assert (none.n_masks, none.n_covered, none.n_contested) == (1, 0, 0)
     assert (none.near, none.lowest_score, none.highest_score) == ((), None, None)
 
 
@@ -60,16 +61,53 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
 @pytest.mark.parametrize(
     ("points", "line"),
     [
-        (BOX * 500, "a: the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
-        (BOX * 100, "a: the cloud spans 640, the scene 6.4 m: centimetres\\?"),
-        (BOX * 1e-3, "a: the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
-        (BOX + 50, "a: no point of the cloud is in the box of the scene"),
-        (np.array([[0, 0, 0], [1, np.nan, 1]]), "a: point 1 is at \\[1.0, nan, 1.0\\]; coordinates must be finite"),
+        (BOX * 500, "the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
+        (BOX * 100, "the cloud spans 640, the scene 6.4 m: centimetres\\?"),
+        (BOX * 1e-3, "the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
+        (BOX + 50, "no point of the cloud is in the box of the scene"),
+        (np.array([[0, 0, 0], [1, np.nan, 1]]), "point 1 is at \\[1.0, nan, 1.0\\]; coordinates must be finite"),
     ],
 )
 def test_cloud_in_other_units_or_position_is_refused(points: Any, line: str) -> None:
     with pytest.raises(PredictionError, match=line):
-        check_cloud("a", points.astype(np.float32), BOX)
+        check_cloud(points.astype(np.float32), BOX)
+
+
+# ---- lists of masks
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (" 5 1.0", " 5 nan", "pred/scene0001_00.txt:1: confidence 'nan' is not a finite number"),
+        (" 5 1.0", " 3.5 1.0", "pred/scene0001_00.txt:1: '3.5' is not a class id"),
+        (" 5 1.0", ",5,1.0", "pred/scene0001_00.txt:1: 1 field in 'masks/scene0001_00_0.txt,5,1.0'; expected 'mask f"),
+        (" 5 1.0", " chair", "scene0001_00.txt:1: 'masks/scene0001_00_0.txt chair' is neither 'mask file, class id, c"),
+        (" 7 1.0", " 7,1.0", "pred/scene0001_00.txt:2: 2 fields in 'masks/scene0001_00_1.txt 7,1.0'; expected 'mask"),
+    ],
+)
+def test_malformed_line_of_a_list_is_refused_with_file_line_and_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_truth(Path("gt"))
+    write_scannet_text(Path("pred"), scene([CHAIR, TABLE], [5, 7]))
+    file = Path("pred/scene0001_00.txt")
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(PredictionError, match=re.escape(line)):
+        numbers(Path())
+
+
+@pytest.mark.parametrize("name", ["README.txt", "readme.txt", "LICENSE.txt"])
+def test_tabs_byte_order_marks_and_readmes_do_not_matter(tmp_path: Path, name: str) -> None:
+    write_truth(tmp_path / "gt")
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [5, 7]))
+    plain = numbers(tmp_path)
+    for file in (tmp_path / "gt", tmp_path / "pred"):
+        (file / name).write_text("Results of the second run\n")
+    for file in tmp_path.rglob("scene*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b" ", b"\t"))
+    assert numbers(tmp_path) == plain
 
 
 # ---- hostile files

@@ -194,6 +194,10 @@ class InstanceCounts(Counts):
     n_small_truth: Int64Array = field(metadata=axes("classes"))
     n_predictions: Int64Array = field(metadata=axes("classes"))
 
+    @property
+    def has_match(self) -> bool:
+        return bool(self.is_true.any())
+
     def contradiction(self) -> str | None:
         """Rows beyond the classes or thresholds, non-finite scores, or instances neither matched nor missed."""
         for name, axis in (("class_index", "classes"), ("threshold_index", "thresholds")):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, counted, printable
-from su3d_bench.core.maps import Masks
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.errors import PredictionError, counted, nearest, printable
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Prediction
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, IntArray
+from su3d_bench.metrics.instance.scene_counts import intersections
+from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.nearest import remembered
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 
@@ -72,8 +75,17 @@ NEAR_IOU = 0.9  # pairs above it are duplicates of one object
 MAX_SHARED = 300_000_000  # products in the search for pairs; 600 masks of a large scene need about ten million
 UNITS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
 LARGEST_RATIO = 20.0  # of the extents of two clouds of one scene
+FEW_PERCENT = (1, 99)  # the extent without stray points
 NEAR_M = 0.1  # margin around the scene's box in which a point still counts as inside
 MIN_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
+MIN_COVERED = 0.5  # of the scored points, within the largest radius; less means the same, or a very incomplete map
+MIN_NEAR = 0.9  # of a map's points within 10 cm of the ground truth: it is where it should be
+N_SAMPLED = 10_000  # points of the map for that
+LEAST_IOU = 0.25  # the lowest threshold of the originals: at least one mask of a scene is above it
+ROUNDING = 1e-6  # of confidences in single precision
+NOTHING = "the prediction is empty, without any mask or point: nothing in the scene is found"
+LOW_COVERAGE = "less than half of the scored points have a predicted point within 10 cm"
+NO_CLASSES = "labels are not classes of the protocol"
 
 
 @dataclass(frozen=True)
@@ -85,7 +97,6 @@ class MaskFacts:
     """
 
     n_masks: int
-    n_empty: int
     near: tuple[tuple[int, int], ...] | None
     identical: tuple[tuple[int, int], ...]
     lowest_score: float | None
@@ -102,7 +113,6 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
         near = tuple(duplicate_pairs(masks, n_points, NEAR_IOU))
     return MaskFacts(
         n_masks=len(masks),
-        n_empty=int((masks.sizes == 0).sum()),
         near=near,
         identical=tuple((k, m) for k, m in near or () if np.array_equal(masks.mask(k), masks.mask(m))),
         lowest_score=float(scores.min()) if len(scores) else None,
@@ -112,12 +122,77 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
     )
 
 
-def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[str]) -> list[str]:
-    """A warning on empty masks, with their number and the first of them."""
-    if not facts.n_empty:
+def map_warnings(
+    rules: ProtocolRules, truth: GroundTruth | Float32Array, prediction: Prediction, score: SceneScore
+) -> list[str]:
+    """What makes the ``score`` of a map doubtful: the map is empty, elsewhere, or has strange labels or confidences.
+
+    ``truth`` is the ground truth, or only its points (N, 3) if masks are not compared with objects. Labels of its
+    classes that a protocol leaves out are no mistake.
+    """
+    points = truth.points if isinstance(truth, GroundTruth) else truth
+    lines: list[str] = []
+    if isinstance(prediction, Instances):
+        names = truth.labels.names if isinstance(truth, GroundTruth) else ()
+        lines += mask_warnings(rules, prediction, prediction.scores, prediction.names)
+        lines += _label_warnings(rules, prediction.labels, names)
+    if not score.n_predictions or not len(prediction.points):
+        return lines or [NOTHING]
+    is_whole = rules.names_points or rules.needs_instances or rules.kind == "categories"
+    share = 1 - int(score.n_farther[-1]) / score.n_scored if score.n_scored else 1.0
+    if is_whole and share < MIN_COVERED and not transfer.are_same_points(prediction.points, points):
+        sample = prediction.points[:: 1 + len(prediction.points) // N_SAMPLED]
+        is_near = np.isfinite(transfer.nearest(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
+        why = "the map is incomplete" if is_near else "is it of another scene, rotated, scaled or shifted?"
+        return [*lines, f"{LOW_COVERAGE}: {why}"]
+    if rules.needs_instances and not score.counts.has_match and isinstance(truth, GroundTruth):
+        assert not isinstance(prediction, DenseFeatures)
+        masks, cap_m, voxel_m = transfer.masks_of(prediction), rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+        moved = transfer.transfer_masks(prediction.points, masks, points, cap_m, voxel_m)
+        lines += overlap_warnings(moved, truth.instance)
+    return lines
+
+
+def mask_warnings(rules: ProtocolRules, masks: Masks, scores: Float64Array, keys: Sequence[str]) -> list[str]:
+    """Warnings on a scene without masks, on empty masks, and on confidences (K,) that are none, if they count."""
+    if not len(masks):
+        return [NOTHING]
+    lines, empty = [], np.flatnonzero(masks.sizes == 0)
+    if len(empty):
+        lines.append(f"{counted(len(empty), 'empty mask')}, the first is mask {empty[0]}{_key(keys, int(empty[0]))}")
+    n_outside = int(((scores < -ROUNDING) | (scores > 1 + ROUNDING)).sum())
+    if n_outside and (rules.confidence == "prediction" or rules.kind == "panoptic"):
+        lines.append(
+            f"{n_outside} of {len(scores)} confidences are negative or above 1 ({scores.min():g} to "
+            f"{scores.max():g}): are they logits or percentages?"
+        )
+    return lines
+
+
+def overlap_warnings(masks: Masks, objects: IntArray) -> list[str]:
+    """A warning if no mask reaches IoU 0.25 with any of ``objects``, the object of each point (N,), 0 for none."""
+    ids, column, sizes = np.unique(np.maximum(objects, 0), return_inverse=True, return_counts=True)
+    shared = intersections(column, len(ids), masks.indptr, masks.indices, np.arange(len(masks)))
+    iou = (shared / (sizes + masks.sizes[:, None] - shared))[:, ids > 0]
+    if not iou.size or iou.max() >= LEAST_IOU or not len(masks.indices):
         return []
-    first = int(np.flatnonzero(masks.sizes == 0)[0])
-    return [f"{scene}: {counted(facts.n_empty, 'empty mask')}, the first is mask {first}{_key(keys, first)}"]
+    return [
+        "no mask reaches IoU 0.25 with any object: are the points in the order and frame of reference of the ground "
+        "truth?"
+    ]
+
+
+def _label_warnings(rules: ProtocolRules, labels: Sequence[str] | None, names: Collection[str]) -> list[str]:
+    """A warning on labels that are neither classes of the protocol nor among ``names``; '' is no label."""
+    if rules.n_labels is None or not rules.classes:
+        return []
+    known = dict.fromkeys([*(entry.name for entry in rules.classes), *names])
+    given = [label for label in labels or () if label]
+    strange = [label for label in given if label not in known]
+    if not strange:
+        return []
+    meant = nearest(strange[0].strip().lower(), known)
+    return [f"{len(strange)} of {len(given)} {NO_CLASSES}, such as {strange[0][:60]!r}{meant}"]
 
 
 def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
@@ -179,33 +254,39 @@ def label_warnings(scene: str, rules: ProtocolRules, class_ids: Int64Array) -> l
     ]
 
 
-def check_cloud(scene: str, points: Float32Array, truth: Float32Array) -> list[str]:
+def check_cloud(points: Float32Array, truth: Float32Array) -> list[str]:
     """Warnings on the alignment of a predicted cloud with ground truth; ``PredictionError`` if it is impossible."""
-    if not len(points) or not len(truth):
-        return []
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise PredictionError(f"{scene}: point {bad} is at {points[bad].tolist()}; coordinates must be finite")
-    low, high = truth.min(axis=0).astype(np.float64), truth.max(axis=0).astype(np.float64)
-    span, true_span = float((points.max(axis=0) - points.min(axis=0)).max()), float((high - low).max())
+        raise PredictionError(f"point {bad} is at {points[bad].tolist()}; coordinates must be finite")
+    if not len(points) or not len(truth):
+        return []
+    # column by column: numpy is slow along short rows
+    low, high = ([float(bound(column)) for column in truth.T] for bound in (np.min, np.max))
+    span = max(float(np.ptp(column)) for column in points.T)
+    true_span = max(b - a for a, b in zip(low, high, strict=True))
     ratio = span / true_span if true_span > 0 else 1.0
-    if ratio > LARGEST_RATIO or 0 < ratio < 1 / LARGEST_RATIO:
-        unit = next((name for factor, name in UNITS.items() if factor / 4 < ratio < factor * 4), None)
+    if ratio > LARGEST_RATIO:  # few points may be far away
+        ratio = float(np.ptp(np.percentile(points, FEW_PERCENT, axis=0), axis=0).max()) / true_span
+    unit = next((name for factor, name in UNITS.items() if factor / 4 < ratio < factor * 4), None)
+    if ratio > LARGEST_RATIO or (unit is not None and ratio < 1):
         guess = f": {unit}?" if unit else "; wrong scene?"
         raise PredictionError(
-            f"{scene}: the cloud spans {span:.4g}, the scene {true_span:.4g} m{guess} coordinates must be metres in "
-            "the frame of the ground truth"
+            f"the cloud spans {span:.4g}, the scene {true_span:.4g} m{guess} coordinates must be metres in the frame "
+            "of the ground truth"
         )
-    is_inside = ((points >= low - NEAR_M) & (points <= high + NEAR_M)).all(axis=1)
+    is_inside = np.ones(len(points), bool)
+    for column, a, b in zip(points.T, low, high, strict=True):
+        is_inside &= (column >= a - NEAR_M) & (column <= b + NEAR_M)
     share = float(is_inside.mean())
     if share == 0:
         raise PredictionError(
-            f"{scene}: no point of the cloud is in the box of the scene; is it from another scene or in another frame "
-            "of reference?"
+            "no point of the cloud is in the box of the scene; is it from another scene or in another frame of "
+            "reference?"
         )
     if share < MIN_INSIDE:
         return [
-            f"{scene}: only {100 * share:.0f} % of the cloud is in the box of the scene (the first outside is point "
+            f"only {100 * share:.0f} % of the cloud is in the box of the scene (the first outside is point "
             f"{int(np.argmin(is_inside))}); is the frame of reference right?"
         ]
     return []
