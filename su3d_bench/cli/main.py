@@ -114,13 +114,13 @@ def _exit_code(words: Sequence[str]) -> int:
             code: int | None = arguments.call(arguments)
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
-        how = f"stopped by {end}" if isinstance(end, Terminated) else "interrupted"
+        how = "interrupted" if str(end) in ("", "SIGINT") else f"stopped by {end}"
         again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
-    except Exception as error:  # noqa: BLE001 - the one place that turns every other exception into a line
+    except BaseException as error:  # noqa: BLE001 - the one place that turns every other exception into a line
+        if isinstance(error, SystemExit) and not errors.user_code_line(error):  # of the parser
+            return error.code if isinstance(error.code, int) else EXIT_WRONG_INPUT if error.code else EXIT_DONE
         is_debug = "--debug" in words
         if is_debug:
             import traceback

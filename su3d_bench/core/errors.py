@@ -201,4 +201,4 @@ def error_line(error: BaseException) -> str:
     if isinstance(error, Su3dError):
         return text
     place = user_code_line(error)
-    return f"{place}{': ' if place else ''}{type(error).__name__}: {text}"
+    return ": ".join(filter(None, (place, type(error).__name__, text)))

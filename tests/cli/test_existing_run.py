@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ def test_interrupted_extension_leaves_the_run_finished_and_can_be_resumed(
         nonlocal n_scenes
         n_scenes += 1
         if n_scenes == 2:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         return score(*arguments)
 
     score = scene_run._Scene._score
