@@ -8,11 +8,11 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 from textwrap import wrap
 
 from su3d_bench.cli.options import Parser
 from su3d_bench.cli.output import remark
+from su3d_bench.cli.paths import check_outputs
 from su3d_bench.core import errors
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
 from su3d_bench.core.safe_output import doors
@@ -86,15 +86,6 @@ def complete(parser: Parser) -> None:
     argcomplete.autocomplete(parser)
 
 
-def _check_not_run_files(arguments: argparse.Namespace) -> None:
-    """Reject an ``--out`` that is a file of a finished run."""
-    out = getattr(arguments, "out", None)
-    if isinstance(out, Path) and os.path.isfile(out):
-        from su3d_bench.store.run_folder import check_not_run_file
-
-        check_not_run_file(out)
-
-
 def _exit_code(words: Sequence[str]) -> int:
     """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
@@ -107,7 +98,7 @@ def _exit_code(words: Sequence[str]) -> int:
             arguments = parser.parse_args([*words, "list"])
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
-        _check_not_run_files(arguments)
+        check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
         with ending_in_order():

@@ -112,7 +112,7 @@ def add_verb(
     interruption; others start again.
     """
     parser = _parser(verbs, name, about or call.__doc__)
-    parser.set_defaults(call=call, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
+    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from su3d_bench.cli import output, sheets_make
 from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import remark
+from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ def _add_score(verbs: Verbs) -> None:
     parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: only the ground truth's verdicts)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
-    parser.option("--out DIR", "folder for scores.json, tables and items to review")
-    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids")
+    parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
+    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids", type=output_path)
     parser.shared("--format")
 
 
@@ -80,6 +81,8 @@ def call_score(arguments: argparse.Namespace) -> None:
         raise DataError(f"{key_file}: the ground truth answers no item; give files of answers")
     content = asdict(scores)
     if arguments.out is not None:
+        if taken := [file for file in arguments.files if _is_written(file, arguments.out)]:
+            raise ConfigError(f"--out {arguments.out}: {taken[0]} would be replaced; choose another folder")
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
@@ -139,6 +142,11 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     write_text(folder / "review_items.html", review_items_page(scores.review_items, pictures, scores.sheet_id))
 
 
+def _is_written(file: Path, folder: Path) -> bool:
+    """Whether a file of answers has a name that ``_write`` uses."""
+    return file.stem in ("tables", "review_items") and file.resolve().parent == folder.resolve()
+
+
 def _looks_line(scores: Scores) -> str:
     n_disagree = sum(look.reason == "annotators disagree" for look in scores.review_items)
     n_others = len(scores.review_items) - n_disagree
@@ -154,7 +162,7 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
-    parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
+    parser.option("--out FILE", ".pdf, .png or .svg file to write", type=output_path, required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)

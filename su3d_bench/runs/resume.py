@@ -40,7 +40,7 @@ class FinishedScenes:
         try:
             with silent():
                 outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, steps, strict=True)]
-        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything; the worker reports it
+        except BaseException as error:
             if is_interrupt(error):
                 raise
             return None

@@ -95,7 +95,7 @@ def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     package.addHandler(log)
     try:
         outcome = scene.run(part, folder, log)
-    except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything; the traceback goes to the scene's log
+    except BaseException as error:
         if is_interrupt(error) or (isinstance(error, StoreError) and not user_code_line(error)):
             raise
         line = error_line(error)

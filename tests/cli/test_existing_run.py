@@ -52,7 +52,7 @@ SLIPS: dict[str, tuple[str, int, str]] = {
     "a table over its record": (
         "report tables runs/demo --out runs/demo/metrics.json",
         2,
-        "su3d-bench: runs/demo/metrics.json: is a file of the run itself and cannot be replaced; choose another name",
+        "su3d-bench: --out runs/demo/metrics.json: lies in runs/demo, which is an input",
     ),
 }
 

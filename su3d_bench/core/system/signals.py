@@ -13,8 +13,8 @@ from types import FrameType
 
 # Sent by Slurm, systemd, CI and `kill`, by a closed terminal, and by Ctrl-C.
 ENDING = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-# A sender of the first two sends them at once: the second must not interrupt the shutdown that the first began. A later one
-# counts, because an exception may have been lost in a callback.
+# A sender of the first two sends them at once: the second must not interrupt the shutdown that the first began. A later
+# one counts, because an exception may have been lost in a callback.
 SIGNAL_IGNORE_S = 5.0
 
 
