@@ -120,7 +120,7 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        if errors.user_code_line(error):  # raised in a user-defined method or dataset
+        if errors.user_code_line(error) or errors.is_unusable_path(error):  # of user-defined code, or a path
             remark(f"su3d-bench: {errors.error_line(error)}")
             return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")

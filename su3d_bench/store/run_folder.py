@@ -72,7 +72,7 @@ def check_no_links(top: Path, place: Path) -> None:
     for folder in (place, *place.parents):
         if folder == top:
             return
-        if folder.is_symlink():
+        if os.path.islink(folder):
             raise StoreError(f"{shown(folder)}: is a link, but a run writes only to its own folders; remove the link")
 
 
