@@ -15,7 +15,7 @@ from su3d_bench.cli.output import remark
 from su3d_bench.cli.paths import check_outputs
 from su3d_bench.core import errors
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
-from su3d_bench.core.safe_output import doors
+from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 from su3d_bench.core.version import __version__
 
@@ -101,7 +101,7 @@ def _exit_code(words: Sequence[str]) -> int:
         check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
-        with ending_in_order():
+        with ending_in_order(), answers_apart():
             code: int | None = arguments.call(arguments)
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:

@@ -45,9 +45,6 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     """Raise ``ConfigError`` if an output is an input, another output or a file of the data root, or lies in an input or
     a run. Links and the case of letters make no difference, because files are compared by their identity.
     """
-    from su3d_bench.cli.datasets import data_root
-    from su3d_bench.store.run_folder import JOBS, is_run
-
     inputs: dict[Identity | None, tuple[Path, bool]] = {}
     outputs: dict[str, Path] = {}
     for action in parser._actions:
@@ -59,6 +56,11 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         else:
             searched = action.type is searched_folder
             inputs |= {_identity(path): (path, searched) for path in _paths(action, value)}
+    if not outputs:
+        return
+    from su3d_bench.cli.datasets import data_root
+    from su3d_bench.store.run_folder import JOBS, is_run  # slow to import
+
     inputs.pop(None, None)
     data, written = _identity(data_root()), dict[Path, str]()
     for name, path in outputs.items():

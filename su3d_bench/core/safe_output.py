@@ -15,7 +15,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -169,9 +169,13 @@ class SafeStream(io.TextIOBase):
 
 def terminal_width() -> int | None:
     """The width of stdout in characters: ``COLUMNS``, otherwise that of its terminal; None if it is not a terminal."""
-    width_text = os.environ.get("COLUMNS", "")[:6]
-    if not sys.stdout.isatty() and not (width_text.isdecimal() and int(width_text)):
+    width_text, stream = os.environ.get("COLUMNS", "")[:6], answer_stream()
+    if width_text.isdecimal() and int(width_text):
+        return max(int(width_text), MIN_WIDTH)
+    if not stream.isatty():
         return None
+    with suppress(OSError):
+        return max(os.get_terminal_size(stream.fileno()).columns, MIN_WIDTH)
     return max(shutil.get_terminal_size().columns, MIN_WIDTH)
 
 
@@ -189,6 +193,50 @@ def doors() -> Iterator[SafeStream]:
         sys.stdout, sys.stderr = before
         for door in {out, err}.difference(before):
             door.end()
+
+
+_answers: list[SafeStream] = []
+
+
+def answer_stream() -> TextIO | SafeStream:
+    """The stream for the answer of a command: stdout, also inside ``answers_apart``."""
+    return _answers[-1] if _answers else sys.stdout
+
+
+@contextmanager
+def answers_apart() -> Iterator[None]:
+    """In a block inside ``doors``, only ``answer_stream`` writes to stdout: what user-defined code, libraries and their
+    programs print goes to stderr.
+    """
+    out = sys.stdout
+    assert isinstance(out, SafeStream)
+    out.flush()
+    with _moved(out), redirect_stdout(sys.stderr):
+        _answers.append(out)
+        try:
+            yield
+        finally:
+            _answers.pop()
+            out.flush()
+
+
+@contextmanager
+def _moved(out: SafeStream) -> Iterator[None]:
+    """Write ``out`` to a copy of the process's stdout in the block, and make its stdout a copy of its stderr."""
+    inner, copy = out.stream, -1
+    with suppress(OSError, ValueError):
+        copy = os.dup(1) if inner is not None and inner.fileno() == 1 else -1
+    if copy < 0:  # closed, or not the process's own
+        yield
+        return
+    with os.fdopen(copy, "w", encoding=out.encoding, buffering=1 if out.isatty() else -1) as out.stream:
+        os.dup2(2, 1)
+        try:
+            yield
+        finally:
+            out.flush()
+            os.dup2(copy, 1)
+            out.stream = inner
 
 
 def _occupy(number: int) -> None:
