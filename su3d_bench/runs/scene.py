@@ -50,6 +50,8 @@ logger = logging.getLogger(__name__)
 
 def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, ...]:
     """Outcomes of all methods on one scene, the one of the ceiling last; a failing method does not affect others."""
+    # Frames are read in threads, while a method may be in another working directory.
+    job = replace(job, data_root=job.data_root.absolute(), cache_root=job.cache_root.absolute())
     if job.doubts is None:
         try:
             (job,) = judged([job])

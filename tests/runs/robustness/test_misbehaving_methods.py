@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -66,3 +69,25 @@ def test_only_the_scene_fails_where_a_method_ends_the_program(
 def test_interrupt_of_the_user_still_ends_the_run() -> None:
     assert run("signal.raise_signal(signal.SIGINT)", "--jobs", "1") == 130
     assert is_interrupt(KeyboardInterrupt()) and is_interrupt(Terminated(signal.SIGTERM))  # also in a notebook
+
+
+def test_method_that_changes_the_folder_and_prints_loses_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    act = "print('printed'); os.system('echo by a program >&2'); os.chdir('/')"
+    assert run(act, "--jobs", "1", "--json") == 0
+    answer = capfd.readouterr()
+    assert json.loads(answer.out)["results"] and "printed" in answer.err
+    assert Path("out/scenes/painted.b/mine/counts.npz").is_file() and Path("out/metrics.json").is_file()
+
+
+def test_only_the_answer_is_on_stdout() -> None:
+    text = """import os
+from su3d_bench.core.safe_output import answer_stream, answers_apart, doors
+with doors(), answers_apart():
+    print("a")
+    os.write(1, b"b")
+    os.system("echo c")
+    print("answer", file=answer_stream())
+os.write(1, b"end")
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert (done.stdout, sorted(done.stderr.split())) == ("answer\nend", ["a", "bc"])
