@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -77,17 +75,3 @@ def test_method_that_changes_the_folder_and_prints_loses_nothing(capfd: pytest.C
     answer = capfd.readouterr()
     assert json.loads(answer.out)["results"] and "printed" in answer.err
     assert Path("out/scenes/painted.b/mine/counts.npz").is_file() and Path("out/metrics.json").is_file()
-
-
-def test_only_the_answer_is_on_stdout() -> None:
-    text = """import os
-from su3d_bench.core.safe_output import answer_stream, answers_apart, doors
-with doors(), answers_apart():
-    print("a")
-    os.write(1, b"b")
-    os.system("echo c")
-    print("answer", file=answer_stream())
-os.write(1, b"end")
-"""
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
-    assert (done.stdout, sorted(done.stderr.split())) == ("answer\nend", ["a", "bc"])
