@@ -11,6 +11,7 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
@@ -110,6 +111,11 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates in memory at once while ties are broken
+MAX_COINCIDENT = (
+    16  # points at one place, up to rounding, beyond which only the first is searched: as exact, and bounded
+)
+COINCIDENT_DECIMALS = 12  # a picometre
+MIN_CROWD = 512  # points in a cell, below which a search of all of them costs little
 MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting costs more time than it saves
 
 
@@ -127,7 +133,9 @@ class Candidates:
             self._low = np.array([column.min() for column in points.T])  # numpy is slow along short rows
             side_m = max(float(np.ptp(column)) for column in points.T)
             self._cells_a_metre = 32.0 / max(side_m, 1e-9)
-        self._order = self._along_curve(points)
+        cells = self._cells(points) if self._is_ordered else np.zeros(self._n, np.uint16)
+        self._order = without_crowds(points, suspects=np.flatnonzero((np.bincount(cells) > MIN_CROWD)[cells]))
+        self._order = self._order[self._along_curve(points[self._order])]
         self._held = np.asarray(points, np.float64)[self._order]
         self._tree = cKDTree(self._held, balanced_tree=False, compact_nodes=False)
 
@@ -156,16 +164,48 @@ class Candidates:
     def _along_curve(self, points: Points) -> Int64Array:
         """An order in which points that are near in space are near in memory, for faster searches.
 
-        It follows a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few are not reordered.
+        Few are not reordered.
         """
-        if not self._is_ordered:
-            return np.arange(len(points))
+        # numpy sorts 16 bits in linear time
+        return np.argsort(self._cells(points), kind="stable") if self._is_ordered else np.arange(len(points))
+
+    def _cells(self, points: Points) -> NDArray[np.uint16]:
+        """The cell of each point along a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates."""
         cell = np.clip((points - self._low) * self._cells_a_metre, 0, 31).astype(np.uint16)
-        key = np.zeros(len(points), np.uint16)  # numpy sorts 16 bits in linear time
+        key = np.zeros(len(points), np.uint16)
         for bit in range(5):
             for axis in range(3):
                 key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
-        return np.argsort(key, kind="stable")
+        return key
+
+
+def without_crowds(points: Points, n_kept: int = 1, suspects: Int64Array | None = None) -> Int64Array:
+    """The points, ascending, without all but the first ``n_kept`` of many at one place, which every search would visit.
+
+    ``suspects``: the only points that are checked.
+
+    >>> len(without_crowds(np.zeros((600, 3)), 2)), len(without_crowds(np.zeros((10, 3))))
+    (2, 10)
+    """
+    every = np.arange(len(points))
+    suspects = every if suspects is None else suspects
+    if len(suspects) <= MIN_CROWD:
+        return every
+    rows = np.round(np.asarray(points, np.float64)[suspects], COINCIDENT_DECIMALS) + 0.0  # no -0.0
+    hashes = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        hashes = (hashes + np.ascontiguousarray(column).view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+    in_order, most = np.sort(hashes), max(MAX_COINCIDENT, n_kept)
+    crowded = np.unique(in_order[most:][in_order[most:] == in_order[:-most]])  # more than ``most`` have the hash
+    if not len(crowded):
+        return every
+    is_crowded = np.isin(hashes, crowded)
+    suspects, place = suspects[is_crowded], row_ids(rows[is_crowded])
+    sizes = np.bincount(place)
+    order = np.argsort(place, kind="stable")
+    rank = np.empty(len(place), np.int64)
+    rank[order] = every[: len(place)] - starts_of(sizes)[place[order]]
+    return np.delete(every, suspects[(sizes[place] > most) & (rank >= n_kept)])
 
 
 def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
@@ -196,7 +236,7 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
             offset = candidates[neighbours] - queries[rows][:, None, :]
             squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
             is_nearest = squared == squared.min(axis=1, keepdims=True)
-            answer[rows] = np.where(is_nearest, order[neighbours], len(candidates)).min(axis=1)
+            answer[rows] = np.where(is_nearest, order[neighbours], np.iinfo(np.int64).max).min(axis=1)
             # there may be more ties beyond the last requested neighbour
             unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
         open_rows = np.concatenate(unfinished)

@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids
+from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids, without_crowds
 
 _MAX_CELLS = 4_000_000  # neighbours in memory at once
 _MAX_KEPT = 12_000_000  # cached neighbours, of 16 bytes each, if they may be needed again
@@ -95,8 +95,9 @@ class _Search:
     def __init__(self, points: Points, k: int) -> None:
         from scipy.spatial import cKDTree
 
-        self.points = np.asarray(points, np.float64)
         self.k = min(k, len(points))
+        self.rows = without_crowds(points, self.k)
+        self.points = np.asarray(points, np.float64)[self.rows]
         self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
     def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
@@ -108,7 +109,7 @@ class _Search:
             tied = np.flatnonzero(distances[:, k - 1] == distances[:, k])
             indices = indices[:, :k]
             indices[tied] = self._lowest_of_equals(queries[tied])
-        return distances[:, :k], indices
+        return distances[:, :k], self.rows[indices]
 
     def _lowest_of_equals(self, queries: Float64Array) -> Int64Array:
         """Indices (Q, k) if there are ties beyond the k-th neighbour; the distances are those of the tree."""
@@ -165,6 +166,7 @@ def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Flo
     low, high = own.min(axis=0) - cap_m, own.max(axis=0) + cap_m
     near = along_x[np.searchsorted(x, low[0], "left") : np.searchsorted(x, high[0], "right")]
     near = np.sort(near[((places[near, 1:] >= low[1:]) & (places[near, 1:] <= high[1:])).all(axis=1)])
+    own = own[without_crowds(own)]
     _, own_index = cKDTree(own).query(places[near], distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
     near, own_index = near[own_index < len(own)], own_index[own_index < len(own)]
     offset = own[own_index] - places[near]
