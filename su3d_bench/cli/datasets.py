@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, count
 from su3d_bench.cli.output import answer_either
-from su3d_bench.cli.paths import output_path
+from su3d_bench.cli.paths import data_root, output_path
 
 LAYOUTS = ("native", "replica", "scannet")  # a copy of su3d_bench.datasets.layouts, which is slow to import
 MAX_LISTED = 40
@@ -99,11 +98,6 @@ def call_list(arguments: argparse.Namespace) -> None:
     lines = [f"data root: {root}", *(line for row in rows if row not in absent for line in _lines(row))]
     lines += _absent_lines(absent, root)
     answer_either(arguments, {"data_root": str(root), "datasets": rows}, *lines)
-
-
-def data_root() -> Path:
-    """The data root; repeated here because the module that plans runs is slow to import."""
-    return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
 
 
 def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:

@@ -37,13 +37,21 @@ def searched_folder(text: str) -> Path:
     return Path(text)
 
 
+def data_root() -> Path:
+    """The data root; repeated here because the module that plans runs is slow to import."""
+    return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
+
+
 def is_output(action: argparse.Action) -> bool:
     return action.type in (output_path, run_place) or action.dest == "json"
 
 
 def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Raise ``ConfigError`` if an output is an input, another output or a file of the data root, or lies in an input or
-    a run. Links and the case of letters make no difference, because files are compared by their identity.
+    a run.
+
+    Links and the case of letters make no difference, because files are compared by their identity. If the working
+    directory or one above it is an input, new files may be created there.
     """
     inputs: dict[Identity | None, tuple[Path, bool]] = {}
     outputs: dict[str, Path] = {}
@@ -58,19 +66,20 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
             inputs |= {_identity(path): (path, searched) for path in _paths(action, value)}
     if not outputs:
         return
-    from su3d_bench.cli.datasets import data_root
     from su3d_bench.store.run_folder import JOBS, is_run  # slow to import
 
     inputs.pop(None, None)
-    data, written = _identity(data_root()), dict[Path, str]()
+    data, here, written = _identity(data_root()), Path.cwd(), dict[Path, str]()
     for name, path in outputs.items():
         real = Path(os.path.realpath(path))
         for place in (real, *real.parents, *Path(os.path.abspath(path)).parents):
             identity = _identity(place)
             found, is_searched = inputs.get(identity, (None, False))
             fault = None
-            if found is not None and not (is_searched and place != real):
-                fault = "is an input of this command" if place == real else f"lies in {shown(found)}, which is an input"
+            if found is not None and place == real:
+                fault = "is an input of this command"
+            elif found is not None and not is_searched and (real.is_file() or not here.is_relative_to(place)):
+                fault = f"lies in {shown(found)}, which is an input"
             elif identity == data is not None and real.is_file():
                 fault = f"is a file of the data root {shown(data_root())}"
             elif is_run(place) and (place / JOBS).is_dir() and (place != real or arguments.verb not in RUN_VERBS):
