@@ -6,9 +6,8 @@ import argparse
 import os
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import Verbs, add_group, add_verb, count, output_path
 from su3d_bench.cli.output import answer_either
-from su3d_bench.cli.paths import data_root, output_path
+from su3d_bench.cli.paths import data_root
 
 LAYOUTS = ("native", "replica", "scannet")  # a copy of su3d_bench.datasets.layouts, which is slow to import
 MAX_LISTED = 40

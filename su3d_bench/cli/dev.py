@@ -10,9 +10,8 @@ from typing import Any
 
 from su3d_bench.cli import doctor
 from su3d_bench.cli.new import REGISTRY, add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, searched_folder
 from su3d_bench.cli.output import answer, answer_either, answer_json, remark, show
-from su3d_bench.cli.paths import output_path, searched_folder
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
 
 SHELLS = ("bash", "zsh", "fish")

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer_tables, remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError
 
 SCHEMA = 1  # version of the JSON for several methods

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer, answer_json, remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, PredictionError, counted, printable, suggest
 
 if TYPE_CHECKING:

@@ -6,9 +6,8 @@ import argparse
 import re
 from pathlib import Path
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer_either
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError
 
 SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}

@@ -159,6 +159,21 @@ def index(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
 
 
+def output_path(text: str) -> Path:
+    """Option type: a file or folder that the command writes."""
+    return Path(text)
+
+
+def run_place(text: str) -> Path | str:
+    """Option type: a run folder that the command writes, or a URL as text."""
+    return text if "://" in text else Path(text)
+
+
+def searched_folder(text: str) -> Path:
+    """Option type: a folder to search, which may contain the outputs."""
+    return Path(text)
+
+
 def positive(text: str) -> float:
     """Option type: a finite number above 0."""
     try:

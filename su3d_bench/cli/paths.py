@@ -13,28 +13,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.cli.options import output_path, run_place, searched_folder
 from su3d_bench.core.errors import ConfigError, shown
 
 RUN_VERBS = ("run", "ablate", "evaluate")  # whose --out may be an existing run
 # Texts that contain the path of a file or folder; in other texts, such as METHOD, only files are inputs.
 TEXTS = ("A", "B", "RUN[:METHOD]", "METHOD=PREDICTIONS", "METHOD=DIR", "METHOD=FILE", "KEY=VALUE", "FILE")
 FREE_TEXTS = (None, "TEXT", "NAME")
-Identity = tuple[int, int]
-
-
-def output_path(text: str) -> Path:
-    """Option type: a file or folder that the command writes."""
-    return Path(text)
-
-
-def run_place(text: str) -> Path | str:
-    """Option type: a run folder that the command writes, or a URL as text."""
-    return text if "://" in text else Path(text)
-
-
-def searched_folder(text: str) -> Path:
-    """Option type: a folder to search, which may contain the outputs."""
-    return Path(text)
 
 
 def data_root() -> Path:
@@ -53,7 +38,7 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     Links and the case of letters make no difference, because files are compared by their identity. If the working
     directory or one above it is an input, new files may be created there.
     """
-    inputs: dict[Identity | None, tuple[Path, bool]] = {}
+    inputs: dict[tuple[int, int] | None, tuple[Path, bool]] = {}
     outputs: dict[str, Path] = {}
     for action in parser._actions:
         value = getattr(arguments, action.dest, None)
@@ -103,7 +88,7 @@ def _paths(action: argparse.Action, value: Any) -> Iterator[Path]:
                         yield Path(text)
 
 
-def _identity(path: Path) -> Identity | None:
+def _identity(path: Path) -> tuple[int, int] | None:
     """The device and number of a file or folder; None if there is none."""
     try:
         status = os.stat(path)

@@ -11,9 +11,8 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, shown, suggest
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output, questions
-from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output
-from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 
 if TYPE_CHECKING:

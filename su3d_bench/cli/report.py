@@ -7,9 +7,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output, report_files
-from su3d_bench.cli.options import Verbs, add_group, add_verb, index, positive
+from su3d_bench.cli.options import Verbs, add_group, add_verb, index, output_path, positive, searched_folder
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path, searched_folder
 from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:

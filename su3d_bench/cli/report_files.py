@@ -10,9 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import answer_either, remark
-from su3d_bench.cli.paths import output_path, searched_folder
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
 MEGABYTE = 10**6
@@ -44,9 +43,7 @@ def add_archives(verbs: Verbs) -> None:
     parser.option("--trained-on TEXT", "training data of your weights, for a registry", default="")
     parser = add_verb(verbs, "verify", call_verify)
     parser.option("files FILE...", "LaTeX files written by report tables, or bundle.zip")
-    parser.option(
-        "--root DIR", "folder of the runs (default: current folder, then that of the file)", type=searched_folder
-    )
+    parser.option("--root DIR", "folder of the runs (default: current folder, then that of the file)")
 
 
 def call_html(arguments: argparse.Namespace) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:

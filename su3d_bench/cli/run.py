@@ -7,9 +7,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb
+from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb, run_place
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import run_place
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import export, options, output
-from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import Verbs, add_group, add_verb, count, searched_folder
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import searched_folder
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted, printable, printable_json, suggest
 
 if TYPE_CHECKING:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output, sheets_make
-from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.cli.paths import output_path
 from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -81,8 +80,9 @@ def call_score(arguments: argparse.Namespace) -> None:
         raise DataError(f"{key_file}: the ground truth answers no item; give files of answers")
     content = asdict(scores)
     if arguments.out is not None:
-        if taken := [file for file in arguments.files if _is_written(file, arguments.out)]:
-            raise ConfigError(f"--out {arguments.out}: {taken[0]} would be replaced; choose another folder")
+        places = (arguments.out.resolve() / f"{name}.csv" for name in ("tables", "review_items"))
+        if taken := {file.resolve() for file in arguments.files}.intersection(places):
+            raise ConfigError(f"--out {arguments.out}: {taken.pop()} would be replaced; choose another folder")
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
@@ -140,11 +140,6 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
     write_text(folder / "review_items.csv", review_items_csv(scores.review_items))
     write_text(folder / "review_items.html", review_items_page(scores.review_items, pictures, scores.sheet_id))
-
-
-def _is_written(file: Path, folder: Path) -> bool:
-    """Whether a file of answers has a name that ``_write`` uses."""
-    return file.stem in ("tables", "review_items") and file.resolve().parent == folder.resolve()
 
 
 def _looks_line(scores: Scores) -> str:

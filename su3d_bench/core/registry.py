@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import ConfigError, PlugInError, suggest, user_code_line
+from su3d_bench.core.errors import ConfigError, PlugInError, suggest
 from su3d_bench.core.system.files import user_folder
 
 DATASETS = {
@@ -110,11 +110,8 @@ def _module_of(path: Path, state: tuple[int, int]) -> Any:
     try:
         with user_folder([], waits=True):
             spec.loader.exec_module(module)
-    except BaseException as error:
+    except BaseException:
         del sys.modules[name]
-        if isinstance(error, SystemExit):
-            place = user_code_line(error) or path.name
-            raise PlugInError(f"{place}: exits the program on import; put that code under __main__") from error
         raise
     return module
 

@@ -11,7 +11,6 @@ import io
 import json
 import os
 import re
-import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -172,11 +171,7 @@ def terminal_width() -> int | None:
     width_text, stream = os.environ.get("COLUMNS", "")[:6], answer_stream()
     if width_text.isdecimal() and int(width_text):
         return max(int(width_text), MIN_WIDTH)
-    if not stream.isatty():
-        return None
-    with suppress(OSError):
-        return max(os.get_terminal_size(stream.fileno()).columns, MIN_WIDTH)
-    return max(shutil.get_terminal_size().columns, MIN_WIDTH)
+    return max(os.get_terminal_size(stream.fileno()).columns, MIN_WIDTH) if stream.isatty() else None
 
 
 @contextmanager
@@ -210,32 +205,21 @@ def answers_apart() -> Iterator[None]:
     """
     out = sys.stdout
     assert isinstance(out, SafeStream)
+    inner = out.stream
     out.flush()
-    with _moved(out), redirect_stdout(sys.stderr):
-        _answers.append(out)
-        try:
-            yield
-        finally:
-            _answers.pop()
-            out.flush()
-
-
-@contextmanager
-def _moved(out: SafeStream) -> Iterator[None]:
-    """Write ``out`` to a copy of the process's stdout in the block, and make its stdout a copy of its stderr."""
-    inner, copy = out.stream, -1
-    with suppress(OSError, ValueError):
-        copy = os.dup(1) if inner is not None and inner.fileno() == 1 else -1
-    if copy < 0:  # closed, or not the process's own
-        yield
-        return
-    with os.fdopen(copy, "w", encoding=out.encoding, buffering=1 if out.isatty() else -1) as out.stream:
+    _answers.append(out)
+    if inner is sys.__stdout__ is not None:  # what is written to its number without Python moves, too
+        out.stream = os.fdopen(os.dup(1), "w", encoding=out.encoding)
         os.dup2(2, 1)
-        try:
+    try:
+        with redirect_stdout(sys.stderr):
             yield
-        finally:
-            out.flush()
-            os.dup2(copy, 1)
+    finally:
+        _answers.pop()
+        out.flush()
+        if out.stream is not inner and out.stream is not None:
+            os.dup2(out.stream.fileno(), 1)
+            out.stream.close()
             out.stream = inner
 
 

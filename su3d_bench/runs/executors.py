@@ -22,7 +22,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
-from su3d_bench.core.errors import ConfigError, PlugInError, Su3dError, error_line, user_code_line
+from su3d_bench.core.errors import ConfigError, Su3dError
 from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 
@@ -175,9 +175,7 @@ def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[st
         return "user-error", error
     except Terminated:
         raise
-    except BaseException as error:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
-        if user_code_line(error):
-            return "user-error", PlugInError(error_line(error))
+    except BaseException:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
         return "internal-error", traceback.format_exc()
 
 

@@ -173,7 +173,8 @@ def made(plug_in: type, *words: Any) -> Any:
     last: list[str] = []
     with user_folder(last, waits=True):
         built = _called(place_of(plug_in, "__init__", function), plug_in, words, {})
-    _remember(built, LAST_FOLDER, last)
+    with suppress(AttributeError):
+        object.__setattr__(built, LAST_FOLDER, last)
     return built
 
 
@@ -217,13 +218,9 @@ def _watched(plug_in: Any, kind: str) -> Any:
         if callable(getattr(type(plug_in), name, None)):  # not a property, which may not have a value yet
             function = getattr(plug_in, name)
             watching = wraps(function)(partial(_asked, plug_in, name, function, answer))
-            _remember(plug_in, name, watching)
+            with suppress(AttributeError):  # a class with slots is not checked
+                object.__setattr__(plug_in, name, watching)
     return plug_in
-
-
-def _remember(plug_in: Any, name: str, value: Any) -> None:
-    with suppress(AttributeError):  # a class with slots is not checked
-        object.__setattr__(plug_in, name, value)
 
 
 def _asked(plug_in: Any, name: str, function: Callable[..., Any], answer: Any, *words: Any, **named: Any) -> Any:

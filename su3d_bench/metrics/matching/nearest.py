@@ -11,7 +11,6 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
@@ -115,7 +114,6 @@ MAX_COINCIDENT = (
     16  # points at one place, up to rounding, beyond which only the first is searched: as exact, and bounded
 )
 COINCIDENT_DECIMALS = 12  # a picometre
-MIN_CROWD = 512  # points in a cell, below which a search of all of them costs little
 MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting costs more time than it saves
 
 
@@ -133,8 +131,7 @@ class Candidates:
             self._low = np.array([column.min() for column in points.T])  # numpy is slow along short rows
             side_m = max(float(np.ptp(column)) for column in points.T)
             self._cells_a_metre = 32.0 / max(side_m, 1e-9)
-        cells = self._cells(points) if self._is_ordered else np.zeros(self._n, np.uint16)
-        self._order = without_crowds(points, suspects=np.flatnonzero((np.bincount(cells) > MIN_CROWD)[cells]))
+        self._order = without_crowds(points)
         self._order = self._order[self._along_curve(points[self._order])]
         self._held = np.asarray(points, np.float64)[self._order]
         self._tree = cKDTree(self._held, balanced_tree=False, compact_nodes=False)
@@ -164,43 +161,32 @@ class Candidates:
     def _along_curve(self, points: Points) -> Int64Array:
         """An order in which points that are near in space are near in memory, for faster searches.
 
-        Few are not reordered.
+        It follows a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few are not reordered.
         """
-        # numpy sorts 16 bits in linear time
-        return np.argsort(self._cells(points), kind="stable") if self._is_ordered else np.arange(len(points))
-
-    def _cells(self, points: Points) -> NDArray[np.uint16]:
-        """The cell of each point along a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates."""
+        if not self._is_ordered:
+            return np.arange(len(points))
         cell = np.clip((points - self._low) * self._cells_a_metre, 0, 31).astype(np.uint16)
-        key = np.zeros(len(points), np.uint16)
+        key = np.zeros(len(points), np.uint16)  # numpy sorts 16 bits in linear time
         for bit in range(5):
             for axis in range(3):
                 key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
-        return key
+        return np.argsort(key, kind="stable")
 
 
-def without_crowds(points: Points, n_kept: int = 1, suspects: Int64Array | None = None) -> Int64Array:
+def without_crowds(points: Points, n_kept: int = 1) -> Int64Array:
     """The points, ascending, without all but the first ``n_kept`` of many at one place, which every search would visit.
-
-    ``suspects``: the only points that are checked.
 
     >>> len(without_crowds(np.zeros((600, 3)), 2)), len(without_crowds(np.zeros((10, 3))))
     (2, 10)
     """
-    every = np.arange(len(points))
-    suspects = every if suspects is None else suspects
-    if len(suspects) <= MIN_CROWD:
-        return every
-    rows = np.round(np.asarray(points, np.float64)[suspects], COINCIDENT_DECIMALS) + 0.0  # no -0.0
+    every, most = np.arange(len(points)), max(MAX_COINCIDENT, n_kept)
+    rows = np.asarray(np.round(points.astype(np.float64), COINCIDENT_DECIMALS) + 0.0, np.float64)  # no -0.0
     hashes = np.zeros(len(rows), np.uint64)
     for column in rows.T:
         hashes = (hashes + np.ascontiguousarray(column).view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-    in_order, most = np.sort(hashes), max(MAX_COINCIDENT, n_kept)
-    crowded = np.unique(in_order[most:][in_order[most:] == in_order[:-most]])  # more than ``most`` have the hash
-    if not len(crowded):
-        return every
-    is_crowded = np.isin(hashes, crowded)
-    suspects, place = suspects[is_crowded], row_ids(rows[is_crowded])
+    in_order = np.sort(hashes)
+    suspects = np.flatnonzero(np.isin(hashes, in_order[most:][in_order[most:] == in_order[:-most]]))
+    place = row_ids(rows[suspects])
     sizes = np.bincount(place)
     order = np.argsort(place, kind="stable")
     rank = np.empty(len(place), np.int64)
