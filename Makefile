@@ -9,7 +9,7 @@ DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
-	$(BIN)/su3d-bench report html runs/demo --out runs/demo/page.html
+	$(BIN)/su3d-bench report html runs/demo --out runs/demo.html
 
 test: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto

@@ -171,7 +171,7 @@ class _Findings:
             if known is None or SEVERITIES.index(finding.severity) < SEVERITIES.index(known.severity):
                 self._findings[keys[0]] = Finding(finding.severity, finding.check, keys[0][0], text)
 
-    def add_fault(self, check: str, where: str, error: Exception) -> None:
+    def add_fault(self, check: str, where: str, error: BaseException) -> None:
         """Add a finding for an exception, unless it is about a file whose fault is known."""
         text = str(error) if isinstance(error, OSError) else error_line(error)
         text = printable(text.removeprefix(f"{self.scene}: "))
@@ -252,10 +252,10 @@ def _read_frames(
 ) -> list[FrameFacts]:
     """Facts of the readable frames; each unreadable one becomes a finding."""
 
-    def read(position: int) -> FrameFacts | Exception:
+    def read(position: int) -> FrameFacts | BaseException:
         try:
             return facts_of(frames[position])
-        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; every broken frame is named
+        except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything; every broken frame is named
             return error
 
     facts = []

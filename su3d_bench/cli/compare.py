@@ -6,7 +6,7 @@ import argparse
 import os
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
@@ -23,15 +23,15 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("runs [RUN...]", "run to check")
     parser.option("--against FILE", "reference file")
     parser.option("--build-from RUN...", "repetitions of one run to build the reference from")
-    parser.option("--out FILE", "reference file that --build-from writes")
+    parser.option("--out FILE", "reference file that --build-from writes", type=output_path)
     parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --build-from)", type=float)
     parser.option(
         "--machine-tolerance POINTS",
         "tolerance across machines in points (with --build-from; default: 2)",
         type=float,
     )
-    parser.option("--markdown FILE", "write the table as Markdown, for a pull request")
-    parser.option("--junit FILE", "write JUnit XML")
+    parser.option("--markdown FILE", "write the table as Markdown, for a pull request", type=output_path)
+    parser.option("--junit FILE", "write JUnit XML", type=output_path)
     parser.option(
         "--github", "print GitHub annotations (default: in GitHub workflows)", action=argparse.BooleanOptionalAction
     )

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import Verbs, add_group, add_verb, count, output_path
 from su3d_bench.cli.output import answer_either
+from su3d_bench.cli.paths import data_root
 
 LAYOUTS = ("native", "replica", "scannet")  # a copy of su3d_bench.datasets.layouts, which is slow to import
 MAX_LISTED = 40
@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--jobs", "--set")
     parser = add_verb(actions, "show", call_show)
     parser.option("scene SCENE", "scene, such as rooms/living0")
-    parser.option("--out FILE", "PNG file to write (default: DATASET-SCENE.png)")
+    parser.option("--out FILE", "PNG file to write (default: DATASET-SCENE.png)", type=output_path)
     parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, takes_up=True)
@@ -44,7 +44,7 @@ def add_parser(verbs: Verbs) -> None:
         choices=LAYOUTS,
         default="native",
     )
-    parser.option("--out DIR", "data root to write to (native: default $SU3D_DATA)")
+    parser.option("--out DIR", "data root to write to (native: default $SU3D_DATA)", type=output_path)
     parser.shared("--set", "--jobs")
     fetch.add_data(actions)
     add_new(actions, "dataset")
@@ -98,11 +98,6 @@ def call_list(arguments: argparse.Namespace) -> None:
     lines = [f"data root: {root}", *(line for row in rows if row not in absent for line in _lines(row))]
     lines += _absent_lines(absent, root)
     answer_either(arguments, {"data_root": str(root), "datasets": rows}, *lines)
-
-
-def data_root() -> Path:
-    """The data root; repeated here because the module that plans runs is slow to import."""
-    return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
 
 
 def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:

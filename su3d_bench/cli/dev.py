@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.cli import doctor
 from su3d_bench.cli.new import REGISTRY, add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, searched_folder
 from su3d_bench.cli.output import answer, answer_either, answer_json, remark, show
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
 
@@ -136,11 +136,11 @@ def _add_registry(verbs: Verbs) -> None:
     actions = add_group(verbs, "registry", _add_registry)
     parser = add_verb(actions, "add", call_registry_add)
     parser.option("bundles BUNDLE...", "archives written by report bundle or reproduce")
-    parser.option("--to DIR", "registry folder (default: the current folder)", default=Path())
+    parser.option("--to DIR", "registry folder (default: the current folder)", type=output_path, default=Path())
     parser.option("--name NAME", "name of the bundle in the registry (default: from its file or recipe)")
     parser = add_verb(actions, "build", call_registry_build)
-    parser.option("folder DIR", "registry, or any folder of bundles")
-    parser.option("--out DIR", "folder of the site (default: site)", default=Path("site"))
+    parser.option("folder DIR", "registry, or any folder of bundles", type=searched_folder)
+    parser.option("--out DIR", "folder of the site (default: site)", type=output_path, default=Path("site"))
     parser.option("--title TEXT", "title of the first page (default: Registry of results)")
     parser.option("--bundle-url URL", "base URL for links to bundles (default: no links)")
     add_new(actions, REGISTRY)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import ConfigError
 
@@ -33,7 +33,7 @@ def add_parser(verbs: Verbs) -> None:
         action="extend",
         default=[],
     )
-    parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query")
+    parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query", type=output_path)
     parser.option("--dataset NAME", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
     parser.option(
         "--ground-truth DIR",

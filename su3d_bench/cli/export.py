@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer, answer_json, remark
 from su3d_bench.core.errors import ConfigError, PredictionError, counted, printable, suggest
 
@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
         required=True,
         choices=TARGETS,
     )
-    parser.option("--out DIR", "new folder for the files", required=True)
+    parser.option("--out DIR", "new folder for the files", type=output_path, required=True)
     parser.option("--method METHOD", "method whose maps are exported (default: the only one of the run)")
     parser.shared("--scenes")
     parser.option("--format FORMAT", "format of the predictions (default: recognised)")

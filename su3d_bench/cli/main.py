@@ -8,14 +8,14 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 from textwrap import wrap
 
 from su3d_bench.cli.options import Parser
 from su3d_bench.cli.output import remark
+from su3d_bench.cli.paths import check_outputs
 from su3d_bench.core import errors
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
-from su3d_bench.core.safe_output import doors
+from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 from su3d_bench.core.version import __version__
 
@@ -86,15 +86,6 @@ def complete(parser: Parser) -> None:
     argcomplete.autocomplete(parser)
 
 
-def _check_not_run_files(arguments: argparse.Namespace) -> None:
-    """Reject an ``--out`` that is a file of a finished run."""
-    out = getattr(arguments, "out", None)
-    if isinstance(out, Path) and os.path.isfile(out):
-        from su3d_bench.store.run_folder import check_not_run_file
-
-        check_not_run_file(out)
-
-
 def _exit_code(words: Sequence[str]) -> int:
     """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
@@ -107,20 +98,20 @@ def _exit_code(words: Sequence[str]) -> int:
             arguments = parser.parse_args([*words, "list"])
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
-        _check_not_run_files(arguments)
+        check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
-        with ending_in_order():
+        with ending_in_order(), answers_apart():
             code: int | None = arguments.call(arguments)
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
-        how = f"stopped by {end}" if isinstance(end, Terminated) else "interrupted"
+        how = "interrupted" if str(end) in ("", "SIGINT") else f"stopped by {end}"
         again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
-    except Exception as error:  # noqa: BLE001 - the one place that turns every other exception into a line
+    except BaseException as error:  # noqa: BLE001 - the one place that turns every other exception into a line
+        if isinstance(error, SystemExit) and not errors.user_code_line(error):  # of the parser
+            return error.code if isinstance(error.code, int) else EXIT_WRONG_INPUT if error.code else EXIT_DONE
         is_debug = "--debug" in words
         if is_debug:
             import traceback
@@ -129,7 +120,7 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        if errors.user_code_line(error):  # raised in a user-defined method or dataset
+        if errors.user_code_line(error) or errors.is_unusable_path(error):  # of user-defined code, or a path
             remark(f"su3d-bench: {errors.error_line(error)}")
             return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")

@@ -6,7 +6,7 @@ import argparse
 import re
 from pathlib import Path
 
-from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import ConfigError
 
@@ -43,9 +43,9 @@ def add_new(verbs: Verbs, what: str) -> None:
     parser = add_verb(verbs, "new", call, about)
     parser.set_defaults(what=what)
     if what == REGISTRY:
-        parser.option("file DIR", "folder to create")
+        parser.option("file DIR", "folder to create", type=output_path)
     else:
-        parser.option("file FILE", f"file to create; its name becomes that of the {what}")
+        parser.option("file FILE", f"file to create; its name becomes that of the {what}", type=output_path)
 
 
 def call(arguments: argparse.Namespace) -> None:

@@ -112,7 +112,7 @@ def add_verb(
     interruption; others start again.
     """
     parser = _parser(verbs, name, about or call.__doc__)
-    parser.set_defaults(call=call, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
+    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
@@ -157,6 +157,21 @@ def index(text: str) -> int:
     if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
+
+
+def output_path(text: str) -> Path:
+    """Option type: a file or folder that the command writes."""
+    return Path(text)
+
+
+def run_place(text: str) -> Path | str:
+    """Option type: a run folder that the command writes, or a URL as text."""
+    return text if "://" in text else Path(text)
+
+
+def searched_folder(text: str) -> Path:
+    """Option type: a folder to search, which may contain the outputs."""
+    return Path(text)
 
 
 def positive(text: str) -> float:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.core.errors import counted, printable
-from su3d_bench.core.safe_output import SafeStream, escaped_json, one_line, stream_behind, terminal_width
+from su3d_bench.core.safe_output import SafeStream, answer_stream, escaped_json, one_line, stream_behind, terminal_width
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -36,7 +36,7 @@ def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, 
 
 def answer(*lines: str) -> None:
     """Print lines to stdout, with control characters escaped."""
-    print("\n".join(map(one_line, lines)))
+    print("\n".join(map(one_line, lines)), file=answer_stream())
 
 
 def answer_document(text: str) -> None:
@@ -51,7 +51,7 @@ def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
         path = written(arguments.json_file, f"{text}\n")
         remark(f"written: {path}", quiet=arguments.quiet)
     if arguments.json:
-        print(text)
+        print(text, file=answer_stream())
     return bool(arguments.json)
 
 
@@ -78,21 +78,20 @@ def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Tab
 
 def show() -> None:
     """Flush stdout before something slow."""
-    sys.stdout.flush()
+    answer_stream().flush()
 
 
 def answer_commands(lines: Sequence[str]) -> None:
     """Print workflow commands, whose text is already escaped."""
+    stream = answer_stream()
     for line in lines:
-        sys.stdout.write_command(line) if isinstance(sys.stdout, SafeStream) else print(line)
+        stream.write_command(line) if isinstance(stream, SafeStream) else print(line)
 
 
 def written(path: Path, text: str) -> Path:
     """Write ``text`` to the file of an option, creating its folder; returns the path."""
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.store.run_folder import check_not_run_file
 
-    check_not_run_file(path)
     make_folder(path.parent)
     write_text(path, text)
     return path

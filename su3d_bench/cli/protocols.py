@@ -11,7 +11,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
 from su3d_bench.core.errors import ConfigError, shown, suggest
 
@@ -39,13 +39,13 @@ def add_parser(verbs: Verbs) -> None:
         "--prediction RUN[:METHOD]",
         "run to score under both, to show the effect of each rule",
     )
-    parser.option("--out PNG", "plot of the effect of each rule (with --prediction)")
+    parser.option("--out PNG", "plot of the effect of each rule (with --prediction)", type=output_path)
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol P", "protocol, or .toml file", required=True)
     parser.option("--encoder E", "encoder from models list (default: that of the protocol)")
     parser.shared("--queries", "--device", "--set")
-    parser.option("--out FILE", ".npz file to write", required=True)
+    parser.option("--out FILE", ".npz file to write", type=output_path, required=True)
     add_new(actions, "protocol")
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output, questions
-from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted
 
@@ -29,14 +29,14 @@ def add_parser(verbs: Verbs) -> None:
     """
     actions = add_group(verbs, "query", add_parser)
     parser = add_verb(actions, "text", call_text)
-    parser.option("scene", "scene, such as rooms/living0")
+    parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("text", "text to search for")
     parser.shared("--run", "--method")
     parser.option("--top N", "number of instances to list (default: 10)", type=count, default=10)
     parser.shared("--device")
-    parser.option("--out FILE", "picture to write (default: next to the map)")
+    parser.option("--out FILE", "picture to write (default: next to the map)", type=output_path)
     parser = add_verb(actions, "ask", call_ask)
-    parser.option("scene", "scene, such as rooms/living0")
+    parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("question", "question in English")
     parser.shared("--run", "--method")
     parser.option(
@@ -55,7 +55,7 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar=("X", "Y", "Z"),
     )
-    parser.option("--out FILE", "picture to write (default: next to the map)")
+    parser.option("--out FILE", "picture to write (default: next to the map)", type=output_path)
     options.add_language_options(parser)
     questions.add_parser(actions)
 

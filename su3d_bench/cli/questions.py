@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output
-from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 
@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     scenes = "--scenes SCENE...", "scenes or patterns, such as 'rooms/*'"
     parser = add_verb(verbs, "make", _make)
     parser.option(*scenes, required=True)
-    parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", required=True)
+    parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number of questions per kind and scene (default: all)", type=count)
     parser.option(
         "--source",
@@ -50,7 +50,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser = add_verb(verbs, "audit", _audit)
     parser.option(*scenes)
-    parser.option("--out DIR", "folder for page, pictures and table")
+    parser.option("--out DIR", "folder for page, pictures and table", type=output_path)
     parser.option("--n-questions N", "number of questions (default: 200)", type=count, default=200)
     parser.shared("--seed")
     parser.option("--kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[])

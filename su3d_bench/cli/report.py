@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output, report_files
-from su3d_bench.cli.options import Verbs, add_group, add_verb, index, positive
+from su3d_bench.cli.options import Verbs, add_group, add_verb, index, output_path, positive, searched_folder
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, counted
 
@@ -53,7 +53,7 @@ def _add_tables(verbs: Verbs) -> None:
     parser.option(
         "--published", "show published results (default: with --table)", action=argparse.BooleanOptionalAction
     )
-    parser.option("--out FILE", "file to write (default: print)")
+    parser.option("--out FILE", "file to write (default: print)", type=output_path)
 
 
 def call_tables(arguments: argparse.Namespace) -> None:
@@ -99,7 +99,7 @@ def _add_timing(verbs: Verbs) -> None:
     parser.shared("--methods")
     parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
     parser.option("--camera-rate HZ", "frame rate of the camera (default: 30)", type=positive, default=30.0)
-    parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots")
+    parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots", type=output_path)
     parser.shared("--format")
 
 
@@ -150,7 +150,7 @@ def _add_instances(verbs: Verbs) -> None:
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
     parser.option("--format", "csv or parquet (default: by the suffix of --out, else csv)", choices=FORMATS)
-    parser.option("--out FILE", "file to write (default: print CSV)")
+    parser.option("--out FILE", "file to write (default: print CSV)", type=output_path)
     parser.option("--describe-columns", "describe the columns and exit")
     parser.shared("--table-format")
 
@@ -197,11 +197,11 @@ def call_instances(arguments: argparse.Namespace) -> None:
 
 def _add_leaderboard(verbs: Verbs) -> None:
     parser = add_verb(verbs, "leaderboard", call_leaderboard)
-    parser.option("folder DIR", "folder to search for runs")
+    parser.option("folder DIR", "folder to search for runs", type=searched_folder)
     parser.shared("--protocols")
     parser.option("--intervals", "show 95 %% confidence intervals of scores and ranks")
     parser.shared("--format")
-    parser.option("--out FILE", "file to write (default: print)")
+    parser.option("--out FILE", "file to write (default: print)", type=output_path)
 
 
 def call_leaderboard(arguments: argparse.Namespace) -> None:
@@ -225,7 +225,7 @@ def _add_attribution(verbs: Verbs) -> None:
     parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
     parser.shared("--protocols")
     parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
-    parser.option("--out PNG", "plot to write")
+    parser.option("--out PNG", "plot to write", type=output_path)
     parser.shared("--format")
 
 

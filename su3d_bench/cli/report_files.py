@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import answer_either, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
@@ -20,7 +20,7 @@ MEGABYTE = 10**6
 def add_pages(verbs: Verbs) -> None:
     parser = add_verb(verbs, "html", call_html, takes_up=True)
     parser.shared("runs")
-    parser.option("--out FILE", "page to write (default: page.html)", default=Path("page.html"))
+    parser.option("--out FILE", "page to write (default: page.html)", type=output_path, default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
     parser.option("--queries TEXT...", "texts for the similarity view (default: eight built-in texts)")
     parser.option("--no-maps", "omit the maps")
@@ -33,13 +33,13 @@ def add_pages(verbs: Verbs) -> None:
     parser = add_verb(verbs, "rerun", call_rerun)
     parser.shared("run", "--scenes", "--methods")
     parser.option("--stride N", "use every Nth frame (default: at most 60 frames per scene)", type=count)
-    parser.option("--out FILE", ".rrd file to write", required=True)
+    parser.option("--out FILE", ".rrd file to write", type=output_path, required=True)
 
 
 def add_archives(verbs: Verbs) -> None:
     parser = add_verb(verbs, "bundle", call_bundle)
     parser.shared("runs")
-    parser.option("--out FILE", "archive to write (default: name of the first run)")
+    parser.option("--out FILE", "archive to write (default: name of the first run)", type=output_path)
     parser.option("--trained-on TEXT", "training data of your weights, for a registry", default="")
     parser = add_verb(verbs, "verify", call_verify)
     parser.option("files FILE...", "LaTeX files written by report tables, or bundle.zip")

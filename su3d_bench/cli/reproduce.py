@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "reproduce", call, takes_up=True)
     parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
     parser.option("--table NAME...", "experiments to run (default: all)", default=[])
-    parser.option("--out DIR", "output folder (default: reproduced/<recipe>)")
+    parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)
     parser.shared("--dry-run")
     parser.option("--rehearse", "run on synthetic rooms in the datasets' file layouts, with embedded perception")
     parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
@@ -48,7 +48,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--profile")
     parser.option("--encoder ENCODER", "encoder of all runs (default: set by the recipe)")
     parser.shared("--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR, "--set")
-    parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)")
+    parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)", type=output_path)
     parser.shared("--format")
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb
+from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb, run_place
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -58,11 +57,6 @@ def _add_run_options(parser: Parser) -> None:
     what = "add scenes, methods and protocols to the run in --out"
     parser.option("--extend", what, into)
     parser.option("--replace", "overwrite the run in --out", into)
-
-
-def run_place(text: str) -> Path | str:
-    """A path, or a URL as text."""
-    return text if "://" in text else Path(text)
 
 
 def call_run(arguments: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import export, options, output
-from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.options import Verbs, add_group, add_verb, count, searched_folder
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted, printable, printable_json, suggest
 
@@ -33,7 +33,7 @@ def add_parser(verbs: Verbs) -> None:
     """
     actions = add_group(verbs, "runs", add_parser, lists=True)
     parser = add_verb(actions, "list", call_list)
-    parser.option("folder [DIR]", "folder to search (default: runs)", default=DEFAULT)
+    parser.option("folder [DIR]", "folder to search (default: runs)", type=searched_folder, default=DEFAULT)
     parser.shared("--format")
     parser = add_verb(actions, "show", call_show)
     parser.shared("run")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output, sheets_make
-from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, DataError, counted
 
@@ -35,8 +35,8 @@ def _add_score(verbs: Verbs) -> None:
     parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: only the ground truth's verdicts)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
-    parser.option("--out DIR", "folder for scores.json, tables and items to review")
-    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids")
+    parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
+    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids", type=output_path)
     parser.shared("--format")
 
 
@@ -80,6 +80,9 @@ def call_score(arguments: argparse.Namespace) -> None:
         raise DataError(f"{key_file}: the ground truth answers no item; give files of answers")
     content = asdict(scores)
     if arguments.out is not None:
+        places = (arguments.out.resolve() / f"{name}.csv" for name in ("tables", "review_items"))
+        if taken := {file.resolve() for file in arguments.files}.intersection(places):
+            raise ConfigError(f"--out {arguments.out}: {taken.pop()} would be replaced; choose another folder")
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
@@ -154,7 +157,7 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
-    parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
+    parser.option("--out FILE", ".pdf, .png or .svg file to write", type=output_path, required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)

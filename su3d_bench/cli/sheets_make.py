@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from su3d_bench.cli import options, output
-from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, counted
 
@@ -35,8 +35,8 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call)
     parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
     parser.option("--kind ...", "what annotators rate; one folder per kind if several", choices=KINDS, required=True)
-    parser.option("--out DIR", "folder for the sheets", required=True)
-    parser.option("--key DIR", "folder for the answer key: which method made which item (default: <--out>-key)")
+    parser.option("--out DIR", "folder for the sheets", type=output_path, required=True)
+    parser.option("--key DIR", "folder for the key: which method made what (default: <--out>-key)", type=output_path)
     parser.option(
         "--questions FILE",
         "'generated' (default), 'paper' (those of OpenSU3D's paper), or a question file",

@@ -5,15 +5,17 @@ The form of a message is *where: what is wrong (value); what to do*, in lower ca
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from su3d_bench.core.english import plural
 from su3d_bench.core.safe_output import escaped, plain_value
 
+UNUSABLE = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may contain a line of any length
 
 
@@ -180,6 +182,11 @@ def _library_folders() -> tuple[str, ...]:
     return tuple(str(folder) for folder in (package, *links, *installed))
 
 
+def is_unusable_path(error: BaseException) -> TypeGuard[OSError]:
+    """Whether the system rejects a path that the user named: too long, a loop of links, or not permitted."""
+    return isinstance(error, OSError) and error.errno in UNUSABLE and error.filename is not None
+
+
 def user_code_line(error: BaseException) -> str:
     """``my_method.py:12``: the deepest line of a user-defined file in the traceback of ``error``; empty without one."""
     import traceback
@@ -201,4 +208,7 @@ def error_line(error: BaseException) -> str:
     if isinstance(error, Su3dError):
         return text
     place = user_code_line(error)
-    return f"{place}{': ' if place else ''}{type(error).__name__}: {text}"
+    if is_unusable_path(error):
+        text = f"{printable(str(error.filename), 200)}: {error.strerror}; choose another file or folder"
+        return f"{place}: {text}" if place else text
+    return ": ".join(filter(None, (place, type(error).__name__, text)))

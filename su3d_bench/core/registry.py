@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import ConfigError, PlugInError, suggest, user_code_line
+from su3d_bench.core.errors import ConfigError, PlugInError, suggest
+from su3d_bench.core.system.files import user_folder
 
 DATASETS = {
     "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
@@ -72,7 +73,8 @@ def _found(kind: str, name: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     for entry in entry_points(group=GROUPS[kind]):
         if entry.name == name:
-            return entry.load()
+            with user_folder([], waits=True):
+                return entry.load()
     if ".py:" in name:
         return _from_file(kind, name)
     known = names(kind)
@@ -106,12 +108,10 @@ def _module_of(path: Path, state: tuple[int, int]) -> Any:
     assert spec is not None and spec.loader is not None
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
-    except BaseException as error:
+        with user_folder([], waits=True):
+            spec.loader.exec_module(module)
+    except BaseException:
         del sys.modules[name]
-        if isinstance(error, SystemExit):
-            place = user_code_line(error) or path.name
-            raise PlugInError(f"{place}: exits the program on import; put that code under __main__") from error
         raise
     return module
 

@@ -11,11 +11,10 @@ import io
 import json
 import os
 import re
-import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -169,10 +168,10 @@ class SafeStream(io.TextIOBase):
 
 def terminal_width() -> int | None:
     """The width of stdout in characters: ``COLUMNS``, otherwise that of its terminal; None if it is not a terminal."""
-    width_text = os.environ.get("COLUMNS", "")[:6]
-    if not sys.stdout.isatty() and not (width_text.isdecimal() and int(width_text)):
-        return None
-    return max(shutil.get_terminal_size().columns, MIN_WIDTH)
+    width_text, stream = os.environ.get("COLUMNS", "")[:6], answer_stream()
+    if width_text.isdecimal() and int(width_text):
+        return max(int(width_text), MIN_WIDTH)
+    return max(os.get_terminal_size(stream.fileno()).columns, MIN_WIDTH) if stream.isatty() else None
 
 
 @contextmanager
@@ -189,6 +188,39 @@ def doors() -> Iterator[SafeStream]:
         sys.stdout, sys.stderr = before
         for door in {out, err}.difference(before):
             door.end()
+
+
+_answers: list[SafeStream] = []
+
+
+def answer_stream() -> TextIO | SafeStream:
+    """The stream for the answer of a command: stdout, also inside ``answers_apart``."""
+    return _answers[-1] if _answers else sys.stdout
+
+
+@contextmanager
+def answers_apart() -> Iterator[None]:
+    """In a block inside ``doors``, only ``answer_stream`` writes to stdout: what user-defined code, libraries and their
+    programs print goes to stderr.
+    """
+    out = sys.stdout
+    assert isinstance(out, SafeStream)
+    inner = out.stream
+    out.flush()
+    _answers.append(out)
+    if inner is sys.__stdout__ is not None:  # what is written to its number without Python moves, too
+        out.stream = os.fdopen(os.dup(1), "w", encoding=out.encoding)
+        os.dup2(2, 1)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _answers.pop()
+        out.flush()
+        if out.stream is not inner and out.stream is not None:
+            os.dup2(out.stream.fileno(), 1)
+            out.stream.close()
+            out.stream = inner
 
 
 def _occupy(number: int) -> None:

@@ -21,7 +21,7 @@ from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, has_every_label, similarities
-from su3d_bench.metrics.matching.nearest import row_ids
+from su3d_bench.metrics.matching.nearest import row_ids, without_crowds
 from su3d_bench.metrics.metric import Counts, Metric, SceneScore, axes
 from su3d_bench.metrics.protocols.kinds import OBJECT_RANKS
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -40,7 +40,7 @@ class Cloud:
     def _tree(self) -> Any:
         from scipy.spatial import cKDTree
 
-        return cKDTree(self.points)
+        return cKDTree(self.points[without_crowds(self.points)])
 
     @cached_property
     def corners(self) -> Float64Array:

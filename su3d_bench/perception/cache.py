@@ -8,6 +8,7 @@ recomputed.
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -16,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.digests import package_digest
-from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, Regions, UInt8Array
+
+logger = logging.getLogger(__name__)
 
 
 def mask_boxes(masks: BoolArray) -> Float32Array:
@@ -293,7 +295,7 @@ class FrameCache:
     def load(self, key: str) -> Arrays | None:
         """The arrays stored under ``key``, or None if there is no valid entry."""
         path = self.path(key)
-        if path is None or not path.is_file():
+        if path is None:
             return None
         try:
             arrays = read_arrays(path)
@@ -305,7 +307,7 @@ class FrameCache:
         return arrays
 
     def save(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Store ``arrays`` under ``key`` atomically; raises ``StoreError`` if writing fails."""
+        """Store ``arrays`` under ``key`` atomically; if writing fails, warn and use the cache no more."""
         path = self.path(key)
         if path is None:
             return
@@ -313,10 +315,12 @@ class FrameCache:
             with filling(path) as file:
                 np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
         except OSError as error:
-            raise StoreError(
-                f"{path.parent}: cannot write the perception cache ({error.strerror or error}); "
-                "free space, choose another cache folder, or set perception.cache = false"
-            ) from error
+            logger.warning(
+                "%s: cannot be written (%s): the run continues without this cache; set SU3D_CACHE to another folder",
+                self._root,
+                error.strerror or error,
+            )
+            self._root = None
 
 
 def _checksum(arrays: Mapping[str, NDArray[Any]]) -> UInt8Array:

@@ -91,7 +91,7 @@ def next_commands(result: RunResult) -> list[str]:
     if not result.is_complete or result.plan.place.url is not None:
         return []
     run = str(result.plan.folder.path)
-    commands = [["report", "html", run, "--out", f"{run}/page.html"]]
+    commands = [["report", "html", run, "--out", f"{run}.html" if result.plan.folder.path.name else "../page.html"]]
     with suppress(Su3dError):  # an unreadable map is reported by the command that reads it
         commands += _query(result, run)
     commands += _numbers(result, run)

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.core.safe_output import doors
+from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 
 ENDING_S = 20.0  # for a worker without a parent to release its resources; Slurm kills a job 30 s after asking it to end
@@ -169,7 +169,7 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
     """The outcome of ``unit`` in this process, as a message for ``unwrap``; raises only ``Terminated``."""
     try:
-        with doors(), one_thread():
+        with doors(), answers_apart(), one_thread():
             return "outcome", work(unit, report)
     except Su3dError as error:
         return "user-error", error

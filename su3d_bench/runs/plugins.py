@@ -19,6 +19,7 @@ from su3d_bench.core import maps, types
 from su3d_bench.core.errors import PlugInError, Su3dError, printable, user_code_line
 from su3d_bench.core.interfaces import ABILITIES, INTERFACES
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.system.files import user_folder
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface
 from su3d_bench.store.predictions import array_fault, prediction_arrays, value_fault
 
@@ -140,6 +141,7 @@ def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> s
 
 # ---- where user-defined datasets and methods return values
 
+LAST_FOLDER = "_su3d_last_folder"  # attribute of an object: the working directory that it changed to
 NUMPY: dict[type, type] = {int: np.integer, bool: np.bool_}  # accepted in place of Python's own types
 
 
@@ -168,7 +170,12 @@ def made(plug_in: type, *words: Any) -> Any:
     if is_built_in(plug_in):
         return plug_in(*words)
     function = plug_in.__init__  # type: ignore[misc]
-    return _called(place_of(plug_in, "__init__", function), plug_in, words, {})
+    last: list[str] = []
+    with user_folder(last, waits=True):
+        built = _called(place_of(plug_in, "__init__", function), plug_in, words, {})
+    with suppress(AttributeError):
+        object.__setattr__(built, LAST_FOLDER, last)
+    return built
 
 
 def checked_dataset(dataset: Any) -> Any:
@@ -218,7 +225,8 @@ def _watched(plug_in: Any, kind: str) -> Any:
 
 def _asked(plug_in: Any, name: str, function: Callable[..., Any], answer: Any, *words: Any, **named: Any) -> Any:
     place = place_of(type(plug_in), name, function)
-    found = _validated(place, _called(place, function, words, named), answer)
+    with user_folder(getattr(plug_in, LAST_FOLDER, [])):
+        found = _validated(place, _called(place, function, words, named), answer)
     if name == "frames":
         return _Frames(place, found)
     if name == "digest" and not found:

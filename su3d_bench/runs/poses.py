@@ -66,7 +66,7 @@ def _remarks(job: SceneJob) -> Remarks:
         if isinstance(dataset, ProvidesUpAxis) and (doubt := dataset.up(job.scene_name).doubt) is not None:
             lines.append(f"{job.scene}: {doubt}")
         return tuple(lines), verdict is not None and verdict.is_wrong
-    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; a scene that cannot be read fails later
+    except BaseException as error:  # noqa: BLE001 - a plug-in may raise anything; a scene that cannot be read fails later
         return (f"{job.scene}: poses and depth could not be checked: {error_line(error)}",), False
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache, lru_cache
 
+from su3d_bench.core.system.signals import is_interrupt
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, resolve_profile
 from su3d_bench.runs.job import ConfiguredMethods, JobInputs, MethodOutcome, Part, SceneJob, build_dataset, stride_of
@@ -39,7 +40,9 @@ class FinishedScenes:
         try:
             with silent():
                 outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, steps, strict=True)]
-        except Exception:  # noqa: BLE001 - a plug-in may raise anything; the worker reports it
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
             return None
         return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 

@@ -16,10 +16,11 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core import interfaces
-from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable
+from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable, user_code_line
 from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.safe_output import one_line
+from su3d_bench.core.system.signals import is_interrupt
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.metrics.compatibility import kind_incompatibility
@@ -49,6 +50,8 @@ logger = logging.getLogger(__name__)
 
 def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, ...]:
     """Outcomes of all methods on one scene, the one of the ceiling last; a failing method does not affect others."""
+    # Frames are read in threads, while a method may be in another working directory.
+    job = replace(job, data_root=job.data_root.absolute(), cache_root=job.cache_root.absolute())
     if job.doubts is None:
         try:
             (job,) = judged([job])
@@ -94,9 +97,9 @@ def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     package.addHandler(log)
     try:
         outcome = scene.run(part, folder, log)
-    except StoreError:
-        raise
-    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the traceback goes to the scene's log
+    except BaseException as error:
+        if is_interrupt(error) or (isinstance(error, StoreError) and not user_code_line(error)):
+            raise
         line = error_line(error)
         name = printable(job.scene)
         line = line if line.startswith(name) else f"{name}: {line}"

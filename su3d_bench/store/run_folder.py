@@ -72,17 +72,8 @@ def check_no_links(top: Path, place: Path) -> None:
     for folder in (place, *place.parents):
         if folder == top:
             return
-        if folder.is_symlink():
+        if os.path.islink(folder):
             raise StoreError(f"{shown(folder)}: is a link, but a run writes only to its own folders; remove the link")
-
-
-def check_not_run_file(place: Path) -> None:
-    """Raise ``StoreError`` if a command would overwrite a file of the run itself."""
-    above = place.absolute().parents
-    is_record = place.name in RECORDS and is_run(above[0])
-    is_of_job = len(above) > 3 and above[2].name == JOBS and is_run(above[3])
-    if (is_record or is_of_job) and os.path.exists(place):
-        raise StoreError(f"{shown(place)}: is a file of the run itself and cannot be replaced; choose another name")
 
 
 def is_run(folder: Path) -> bool:

@@ -274,23 +274,6 @@ def test_json_file_is_written_in_addition_to_the_text(tmp_path: Path, capsys: py
     assert json.loads(capsys.readouterr().out) == json.loads(file.read_text())
 
 
-@pytest.mark.parametrize("name", ["run.json", "metrics.json", "run.toml", "scenes/rooms.living0/opensu3d/done.json"])
-def test_output_never_overwrites_files_of_a_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    file = Path("runs/demo", name)
-    file.parent.mkdir(parents=True)
-    Path("runs/demo/run.toml").write_text("seed = 0\n")
-    file.write_text("{}")
-    for words in (
-        ["query", "text", "rooms/living0", "plant", "--out", str(file)],
-        ["report", "tables", "runs/demo", "--out", str(file)],
-        ["check", "--build-from", "runs/demo", "--out", str(file)],
-        *([["protocols", "list", "--json", str(file)]] if file.suffix == ".json" else []),
-    ):
-        assert main(words) == 2
-        assert "is a file of the run itself" in capsys.readouterr().err
-        assert file.read_text() == "{}"
-
-
 def test_undefined_number_is_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = argparse.Namespace(json=True, json_file=None)
     answer_either(arguments, {"x": [float("nan"), (float("inf"), 1.5)]}, "words")

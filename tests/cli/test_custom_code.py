@@ -46,7 +46,7 @@ def answer(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 # The change to the template, and the message in addition to file and line.
 METHODS = {
     "no Python": ("    def start(", "    def start", "SyntaxError"),
-    "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "exits the program on import"),
+    "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "SystemExit: 0"),
     "no update": ("    def update(", "    def _update(", "'update' is missing; a method has Config, finish, name"),
     "unknown masks": (
         'masks="grounded"',

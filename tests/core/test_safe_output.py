@@ -107,3 +107,17 @@ def test_unread_output_does_not_change_the_exit_code(command: str, code: int, n_
     done = shell(command)
     assert (done.returncode, done.stderr.count("\n")) == (code, n_lines), done.stderr
     assert not n_lines or done.stderr.startswith("su3d-bench: stdout: write error (No space left on device); ")
+
+
+def test_only_the_answer_is_on_stdout() -> None:
+    text = """import os
+from su3d_bench.core.safe_output import answer_stream, answers_apart, doors
+with doors(), answers_apart():
+    print("a")
+    os.write(1, b"b")
+    os.system("echo c")
+    print("answer", file=answer_stream())
+os.write(1, b"end")
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert (done.stdout, sorted(done.stderr.split())) == ("answer\nend", ["a", "bc"])

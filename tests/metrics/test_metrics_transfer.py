@@ -11,11 +11,14 @@ from threadpoolctl import threadpool_info
 
 from su3d_bench.core.maps import Masks, Partition
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.matching import labelling
+from su3d_bench.metrics import graphs
+from su3d_bench.metrics.matching import labelling, votes
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.matching.nearest import (
+    MIN_SORTED_CANDIDATES,
+    Candidates,
     nearest,
     reduce_to_voxels,
     transfer_masks,
@@ -181,3 +184,17 @@ def test_labels_do_not_depend_on_the_block_size() -> None:
     features, text = rng.normal(size=(20_000, 16)).astype(np.float16), rng.normal(size=(9, 16))
     whole = most_similar(features, text)
     assert np.array_equal(whole[15_000:15_100], most_similar(features[15_000:15_100], text))
+
+
+@pytest.mark.parametrize("n", [2_000, MIN_SORTED_CANDIDATES + 5])
+@pytest.mark.parametrize("apart_m", [0.0, 1e-25])
+def test_points_at_one_place_are_searched_once(n: int, apart_m: float) -> None:
+    rng = np.random.default_rng(n)
+    places = np.array([[0.0, 0, 0], [1, 1, 1], [2, 0, 1]])
+    points, queries = places[rng.integers(0, 3, n)], rng.integers(0, 5, (40, 3)) / 2
+    points += apart_m * np.arange(n)[:, None]
+    _, index = nearest(points, queries)
+    assert index.tolist() == brute_force(points, queries).tolist()
+    assert Candidates(points)._tree.n == 3
+    assert votes._Search(points, 5).tree.n == 15
+    assert graphs.Cloud(points)._tree.n == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.core.system.timing import Timer
@@ -113,3 +114,16 @@ def test_excluded_regions_are_encoded_on_later_request(tmp_path: Path) -> None:
     assert later.n_images == len(everything) - n_kept
     fresh = perception(tmp_path / "none", CountingEncoder(), cache=False).detect(still_life(), unfiltered, Timer())
     assert_equal_to_the_bit(cached, fresh)
+
+
+def test_cache_that_cannot_be_written_changes_nothing_and_is_reported_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    without, with_cache = (
+        perception(tmp_path / name, CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
+        for name in ("file", "folder")
+    )
+    assert_equal_to_the_bit(without, with_cache)
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"{tmp_path}/file/perception: cannot be written (Not a directory)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ def test_unfinished_run_is_as_protected_as_a_finished_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
         patch.setattr(scene_run._Scene, "_score", stop)
@@ -157,7 +158,7 @@ def test_killed_replacement_is_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
         nonlocal removed
         removed += 1
         if removed == 2:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         remove(self)
 
     remove = JobFolder.remove

@@ -37,7 +37,7 @@ def test_run_ends_with_pictures_and_next_commands_that_work(capsys: pytest.Captu
     pictures = lines[start + 1].removeprefix("pictures: ").partition(" and ")[0]
     assert Path(pictures).is_file() and lines[start + 1].endswith("more in runs/of mine/scenes/*/*/pictures")
     html, query, compare = commands_in(lines[start + 2 :])
-    assert html == ["report", "html", "runs/of mine", "--out", "runs/of mine/page.html"]
+    assert html == ["report", "html", "runs/of mine", "--out", "runs/of mine.html"]
     assert query[:2] == ["query", "text"] and query[2].endswith("/a")
     assert query[4:] == ["--run", "runs/of mine", "--method", "collector"]
     assert query[3] in {"chair", "sofa", "table", "lamp", "plant", "book", "floor", "wall"}

@@ -1,4 +1,4 @@
-"""Open files for reading: only regular files, otherwise an ``OSError`` at once.
+"""Open files for reading: only regular files, otherwise an ``OSError`` at once; the working directory of user code.
 
 Reading a pipe would wait for ever, and a device such as ``/dev/zero`` has no end. No other module opens a file for
 reading.
@@ -11,9 +11,10 @@ import io
 import os
 import re
 import stat
+import threading
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -24,6 +25,31 @@ KINDS = (
     (stat.S_ISSOCK, "a socket"),
 )
 _NOTED: list[dict[Path, None]] = []
+_USER_CODE = threading.RLock()
+
+
+@contextmanager
+def user_folder(last: list[str], *, waits: bool = False) -> Iterator[None]:
+    """Run user-defined code in the working directory that it ``last`` changed to, and return to our own.
+
+    So relative paths of a command, such as ``--out``, hold whatever a method does. ``last`` is empty, or one path.
+    While another thread is in such a block, this one does nothing or ``waits``.
+    """
+    if not _USER_CODE.acquire(blocking=waits):
+        yield
+        return
+    try:
+        ours = os.getcwd()
+        for folder in last:
+            os.chdir(folder)
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # theirs was removed
+                last[:] = [os.getcwd()]
+            os.chdir(ours)
+    finally:
+        _USER_CODE.release()
 
 
 @contextmanager

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# Sent by Slurm, systemd, CI and `kill`, and by a closed terminal.
-ENDING = (signal.SIGTERM, signal.SIGHUP)
-# A sender of both sends them at once: the second must not interrupt the shutdown that the first began. A later one
-# counts, because an exception may have been lost in a callback.
+# Sent by Slurm, systemd, CI and `kill`, by a closed terminal, and by Ctrl-C.
+ENDING = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+# A sender of the first two sends them at once: the second must not interrupt the shutdown that the first began. A later
+# one counts, because an exception may have been lost in a callback.
 SIGNAL_IGNORE_S = 5.0
 
 
@@ -43,6 +43,8 @@ def ending_in_order() -> Iterator[None]:
         nonlocal heard_s, ended
         if number == signal.SIGHUP:
             _detach_from_terminals()
+        if number == signal.SIGINT:
+            raise Terminated(number)
         if time.monotonic() - heard_s >= SIGNAL_IGNORE_S:
             heard_s, ended = time.monotonic(), number
             raise Terminated(number)
@@ -61,6 +63,15 @@ def ending_in_order() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether the user or a signal ends the process, rather than code that raises the exception of an interrupt itself.
+
+    They cannot be told apart outside ``ending_in_order``, as in a notebook.
+    """
+    is_handled = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    return isinstance(error, Terminated) or (isinstance(error, KeyboardInterrupt) and not is_handled)
 
 
 @contextmanager

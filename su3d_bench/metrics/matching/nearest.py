@@ -110,6 +110,10 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates in memory at once while ties are broken
+MAX_COINCIDENT = (
+    16  # points at one place, up to rounding, beyond which only the first is searched: as exact, and bounded
+)
+COINCIDENT_DECIMALS = 12  # a picometre
 MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting costs more time than it saves
 
 
@@ -127,7 +131,8 @@ class Candidates:
             self._low = np.array([column.min() for column in points.T])  # numpy is slow along short rows
             side_m = max(float(np.ptp(column)) for column in points.T)
             self._cells_a_metre = 32.0 / max(side_m, 1e-9)
-        self._order = self._along_curve(points)
+        self._order = without_crowds(points)
+        self._order = self._order[self._along_curve(points[self._order])]
         self._held = np.asarray(points, np.float64)[self._order]
         self._tree = cKDTree(self._held, balanced_tree=False, compact_nodes=False)
 
@@ -166,6 +171,27 @@ class Candidates:
             for axis in range(3):
                 key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
         return np.argsort(key, kind="stable")
+
+
+def without_crowds(points: Points, n_kept: int = 1) -> Int64Array:
+    """The points, ascending, without all but the first ``n_kept`` of many at one place, which every search would visit.
+
+    >>> len(without_crowds(np.zeros((600, 3)), 2)), len(without_crowds(np.zeros((10, 3))))
+    (2, 10)
+    """
+    every, most = np.arange(len(points)), max(MAX_COINCIDENT, n_kept)
+    rows = np.asarray(np.round(points.astype(np.float64), COINCIDENT_DECIMALS) + 0.0, np.float64)  # no -0.0
+    hashes = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        hashes = (hashes + np.ascontiguousarray(column).view(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+    in_order = np.sort(hashes)
+    suspects = np.flatnonzero(np.isin(hashes, in_order[most:][in_order[most:] == in_order[:-most]]))
+    place = row_ids(rows[suspects])
+    sizes = np.bincount(place)
+    order = np.argsort(place, kind="stable")
+    rank = np.empty(len(place), np.int64)
+    rank[order] = every[: len(place)] - starts_of(sizes)[place[order]]
+    return np.delete(every, suspects[(sizes[place] > most) & (rank >= n_kept)])
 
 
 def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
@@ -249,7 +275,7 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
             offset = candidates[neighbours] - queries[rows][:, None, :]
             squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
             is_nearest = squared == squared.min(axis=1, keepdims=True)
-            answer[rows] = np.where(is_nearest, order[neighbours], len(candidates)).min(axis=1)
+            answer[rows] = np.where(is_nearest, order[neighbours], np.iinfo(np.int64).max).min(axis=1)
             # there may be more ties beyond the last requested neighbour
             unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
         open_rows = np.concatenate(unfinished)

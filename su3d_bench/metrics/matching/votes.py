@@ -22,6 +22,7 @@ from su3d_bench.metrics.matching.nearest import (
     is_remembering,
     remembered,
     row_ids,
+    without_crowds,
 )
 
 _MAX_CELLS = 4_000_000  # neighbours in memory at once
@@ -108,13 +109,17 @@ def _most_votes(votes: Int64Array) -> Int64Array:
 
 
 class _Search:
-    """The ``k`` nearest of a list of points, exact in float64; those that ``search`` finds on ties."""
+    """The ``k`` nearest of a list of points, exact in float64; those that ``search`` finds on ties.
+
+    Of more points at one place than ``MAX_COINCIDENT``, the first k + 1 are searched.
+    """
 
     def __init__(self, points: Points, k: int, search: Search = ball_tree) -> None:
         from scipy.spatial import cKDTree
 
-        self.points = np.asarray(points, np.float64)
         self.k = min(k, len(points))
+        self.rows = without_crowds(points, self.k + 1)
+        self.points = np.asarray(points, np.float64)[self.rows]
         self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
         self.search = search
 
@@ -132,7 +137,7 @@ class _Search:
             indices = indices[:, :k]
             if len(tied):
                 indices[tied] = self.found(queries[tied], k)
-        return distances[:, :k], indices
+        return distances[:, :k], self.rows[indices]
 
 
 def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: float) -> Masks:
@@ -167,6 +172,7 @@ def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Flo
     low, high = own.min(axis=0) - cap_m, own.max(axis=0) + cap_m
     near = along_x[np.searchsorted(x, low[0], "left") : np.searchsorted(x, high[0], "right")]
     near = np.sort(near[((places[near, 1:] >= low[1:]) & (places[near, 1:] <= high[1:])).all(axis=1)])
+    own = own[without_crowds(own)]
     _, own_index = cKDTree(own).query(places[near], distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
     near, own_index = near[own_index < len(own)], own_index[own_index < len(own)]
     offset = own[own_index] - places[near]

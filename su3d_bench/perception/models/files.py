@@ -211,8 +211,9 @@ def file_sha256(path: Path) -> str:
         if content == _note(key, content["sha256"]):
             return str(content["sha256"])
     digest = digest_file(path)
-    make_folder(note.parent)
-    write_json(note, _note(key, digest))
+    with suppress(StoreError):  # it is only computed again
+        make_folder(note.parent)
+        write_json(note, _note(key, digest))
     return digest
 
 
