@@ -115,9 +115,10 @@ def call_timing(arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.pictures.plots import draw_timing
     from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
-    from su3d_bench.runs.finished import read_run, read_update_times
+    from su3d_bench.runs.finished import read_update_times
+    from su3d_bench.runs.verify import read_checked
 
-    runs = [read_run(path) for path in arguments.runs]
+    runs = [read_checked(path) for path in arguments.runs]
     timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
     times = [each for each in timed if each]
     if not times:
