@@ -101,13 +101,12 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
                 yield where, "has no result in metrics.json"
                 continue
             yield from ((where, f"metrics.json: {fault}") for fault in _wrong_claims(run, record, jobs))
-            fault: str | None
             try:
-                results[method, protocol], fault = _recomputed(run, record, scores, perfect)
+                results[method, protocol], contradicts = _recomputed(run, record, scores, perfect)
             except Su3dError as error:
-                fault = str(error)
-            if fault is not None:
-                yield where, fault
+                contradicts = str(error)
+            if contradicts is not None:
+                yield where, contradicts
 
 
 def _map_digest(steps: Mapping[str, CompletionRecord]) -> str | None:
@@ -187,9 +186,9 @@ def _wrong_key(
             stated[name] = settings.get(name, "null")
         if name in stated and text != stated[name] and text not in stated[name].split(" or "):
             yield f"done.json: {name} is {text}, the records of the run say {stated[name]}"
-    for what, text in (("profile", profile), ("encoder_digest", score.get("encoder"))):
-        if text is not None and text not in (getattr(run.record, what) or "").split(", "):
-            yield f"done.json: {what} is {text}, run.json says {getattr(run.record, what)}"
+    for what, own in (("profile", profile), ("encoder_digest", score.get("encoder"))):
+        if own is not None and own not in (getattr(run.record, what) or "").split(", "):
+            yield f"done.json: {what} is {own}, run.json says {getattr(run.record, what)}"
     if score.get("predict") != digest_json(dict(key)):
         yield "done.json: the counts are those of another map"
 
@@ -216,6 +215,8 @@ def _wrong_claims(run: FinishedRun, record: ResultRecord, jobs: Jobs) -> Iterato
     for what, value, own in stated:
         if {*(value or "").split(", " if what != "caveat" else "\n")} - {""} != own - {None, ""}:
             yield f"{what} is {value}, the jobs have {', '.join(sorted(map(str, own)))}"
+    if any(run.protocols[record.protocol].digest not in one["score"].key.values() for one in mine[: len(scored)]):
+        yield f"the rules of {record.protocol} in run.json are not those that scored it"
     if (record.encoder is None) != (record.profile is None):
         yield f"encoder is {record.encoder}, but profile is {record.profile}"
     if not is_ceiling(record.method, record.caveat) and any(_uses_truth(run, record.method, one) for one in profiles):
@@ -260,12 +261,9 @@ def _recomputed(
     known = plain(numbers) | {"ceiling": _metrics(rules, truths), "anytime": early}
     written = plain(stated) | {"ceiling": record.ceiling or {}}
     written |= {"anytime": {f"{point.share:g}": point.metrics for point in record.anytime or ()}}
-    about = (stated.n_scenes, record.version, set(stated.scenes)), (len(counts), rules.version, set(numbers.scenes))
-    fault: str | None = (
-        f"it has {about[0][0]} scenes of version {about[0][1]}, the counts {about[1][0]} of {about[1][1]}"
-    )
-    if about[0] == about[1]:
-        fault = contradiction(written, known, rules.headline)
+    fault = contradiction(written, known, rules.headline)
+    if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
+        fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
     recomputed = replace(
         record,
         kind=rules.kind,

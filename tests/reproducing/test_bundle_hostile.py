@@ -46,11 +46,11 @@ def test_links_are_not_unpacked(tmp_path: Path) -> None:
 
 def test_decompression_bombs_are_rejected(tmp_path: Path) -> None:
     zeros = bytes(200 << 20)
-    entries = {"a": {"n_bytes": len(zeros), "sha256": digest_bytes(zeros)}}
-    manifest = {"schema": 1, "program": "", "recipe": "", "runs": [], "files": entries}
+    entries = {"runs/a/run.json": {"n_bytes": len(zeros), "sha256": digest_bytes(zeros)}}
+    manifest = {"schema": 1, "program": "", "recipe": "", "runs": ["runs/a"], "files": entries}
     with zipfile.ZipFile(tmp_path / "b.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("manifest.json", json.dumps(manifest))
-        archive.writestr("a", zeros)
+        archive.writestr("runs/a/run.json", zeros)
     with pytest.raises(StoreError, match="unpacks to more than 128 MiB"):
         unpack(tmp_path / "b.zip", tmp_path / "into")
 

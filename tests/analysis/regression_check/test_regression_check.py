@@ -67,8 +67,8 @@ def other_option(run: Path) -> None:
 
 
 PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "a metric off by the last bit": (lowered("metrics", "F-mIoU", by=1e-15), "F-mIoU: is worse"),
-    "a class worse": (lowered("per_class", "chair", "IoU"), "class chair / IoU: is worse"),
+    "a point of a class": (lambda run: counted_otherwise(run, 1), "class chair / IoU: is worse"),
+    "a metric raised": (lowered("metrics", "F-mIoU", by=-1e-6), "metrics.json does not follow from the counts"),
     "a scene missing in the run": (in_record(lambda r: r["scenes"].remove("painted/b")), "painted/b: the run does not"),
     "another protocol version": (
         in_record(lambda r: r["protocols"][0].update(version=9)),
@@ -141,15 +141,15 @@ def test_command_exits_with_1_and_writes_reports_for_pull_requests(
     run: Path, reference_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["check", str(run), "--against", str(reference_file)]) == 0
-    lowered("metrics", "mAcc")(run)
+    counted_otherwise(run)
     capsys.readouterr()
     words = ["check", str(run), "--against", str(reference_file), "--github"]
     assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
     shown = capsys.readouterr().out
-    assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
+    assert shown.startswith("failed: ") and "::error title=su3d-bench::" in shown
     assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
     suite = ElementTree.parse(tmp_path / "j.xml").getroot()
-    assert suite.get("failures") == "2" and len(suite.findall("testcase/failure")) == 2
+    assert int(suite.get("failures", 0)) == len(suite.findall("testcase/failure")) > 2
     assert main([*words, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["passed"] is False
 
