@@ -127,7 +127,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"no timings in these runs: {why}")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
-    hardware = {run.name: run.record.hardware for run in runs}
+    hardware = {run.name: run.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
     output.answer_tables(arguments, value, tables)

@@ -32,6 +32,7 @@ from su3d_bench.core.files.atomic import is_file, read_json
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.metric import SceneScore
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 
 MAX_NAMED = 8  # scenes or methods of a run in a message
 MAX_NAME_BYTES = 255  # of a folder's name
+AS_SUBMITTED = "as submitted"  # times that were not measured again
 
 
 def external(formats: Sequence[str]) -> str:
@@ -112,6 +114,12 @@ class FinishedRun:
     @property
     def methods(self) -> tuple[str, ...]:
         return self.record.methods
+
+    @property
+    def hardware(self) -> str:
+        """The machine of the run; its times are only known as submitted if this machine has another processor."""
+        is_here = self.record.processor == processor_digest()
+        return self.record.hardware if is_here else f"{self.record.hardware}; times {AS_SUBMITTED}, not measured here"
 
     @property
     def limit(self) -> int:

@@ -185,7 +185,7 @@ def _wrong_key(
         if name.startswith(("method.", "dataset.", "perception.")) and method in run.methods:
             stated[name] = settings.get(name, "null")
         if name in stated and text != stated[name] and text not in stated[name].split(" or "):
-            yield f"done.json: {name} is {text}, the records of the run say {stated[name]}"
+            yield f"done.json: {name} is {printable(text, 60)}, the run says {printable(stated[name], 60)}"
     for what, own in (("profile", profile), ("encoder_digest", score.get("encoder"))):
         if own is not None and own not in (getattr(run.record, what) or "").split(", "):
             yield f"done.json: {what} is {own}, run.json says {getattr(run.record, what)}"

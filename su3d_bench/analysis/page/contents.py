@@ -160,7 +160,7 @@ def _shown(result: ResultRecord) -> dict[str, Any]:
 def _about(run: FinishedRun) -> dict[str, Any]:
     record = run.record
     of_record = plain(record)
-    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "hardware", "packages", "data_digests")
+    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "packages", "data_digests")
     return {
         "name": run.name,
         "is_partial": record.is_partial,
@@ -169,6 +169,7 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "scenes": run.scenes,
         "methods": run.methods,
         **{key: of_record[key] for key in shared},
+        "hardware": run.hardware,
         "protocols": [{key: rules[key] for key in ("name", "version", "digest")} for rules in of_record["protocols"]],
         "settings": [{"key": ".".join(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
