@@ -216,12 +216,12 @@ def _plain_tables(registry: Registry) -> Table | Prose:
         "values",
         "rank",
         "scenes",
-        "s per frame, as submitted",
+        "s per frame",
         "hardware",
         "weights trained on",
         "bundle",
     )
-    return Table("registry", "All rows, in per cent.", "method", columns, tuple(rows), ())
+    return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
 
 
 def _headline(row: Row) -> str:

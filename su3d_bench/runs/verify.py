@@ -23,7 +23,7 @@ from su3d_bench.core.registry import CEILING_METHOD, base_name
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import combine, combined_metrics, plain_json
+from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, plain_json
 from su3d_bench.predictions.run_predictions import read_stored
 from su3d_bench.reports.tables.model import is_ceiling
 from su3d_bench.runs.existing import existing_run
@@ -38,6 +38,7 @@ from su3d_bench.store.run_folder import JobFolder
 # the protocol: those of the counts are shown.
 CHECKED_FIELDS = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
 MAX_FAULTS = 50  # of a run; records can name millions of scenes and methods without files
+TRUTH_CAVEAT = "its counts are those of the ground truth: a ceiling, not a result"
 Fault = tuple[str, str]  # where (``METHOD / PROTOCOL``, ``METHOD / scene SCENE`` or a file) and what is wrong
 Jobs = dict[tuple[str, str], Mapping[str, CompletionRecord]]  # (scene, method) -> completion records
 Scores = Mapping[str, Mapping[str, SceneScore]]  # protocol -> scene -> counts
@@ -264,8 +265,10 @@ def _recomputed(
     fault = contradiction(written, known, rules.headline)
     if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
         fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
+    is_truth = is_elsewhere and all(_is_same(score, truths[scene]) for scene, score in counts.items())
     recomputed = replace(
         record,
+        caveat=f"{record.caveat}; {TRUTH_CAVEAT}" if is_truth else record.caveat,
         kind=rules.kind,
         headline=rules.headline,
         ceiling=known["ceiling"] or None,
@@ -278,6 +281,12 @@ def _recomputed(
         labels=record.labels if is_elsewhere else labels_counted(rules, by_features=record.encoder is not None),
     )
     return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
+
+
+def _is_same(score: SceneScore, truth: SceneScore | None) -> bool:
+    """Whether two scores have the same counts, whatever their warnings."""
+    same = [None if one is None else pack_scores({one.protocol: replace(one, warnings=())}) for one in (score, truth)]
+    return same[0] == same[1]
 
 
 def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> dict[str, float | None]:
