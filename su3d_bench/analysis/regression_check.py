@@ -402,11 +402,13 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
             Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
             for name, value in expected.metrics.items()
         ]
-    costs, limit = reference.costs, reference.cost_limit
+    costs, limit = {} if examined.faults else reference.costs, reference.cost_limit
     dearer, of_costs = compare_costs(run, costs, reference.calibration_ms, limit)
     findings += [one for one in dearer if is_same_machine or one.kind != "cost"]
-    remarks, methods = [*_remarks(run, reference)], {result.method for result in reference.results}
-    for method in run.methods:
+    methods = {result.method for result in reference.results}
+    remarks = ["costs not checked: the records of the run are not its own"] if examined.faults else []
+    remarks += _remarks(run, reference, has_times=not examined.faults)
+    for method in () if examined.faults else run.methods:
         if method in methods and method not in costs:
             if (reason := no_cost_reason(run, method)) is not None:
                 remarks.append(f"{printable(method, 80)}: cost not checked: it {reason}")
@@ -417,7 +419,7 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
     return Verdict(run.name, tuple(findings), len(numbers), tuple(remarks), shown)
 
 
-def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
+def _remarks(run: FinishedRun, reference: Reference, *, has_times: bool) -> Iterator[str]:
     """Remarks on what was not checked, and why."""
     if run.record.processor != reference.processor:
         here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
@@ -428,7 +430,7 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
             f"{which}: headline values are compared within {100 * reference.machine_tolerance:g} points, scenes and "
             "classes only for presence, costs are not checked"
         )
-    elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
+    elif has_times and (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
     for name, before, now in differing_keys(reference.packages, _numeric_packages(run)) if reference.packages else ():
         yield f"{printable(name, 80)} was {printable(before, 40)}, now {printable(now, 40)}"

@@ -56,7 +56,8 @@ def read_checked(path: Path) -> FinishedRun:
     """The run at ``path`` with the numbers of its counts; ``StoreError`` with the first fault of its records."""
     found = examine(read_run(path))
     for where, fault in found.faults[:1]:
-        raise StoreError(f"{found.run.name}: {where}: {fault}; run its command again")
+        hint = "" if ";" in fault else "; run its command again"
+        raise StoreError(f"{found.run.name}: {where}: {fault}{hint}")
     return found.run
 
 
@@ -121,17 +122,17 @@ def _record_faults(run: FinishedRun) -> Iterator[Fault]:
     """Contradictions between run.json, metrics.json and run.toml."""
     record, metrics, asked = run.record, run.metrics, run.settings
     has_failed = any(failure.method in run.methods for failure in record.failed)
-    for where, value, expected in (
-        ("metrics.json: scenes", metrics.scenes or record.scenes, record.scenes),
-        ("metrics.json: is_partial", metrics.is_partial, metrics.limit > 0),
-        ("run.json: is_partial", record.is_partial, metrics.limit > 0),
-        ("metrics.json: limit", metrics.limit, asked.get(("limit",), 0)),
-        ("metrics.json: seed", metrics.seed, record.seed or 0),
-        ("run.json: seed", record.seed or 0, asked.get(("seed",), 0)),
-        ("run.json: status", record.status, "incomplete" if has_failed else "complete"),
+    for file, what, value, expected in (
+        ("metrics.json", "scenes", metrics.scenes or record.scenes, record.scenes),
+        ("metrics.json", "is_partial", metrics.is_partial, metrics.limit > 0),
+        ("run.json", "is_partial", record.is_partial, metrics.limit > 0),
+        ("metrics.json", "limit", metrics.limit, asked.get(("limit",), 0)),
+        ("metrics.json", "seed", metrics.seed, record.seed or 0),
+        ("run.json", "seed", record.seed or 0, asked.get(("seed",), 0)),
+        ("run.json", "status", record.status, "incomplete" if has_failed else "complete"),
     ):
         if value != expected:
-            yield where, f"is {value}, the other records give {expected}"
+            yield file, f"{what} is {printable(str(value), 80)}, the other records give {printable(str(expected), 80)}"
     existing = existing_run(run.folder.path)
     if existing is None or not existing.is_known:
         yield "run.toml", "is not the file that the run wrote"
@@ -179,6 +180,7 @@ def _wrong_key(
         "stride": str(run.settings.get(("stride",)) or run.settings.get(("method", method, "stride"), 1)),
         "code": run.record.code,
         "profile": str(asked if asked != "auto" else "embedded or paper"),
+        **{f"packages.{name}": version for name, version in run.record.packages.items()},
     }
     if method in run.external:
         stated["predictions"] = digest_json(run.external[method].files.get(scene, {}))
