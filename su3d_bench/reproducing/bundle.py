@@ -32,7 +32,8 @@ from su3d_bench.reproducing.differences import Results, compared_all, compared_j
 from su3d_bench.reproducing.recipe import parse_recipe
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.verify import examine
-from su3d_bench.store.run_folder import JOBS, RECORDS
+from su3d_bench.store.records import RunRecord, checked
+from su3d_bench.store.run_folder import JOBS, RECORDS, folder_of_scene
 
 MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.json", "tables.md"
 RUNS = "runs"
@@ -182,6 +183,9 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
             allowance = atomic.allowance_of(archive)
             manifest = _manifest(atomic.member_bytes(archive, members[MANIFEST], allowance), where)
             _check_no_others(members, manifest, where)
+            for run in manifest.runs:
+                content = atomic.member_bytes(archive, members[f"{run}/run.json"], atomic.allowance_of(archive))
+                _check_jobs(run, content, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
     except OSError as error:
@@ -247,13 +251,28 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
     for name in manifest.runs:
         if not is_safe(name) or name.count("/") != 1 or f"{name}/run.json" not in manifest.files:
             raise StoreError(f"{where}: its manifest names the run '{printable(name, 100)}', but has no run.json of it")
+    if not manifest.runs:
+        raise StoreError(f"{where}: contains no runs; create a bundle with: su3d-bench report bundle RUN")
     known = set(manifest.runs)
     if len(known) < len(manifest.runs):
         raise StoreError(f"{where}: its manifest names a run twice; create it again with su3d-bench report bundle RUN")
-    for name in named - {MANIFEST, RECIPE, COMPARED, TABLES}:
+    for name in named - {MANIFEST, *((RECIPE, COMPARED, TABLES) if RECIPE in named else ())}:
         run, file = "/".join(name.split("/")[:2]), "/".join(name.split("/")[2:])
-        if run not in known or not _FILE_OF_RUN.fullmatch(file):
-            raise StoreError(f"{where}: '{printable(name, 120)}' belongs to no run of its manifest")
+        if run not in known or not _FILE_OF_RUN.fullmatch(file) or not manifest.files[name].n_bytes:
+            raise StoreError(f"{where}: '{printable(name, 120)}' belongs to no run of its manifest, or is empty")
+
+
+def _check_jobs(run: str, content: bytes, manifest: Manifest, where: str) -> None:
+    """Raise ``StoreError`` if the manifest has files of jobs that run.json, with this content, does not name."""
+    try:
+        record = checked(RunRecord, atomic.json_value(content.decode()))
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{where}: {run}/run.json is invalid for a bundle") from error
+    scenes, methods = set(map(folder_of_scene, record.scenes)), {*record.methods, CEILING_METHOD}
+    for name in manifest.files:
+        parts = name.split("/")
+        if name.startswith(f"{run}/{JOBS}/") and not (parts[3] in scenes and parts[4] in methods):
+            raise StoreError(f"{where}: '{printable(name, 120)}' belongs to no scene and method of its run.json")
 
 
 def _unpack_one(
@@ -272,7 +291,7 @@ def _unpack_one(
     place = Path(os.devnull)
     if into is not None:
         place = into / info.filename
-        make_folder(place.parent)
+        place.parent.mkdir(parents=True, exist_ok=True)
     with archive.open(info) as member, place.open("wb" if into is None else "xb") as out:
         digest = copy_pieces(member, out)
     if digest != entry.sha256:

@@ -405,8 +405,6 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
     place = file if is_there else _place(registry, file, rows, name)
     found = Added(printable(file.name, 120), printable(str(place), 300), len(rows))
     reasons = [f"{one.what}: {one.reason}" for one in refused]
-    if not rows and not refused:
-        reasons.append("contains no runs; create a bundle with: su3d-bench report bundle RUN")
     reasons = reasons or list(_beside(rows, others, before))
     if not reasons and not is_there and os.path.lexists(place):
         reasons.append(f"{printable(place.name, 120)} is taken by another bundle; choose another with --name")

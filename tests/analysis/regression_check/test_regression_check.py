@@ -12,12 +12,14 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from painted_runs import painted_run
+from painted_runs import painted_run, see_painted
 from reference_runs import (
     counted_otherwise,
     edit,
+    in_metrics,
     in_record,
     lowered,
+    record,
     results_in,
     slower,
     timed,
@@ -86,6 +88,15 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
         "collector / scene painted/a: prediction.npz is missing",
     ),
     "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
+    "other weights": (
+        in_record(lambda r: r["models"].update(sam={"w.pt": "0" * 64})),
+        "weights: sam/w.pt was not set, now 000000000000...",
+    ),
+    "more scenes claimed": (
+        in_metrics(lambda m: m["results"][0]["result"].update(n_scenes=9)),
+        "it has 9 scenes of version 2, the counts 2",
+    ),
+    "a partial run": (in_record(lambda r: r.update(is_partial=True)), "run.json: is_partial is True"),
     "an additional scene": (
         in_record(lambda r: r["scenes"].append("painted/c")),
         "run / scene painted/c: the reference does not have this scene",
@@ -101,6 +112,19 @@ def test_a_planted_regression_is_caught(
     plant(run)
     assert main(["check", str(run), "--against", str(reference_file)]) == 1
     assert printed in capsys.readouterr().out
+
+
+def test_maps_are_scored_again_on_request(
+    run: Path, reference_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    see_painted(monkeypatch)
+    words = ["check", str(run), "--against", str(reference_file)]
+    assert main([*words, "--recompute"]) == 0
+    shutil.copy(run / "scenes/painted.b/collector/prediction.npz", run / "scenes/painted.a/collector/prediction.npz")
+    record(run)
+    assert main(words) == 0
+    assert main([*words, "--recompute"]) == 1
+    assert "painted/a by collector: its counts do not match its map" in capsys.readouterr().out
 
 
 def test_duplicate_protocols_or_results_are_an_error(
