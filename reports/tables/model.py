@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.registry import CEILING_METHOD, base_name
 from su3d_bench.core.types import Interval
 from su3d_bench.numerics.statistics import FEW_SCENES, SignFlipTest
 
@@ -60,7 +60,7 @@ def _listing(whose: Mapping[str, Iterable[str]]) -> str:
 
 def is_ceiling(method: str, caveat: str | None) -> bool:
     """Whether a row uses ground truth, so that it is not ranked."""
-    return method == CEILING_METHOD or "a ceiling, not a result" in (caveat or "")
+    return base_name(method) == CEILING_METHOD or "a ceiling, not a result" in (caveat or "")
 
 
 def label_count_notes(labels: Mapping[str, str | None]) -> list[str]:

@@ -28,8 +28,9 @@ from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, plain_json
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import with_visible_truth
+from su3d_bench.runs.verify import read_checked
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # ground-truth variant -> ground truth
@@ -265,11 +266,11 @@ def attribute(
 
     ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the 2D mask stage.
     """
-    run = read_run(path)
+    run = read_checked(path)
     explained = explained_of(run, method_of(run, method), protocols)
     other = None
     if oracle is not None:
-        other = Side(read_run(oracle), explained.method)
+        other = Side(read_checked(oracle), explained.method)
         if other.run.record.profile != "oracle":
             raise ConfigError(
                 f"{other.run.name}: has the profile '{printable(str(other.run.record.profile), 60)}'; --oracle takes a "

@@ -22,7 +22,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, remarks_starting
 from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics import statistics
-from su3d_bench.runs.finished import read_run
+from su3d_bench.runs.verify import read_checked
 
 SCHEMA = 2
 
@@ -347,7 +347,7 @@ def plan(
             raise ConfigError(f"--points {value:g}: expected a percentage above 0 and at most 100")
     if not 0.05 < power < 1:
         raise ConfigError(f"--power {power:g}: expected a probability above 0.05 and below 1, such as 0.8")
-    read = [read_run(path) for path in dict.fromkeys(runs)]
+    read = [read_checked(path) for path in dict.fromkeys(runs)]
     first = read[0]
     pair = tuple(methods) or first.methods
     if len(pair) != 2 or pair[0] == pair[1]:

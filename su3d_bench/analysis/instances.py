@@ -30,7 +30,8 @@ from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.pictures.maps import names_of
 from su3d_bench.reports.tables.instances import InstanceRow
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.verify import read_checked
 
 MAX_NAME_CHARACTERS = 200  # characters of a text in a cell
 THRESHOLDS = (0.25, 0.5)
@@ -66,7 +67,7 @@ def instance_rows(
     """
     rows: list[InstanceRow] = []
     remarks: list[str] = []
-    for run in map(read_run, paths):
+    for run in map(read_checked, paths):
         methods = _chosen_methods(run, chosen, remarks)
         scenes = tuple(chosen.scenes) or run.scenes
         for n, (scene, found) in enumerate(matched_instances(run, methods, scenes), start=1):

@@ -24,11 +24,10 @@ from su3d_bench.core.files.locks import is_locked
 from su3d_bench.core.types import Interval
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
 from su3d_bench.metrics.protocols.loading import protocol_names
-from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.verify import count_mismatch, rules_of_run
+from su3d_bench.runs.verify import examine
 from su3d_bench.store.records import MetricsRecord, RunRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
 
@@ -144,42 +143,35 @@ def runs_below(folder: Path) -> Iterator[Path]:
 
 def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[RankingRow | Refused]:
     """Each number of ``run``, called ``name``, that can be ranked, or why not; for ``protocols`` or all."""
-    for (method, protocol), record in run.results.items():
+    found = examine(run)
+    faults = dict(reversed(found.faults))  # the first of each place
+    places = {key: printable(" / ".join(key), 200) for key in run.results}
+    if others := [fault for fault in found.faults if fault[0] not in places.values()]:
+        yield Refused(name, *others[0])
+        return
+    for (method, protocol), record in found.run.results.items():
         if protocols and protocol not in protocols:
             continue
-        what = f"{printable(method, 80)} / {printable(protocol, 80)}"
-        if reason := _exclusion_reason(run, protocol, record.failed):
-            yield Refused(name, what, reason)
+        what, result = places[method, protocol], record.result
+        reason = _exclusion_reason(run, protocol, record.failed) or faults.get(what)
+        if reason or result is None:
+            yield Refused(name, what, reason or "was not scored")
             continue
-        try:
-            rules = rules_of_run(run, protocol)
-            scores = run.scores(method).get(protocol, {})
-            if reason := count_mismatch(run, method, protocol, scores):
-                yield Refused(name, what, printable(reason, 300))
-                continue
-            result = combine(rules, scores)
-        except Su3dError as error:
-            yield Refused(name, what, printable(str(error), 300))
-            continue
-        recomputed = result.to_json()
-        unknown = [scene for scene in result.scenes if scene not in run.record.data_digests]
-        if unknown:
-            yield Refused(name, what, f"no data digest of {printable(unknown[0], 80)}")
-            continue
+        scenes = sorted(result.scenes)
         yield RankingRow(
             run=name,
             method=printable(method, 120),
             protocol=protocol,
             version=result.version,
-            digest=rules.digest,
+            digest=run.protocols[protocol].digest,
             headline=result.headline,
-            values=tuple(recomputed["metrics"].get(key) for key in result.headline),
+            values=tuple(result.metrics.get(key) for key in result.headline),
             intervals=tuple(result.intervals.get(key) for key in result.headline),
-            of_scenes=tuple(recomputed["per_scene"][scene][result.headline[0]] for scene in sorted(result.scenes)),
-            data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
-            profile=ELSEWHERE if method in run.external else printable(run.record.profile or "", 40),
+            of_scenes=tuple(result.per_scene[scene][result.headline[0]] for scene in scenes),
+            data=tuple((scene, run.record.data_digests[scene]) for scene in scenes),
+            profile=ELSEWHERE if method in run.external else printable(record.profile or "", 40),
             confidences=None if record.confidences is None else printable(record.confidences, 80),
-            labels=run.labels(method, protocol, rules),
+            labels=record.labels,
             is_ceiling=is_ceiling(method, record.caveat),
         )
 

@@ -16,7 +16,9 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from su3d_bench.analysis.rescoring import rescored
 from su3d_bench.core.config import NEUTRAL_SETTINGS
+from su3d_bench.core.digests import NUMERIC_PACKAGES
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable
 from su3d_bench.core.files.atomic import read_json
@@ -24,7 +26,7 @@ from su3d_bench.metrics.costs import MAP, WARM_UP, UpdateTimes
 from su3d_bench.metrics.protocols.kinds import GroundingRules, PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.regression_check import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.runs.verify import wrong_files
+from su3d_bench.runs.verify import examine
 from su3d_bench.store.records import ROUNDING, NumbersRecord, ResultRecord
 
 # If the calibration workload takes this many times the reference's time on the same kind of processor, other processes
@@ -205,7 +207,7 @@ class Reference(_Model):
     """What a run is compared with; ``costs``: per method, in units of the calibration workload.
 
     ``processor``: digest of the processor's kind; byte-equality is only promised on one kind. ``calibration_ms``: time
-    of the calibration workload.
+    of the calibration workload. ``weights``: see ``weights_of``; None in references of earlier versions.
     """
 
     schema_version: Literal[2]
@@ -216,6 +218,8 @@ class Reference(_Model):
     cost_limit: float = Field(gt=1, le=MAX_COST_LIMIT)
     limit: int = Field(ge=0)
     settings: dict[str, str]
+    weights: dict[str, str] | None = None
+    packages: dict[str, str] = {}
     data_digests: dict[str, str] = Field(min_length=1)
     protocols: dict[str, ProtocolKey] = Field(min_length=1)
     results: tuple[MethodResult, ...] = Field(min_length=1)
@@ -258,9 +262,13 @@ def learn(
             raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
         if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
             raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
-        for where, fault in wrong_files(run):
-            raise ConfigError(f"{run.name}: {where}: {fault}; run its command again")
-    tables = [run.results for run in runs]
+        if weights_of(run) != weights_of(first):
+            raise ConfigError(f"{run.name}: has other weights than {first.name}; learn from repeats of one run")
+    examined = [examine(run, with_maps=True) for run in runs]
+    for one in examined:
+        for where, fault in one.faults[:1]:
+            raise ConfigError(f"{one.run.name}: {where}: {fault}; run its command again")
+    tables = [one.run.results for one in examined]
     if any(set(table) != set(tables[0]) for table in tables):
         raise ConfigError(f"{first.name}: the runs have different methods or protocols; learn from repeats of one run")
     known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in first.methods}
@@ -274,6 +282,8 @@ def learn(
         cost_limit=cost_limit,
         limit=first.limit,
         settings=settings_of(first),
+        weights=weights_of(first),
+        packages=_numeric_packages(first),
         data_digests=dict(first.record.data_digests),
         protocols={name: ProtocolKey(version=key.version, digest=key.digest) for name, key in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
@@ -325,6 +335,20 @@ def settings_of(run: FinishedRun) -> dict[str, str]:
     return {key: value for key, value in sorted(keys.items()) if key not in NOT_COMPARED}
 
 
+def weights_of(run: FinishedRun) -> dict[str, str]:
+    """SHA-256 of every weight file that the run recorded, and of the other files that its methods read."""
+    weights = {f"{model}/{name}": sha for model, files in run.record.models.items() for name, sha in files.items()}
+    for job in run.folder.jobs():
+        step = job.completion_records().get("predict")
+        inputs = {} if step is None else step.key
+        weights |= {f"{job.path.name}/{name}": sha for name, sha in inputs.items() if name.startswith("input.")}
+    return weights
+
+
+def _numeric_packages(run: FinishedRun) -> dict[str, str]:
+    return {name: version for name, version in run.record.packages.items() if name in NUMERIC_PACKAGES}
+
+
 def differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
     """Each key that differs, with its old and new value."""
     for key in [*before, *(key for key in now if key not in before)]:
@@ -348,12 +372,18 @@ HIGHER_IS_BETTER = frozenset(
 )  # fmt: skip
 
 
-def check(run: FinishedRun, reference: Reference) -> Verdict:
-    """Everything in which ``run`` differs from ``reference``, both failures and improvements."""
+def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) -> Verdict:
+    """Everything in which the counts of ``run`` differ from ``reference``, both failures and improvements.
+
+    ``recompute``: also score its maps again and compare these scores with its counts.
+    """
     is_same_machine = run.record.processor == reference.processor
-    findings = [*_identity(run, reference)]
-    findings += [Finding("changed", where, fault) for where, fault in wrong_files(run)]
-    table = run.results
+    findings, examined = [*_identity(run, reference)], examine(run, with_maps=True)
+    findings += [Finding("changed", where, fault) for where, fault in examined.faults]
+    if recompute and not examined.faults:
+        faults = (one.fault for one in rescored(run))
+        findings += [Finding("changed", "maps", fault) for fault in faults if fault is not None]
+    table = examined.run.results
     across = None if is_same_machine else reference.machine_tolerance
     numbers: list[Compared] = []
     for expected in reference.results:
@@ -372,11 +402,13 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
             Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
             for name, value in expected.metrics.items()
         ]
-    costs, limit = reference.costs, reference.cost_limit
+    costs, limit = {} if examined.faults else reference.costs, reference.cost_limit
     dearer, of_costs = compare_costs(run, costs, reference.calibration_ms, limit)
     findings += [one for one in dearer if is_same_machine or one.kind != "cost"]
-    remarks, methods = [*_remarks(run, reference)], {result.method for result in reference.results}
-    for method in run.methods:
+    methods = {result.method for result in reference.results}
+    remarks = ["costs not checked: the records of the run are not its own"] if examined.faults else []
+    remarks += _remarks(run, reference, has_times=not examined.faults)
+    for method in () if examined.faults else run.methods:
         if method in methods and method not in costs:
             if (reason := no_cost_reason(run, method)) is not None:
                 remarks.append(f"{printable(method, 80)}: cost not checked: it {reason}")
@@ -387,7 +419,7 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
     return Verdict(run.name, tuple(findings), len(numbers), tuple(remarks), shown)
 
 
-def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
+def _remarks(run: FinishedRun, reference: Reference, *, has_times: bool) -> Iterator[str]:
     """Remarks on what was not checked, and why."""
     if run.record.processor != reference.processor:
         here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
@@ -398,8 +430,10 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
             f"{which}: headline values are compared within {100 * reference.machine_tolerance:g} points, scenes and "
             "classes only for presence, costs are not checked"
         )
-    elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
+    elif has_times and (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
+    for name, before, now in differing_keys(reference.packages, _numeric_packages(run)) if reference.packages else ():
+        yield f"{printable(name, 80)} was {printable(before, 40)}, now {printable(now, 40)}"
     yield from run.elsewhere_lines()
     known = {result.method for result in reference.results}
     others = [*(method for method in run.methods if method not in known)]
@@ -424,6 +458,9 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
         yield _changed("run", "limit", reference.limit, run.limit)
     for key, before, now in differing_keys(reference.settings, settings_of(run)):
         yield _changed("settings", key, before, now)
+    for key, before, now in differing_keys(reference.weights or {}, weights_of(run)):
+        if reference.weights is not None:
+            yield _changed("weights", key, before, now)
     for scene, digest in reference.data_digests.items():
         if scene not in run.scenes:
             yield Finding("missing", printable(scene, 80), "the run does not have this scene", group=SCENES)

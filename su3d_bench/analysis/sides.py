@@ -18,6 +18,7 @@ from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
 from su3d_bench.numerics.statistics import leave_one_out
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.verify import read_checked
 
 # Settings that do not change any number of a common scene.
 _SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | NEUTRAL_SETTINGS
@@ -48,12 +49,12 @@ class Side:
 def parse_side(text: str, method: str | None) -> tuple[tuple[FinishedRun, ...], str | None]:
     """The runs of ``FOLDER`` or ``FOLDER,FOLDER``, and the method if it is named after a colon or by ``method``."""
     if folders := _folders(text):
-        return tuple(map(read_run, folders)), method
+        return tuple(map(read_checked, folders)), method
     before, colon, name = text.rpartition(":")
     if colon and (folders := _folders(before)):
         if method is not None and method != name:
             raise ConfigError(f"{printable(text, 200)}: names the method '{name}', but --method is '{method}'")
-        return tuple(map(read_run, folders)), name
+        return tuple(map(read_checked, folders)), name
     for path in (Path(text), Path(before)):
         if path.is_file():
             read_run(path)  # its error says what the file is

@@ -30,6 +30,7 @@ from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.ablation import read_rows
 from su3d_bench.runs.finished import FinishedRun, is_scores_file, read_run
 from su3d_bench.runs.summary import found_in, without_score
+from su3d_bench.runs.verify import read_checked
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 MAX_SOURCE_BYTES, MAX_SOURCES = 1 << 24, 500  # of a paper's LaTeX
@@ -45,7 +46,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
     Raises ``ConfigError`` if data, rules or encoder of two runs differ.
     """
     paths = dict.fromkeys(folders)
-    runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
+    runs = {str(folder): read_checked(folder) for folder in paths if not is_scores(folder)}
     measured = [row for path in paths if is_scores(path) for row in _annotated_rows(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
@@ -249,7 +250,7 @@ class _Recomputed:
 
     def _run(self, name: str) -> FinishedRun:
         if name not in self._runs:
-            self._runs[name] = read_run(self._place(name, lambda place: is_file(place / "run.json")))
+            self._runs[name] = read_checked(self._place(name, lambda place: is_file(place / "run.json")))
         return self._runs[name]
 
     def _place(self, name: str, is_it: Callable[[Path], bool]) -> Path:

@@ -149,10 +149,10 @@ class Run(Scores):
     """
 
     def __init__(self, path: Place, remarks: Sequence[str] = ()) -> None:
-        from su3d_bench.runs.finished import read_run
+        from su3d_bench.runs.verify import read_checked
         from su3d_bench.store.records import MetricsRecord
 
-        run: FinishedRun = read_run(Path(path))
+        run: FinishedRun = read_checked(Path(path))
         results = tuple(run.results.values())
         super().__init__(
             MetricsRecord(is_partial=run.record.is_partial, limit=run.limit, scenes=run.scenes, results=results),

@@ -22,6 +22,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "check", call_check)
     parser.option("runs [RUN...]", "run to check")
     parser.option("--against FILE", "reference file")
+    parser.option("--recompute", "also score the maps again (slower)")
     parser.option("--build-from RUN...", "repetitions of one run to build the reference from")
     parser.option("--out FILE", "reference file that --build-from writes", type=output_path)
     parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --build-from)", type=float)
@@ -72,8 +73,10 @@ def _learn(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.files.atomic import json_text
     from su3d_bench.runs.finished import read_run
 
-    if arguments.runs or arguments.against or arguments.out is None:
-        raise ConfigError("check: --build-from takes the runs and needs --out FILE, without RUN and --against")
+    if arguments.runs or arguments.against or arguments.recompute or arguments.out is None:
+        raise ConfigError(
+            "check: --build-from takes the runs and needs --out FILE, without RUN, --against and --recompute"
+        )
     cost_limit = COST_LIMIT if arguments.cost_limit is None else arguments.cost_limit
     across = ACROSS_MACHINES if arguments.machine_tolerance is None else arguments.machine_tolerance / 100
     if not 1 < cost_limit <= MAX_COST_LIMIT or not 0 <= across <= 1:
@@ -106,7 +109,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.tables.formats import plain
     from su3d_bench.runs.finished import read_run
 
-    verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
+    verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against), recompute=arguments.recompute)
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
         if path is not None:
             output.written(path, text(verdict))

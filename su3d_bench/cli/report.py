@@ -115,9 +115,10 @@ def call_timing(arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.pictures.plots import draw_timing
     from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
-    from su3d_bench.runs.finished import read_run, read_update_times
+    from su3d_bench.runs.finished import read_update_times
+    from su3d_bench.runs.verify import read_checked
 
-    runs = [read_run(path) for path in arguments.runs]
+    runs = [read_checked(path) for path in arguments.runs]
     timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
     times = [each for each in timed if each]
     if not times:
@@ -126,7 +127,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"no timings in these runs: {why}")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
-    hardware = {run.name: run.record.hardware for run in runs}
+    hardware = {run.name: run.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
     output.answer_tables(arguments, value, tables)

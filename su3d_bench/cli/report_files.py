@@ -130,12 +130,13 @@ def call_bundle(arguments: argparse.Namespace) -> None:
     su3d-bench report bundle runs/my-run --out my-run.zip
     su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip
     """
+    from su3d_bench.analysis.rescoring import check_dataset_ground_truth
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.reproducing.bundle import bundle_runs, check_dataset_ground_truth, check_no_custom_code, is_bundle
-    from su3d_bench.runs.finished import read_run
+    from su3d_bench.reproducing.bundle import bundle_runs, check_no_custom_code, is_bundle
+    from su3d_bench.runs.verify import read_checked
 
     for path in arguments.runs:
-        run = read_run(path)
+        run = read_checked(path)
         check_no_custom_code(run)
         check_dataset_ground_truth(run)
     place = arguments.out or Path(f"{arguments.runs[0].resolve().name}.zip")

@@ -52,6 +52,11 @@ TEXT_CLASS_ATTRS: dict[str, type] = {"name": str, "label_space": str, "variants"
 MIN_SIMILARITY = 0.84  # of a name to the intended one: a letter missing, added, changed or in the wrong place
 
 
+def base_name(method: str) -> str:
+    """The name of a method without its variant: ``opensu3d`` of ``opensu3d@top_m=1``."""
+    return method.partition("@")[0]
+
+
 def names(kind: str) -> list[str]:
     """All names of ``kind`` (``dataset`` or ``method``) that can be used without a path."""
     known = list(BUILT_IN[kind])

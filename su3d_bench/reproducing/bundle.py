@@ -7,43 +7,33 @@ on every machine. Predictions are already compressed.
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import re
 import stat
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import IO, Annotated, Any, Literal
+from typing import IO, Annotated, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from su3d_bench.analysis.rescoring import TOLERANCE, check_dataset_ground_truth, rescored
 from su3d_bench.core import registry
-from su3d_bench.core.config import NEUTRAL_SETTINGS, Setting, Settings
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
 from su3d_bench.core.files import atomic
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.safe_output import escaped_json
-from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes, opened, regular
-from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.core.version import __version__
-from su3d_bench.evaluation.evaluate import evaluate
-from su3d_bench.evaluation.result import Request
-from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.scoring import pack_scores
 from su3d_bench.reproducing.differences import Results, compared_all, compared_json
 from su3d_bench.reproducing.recipe import parse_recipe
-from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
-from su3d_bench.runs.job import SceneJob
-from su3d_bench.runs.plan import make_plan
-from su3d_bench.runs.scene import scores_again
-from su3d_bench.runs.verify import wrong_files
-from su3d_bench.store.run_folder import RECORDS, RunFolder
+from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.verify import examine
+from su3d_bench.store.records import RunRecord, checked
+from su3d_bench.store.run_folder import JOBS, RECORDS, folder_of_scene
 
 MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.json", "tables.md"
 RUNS = "runs"
@@ -55,6 +45,11 @@ MAX_REMARK_CHARACTERS = 400  # characters
 PIECE = 1 << 20
 _JOB_OPTIONS = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz"
                        r"|counts\.npz|updates\.csv|log\.txt|done\.json|refined_names\.json")  # fmt: skip
+_FILE_OF_RUN = re.compile(
+    f"{'|'.join(map(re.escape, RECORDS))}|language/.+|{JOBS}/[^/]+/[^/]+/({_JOB_OPTIONS.pattern})"
+)
+MAX_HEADER_BYTES = 160  # of a member beside its content and its two names, and at the end of the archive
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the first line of the specification's pointer files
 _SAFE = re.compile(r"[^/\\:\x00-\x1f\x7f]+(/[^/\\:\x00-\x1f\x7f]+)*")
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -144,8 +139,10 @@ def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
 def _files_of(folder: Path) -> Iterator[Path]:
     """The files of a run that go into a bundle: records, maps, counts, times and replies of language models."""
     yield from (folder / name for name in RECORDS if is_file(folder / name))
-    for job in RunFolder(folder).jobs():
-        yield from sorted(file for file in job.path.iterdir() if is_file(file) and _JOB_OPTIONS.fullmatch(file.name))
+    run = read_run(folder)
+    for job in (run.folder.job(scene, method) for scene in run.scenes for method in {*run.methods, CEILING_METHOD}):
+        files = job.path.iterdir() if job.path.is_dir() else ()
+        yield from sorted(file for file in files if is_file(file) and _JOB_OPTIONS.fullmatch(file.name))
     yield from sorted(file for file in (folder / "language").rglob("*") if is_file(file) and not file.is_symlink())
 
 
@@ -169,16 +166,26 @@ class Unpacked:
 def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: True) -> Unpacked:
     """Unpack ``bundle`` into the empty folder ``into``; all files are checked, only those with ``keep(name)`` written.
 
-    Raises ``StoreError`` if it is not a bundle, a name leads out of the folder, a file differs from the manifest, is
-    missing or not listed there, or the files are far larger than the archive.
+    Raises ``StoreError`` if it is not a bundle but a link or anything else, a name leads out of the folder, a file
+    differs from the manifest, is missing, not listed there or belongs to no run, or the files are far larger than the
+    archive.
     """
     where = shown(bundle)
     try:
+        with opened(bundle) as stream:
+            if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+                raise StoreError(f"{where}: is a Git LFS pointer, not the bundle itself; get it with: git lfs pull")
+        if bundle.is_symlink():
+            raise StoreError(f"{where}: is a link; give or copy the bundle itself")
         with zipfile.ZipFile(regular(bundle)) as archive:
             members = _members(archive, where)
+            _check_only_members(archive, bundle.stat().st_size, where)
             allowance = atomic.allowance_of(archive)
             manifest = _manifest(atomic.member_bytes(archive, members[MANIFEST], allowance), where)
             _check_no_others(members, manifest, where)
+            for run in manifest.runs:
+                content = atomic.member_bytes(archive, members[f"{run}/run.json"], atomic.allowance_of(archive))
+                _check_jobs(run, content, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
     except OSError as error:
@@ -207,6 +214,14 @@ def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]
     return {info.filename: info for info in members.values()}
 
 
+def _check_only_members(archive: zipfile.ZipFile, n_bytes: int, where: str) -> None:
+    """Raise ``StoreError`` if the archive has bytes before, between or after its members."""
+    infos = archive.infolist()
+    n_own = sum(info.compress_size + 2 * len(info.filename.encode()) + MAX_HEADER_BYTES for info in infos)
+    if min(info.header_offset for info in infos) > 0 or n_bytes > n_own + MAX_HEADER_BYTES:
+        raise StoreError(f"{where}: has data outside its files; create it again with su3d-bench report bundle RUN")
+
+
 def is_safe(name: str) -> bool:
     """Whether a name is a file below the folder that it is unpacked into, on every system.
 
@@ -219,9 +234,11 @@ def is_safe(name: str) -> bool:
 
 def _manifest(content: bytes, where: str) -> Manifest:
     try:
+        atomic.json_value(content.decode())
         return Manifest.model_validate_json(content)
-    except ValidationError as error:
-        key = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
+    except (ValueError, RecursionError) as error:
+        places = error.errors()[0]["loc"] if isinstance(error, ValidationError) else ()
+        key = printable(".".join(map(str, places)), 120)
         raise StoreError(f"{where}: {MANIFEST}: {key or 'content'} is invalid for a bundle") from error
 
 
@@ -232,8 +249,30 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
         if names:
             raise StoreError(f"{where}: {counted(len(names), 'file')} {what}, such as {printable(min(names), 120)}")
     for name in manifest.runs:
-        if not is_safe(name) or f"{name}/run.json" not in manifest.files:
+        if not is_safe(name) or name.count("/") != 1 or f"{name}/run.json" not in manifest.files:
             raise StoreError(f"{where}: its manifest names the run '{printable(name, 100)}', but has no run.json of it")
+    if not manifest.runs:
+        raise StoreError(f"{where}: contains no runs; create a bundle with: su3d-bench report bundle RUN")
+    known = set(manifest.runs)
+    if len(known) < len(manifest.runs):
+        raise StoreError(f"{where}: its manifest names a run twice; create it again with su3d-bench report bundle RUN")
+    for name in named - {MANIFEST, *((RECIPE, COMPARED, TABLES) if RECIPE in named else ())}:
+        run, file = "/".join(name.split("/")[:2]), "/".join(name.split("/")[2:])
+        if run not in known or not _FILE_OF_RUN.fullmatch(file) or not manifest.files[name].n_bytes:
+            raise StoreError(f"{where}: '{printable(name, 120)}' belongs to no run of its manifest, or is empty")
+
+
+def _check_jobs(run: str, content: bytes, manifest: Manifest, where: str) -> None:
+    """Raise ``StoreError`` if the manifest has files of jobs that run.json, with this content, does not name."""
+    try:
+        record = checked(RunRecord, atomic.json_value(content.decode()))
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{where}: {run}/run.json is invalid for a bundle") from error
+    scenes, methods = set(map(folder_of_scene, record.scenes)), {*record.methods, CEILING_METHOD}
+    for name in manifest.files:
+        parts = name.split("/")
+        if name.startswith(f"{run}/{JOBS}/") and not (parts[3] in scenes and parts[4] in methods):
+            raise StoreError(f"{where}: '{printable(name, 120)}' belongs to no scene and method of its run.json")
 
 
 def _unpack_one(
@@ -252,7 +291,7 @@ def _unpack_one(
     place = Path(os.devnull)
     if into is not None:
         place = into / info.filename
-        make_folder(place.parent)
+        place.parent.mkdir(parents=True, exist_ok=True)
     with archive.open(info) as member, place.open("wb" if into is None else "xb") as out:
         digest = copy_pieces(member, out)
     if digest != entry.sha256:
@@ -266,16 +305,6 @@ def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
         digest.update(piece)
         out.write(piece)
     return digest.hexdigest()
-
-
-TOLERANCE = 1e-9  # of a value computed on another machine
-VERIFIER_SETTINGS = {
-    "profile": "embedded",
-    "executor": "auto",
-    "offline": True,
-    "pictures": False,
-    "accept_poses": True,
-}
 
 
 @dataclass
@@ -301,7 +330,7 @@ def verify_bundle(bundle: Path) -> Verified:
         for place in unpacked.runs:
             name = place.relative_to(folder).as_posix()
             try:
-                found.faults += [f"{name}: {line}" for line in _faults_of(read_run(place), found, folder)]
+                found.faults += [f"{name}: {line}" for line in _faults_of(read_run(place), found)]
             except Su3dError as error:
                 found.faults.append(f"{name}: {str(error).replace(str(folder), '').lstrip('/')}")
         if not found.faults:
@@ -310,90 +339,16 @@ def verify_bundle(bundle: Path) -> Verified:
         return found
 
 
-def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
-    wrong = [f"{where}: {what}" for where, what in wrong_files(run) if not what.startswith("done.json")]
-    yield from wrong or _rescored(run, found, folder)
-
-
-def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
-    """Faults for all counts that differ from those of the map when it is scored again."""
-    is_same_machine = run.record.processor == processor_digest()
-    rescored = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
-    for scene, method, scores in rescored:
-        counts = run.folder.job(scene, method).counts
-        kept = atomic.read_arrays(io.BytesIO(file_bytes(counts)))
-        ours = atomic.read_arrays(io.BytesIO(pack_scores(scores)))
-        found.n_scores += len(scores)
-        fault = difference(kept, ours, to_the_bit=is_same_machine)
-        found.is_to_the_bit &= difference(kept, ours, to_the_bit=True) is None
-        if fault is not None:
-            yield f"{printable(scene, 100)} by {printable(method, 80)}: its counts do not match its map: {fault}"
-
-
-def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]], *, to_the_bit: bool) -> str | None:
-    """The first array in which two files of counts differ; None if they agree.
-
-    Integers must be equal; other numbers equal to the bit, or within ``TOLERANCE``.
-
-    >>> one, other = {"a": np.array([0.1])}, {"a": np.array([0.1 + 1e-12])}
-    >>> difference(one, other, to_the_bit=False), difference(one, other, to_the_bit=True)
-    (None, "'a' has 0.1, its map gives 0.100000000001")
-    """
-    if sorted(kept) != sorted(ours):
-        odd = sorted(set(kept) ^ set(ours))[0]
-        return f"'{printable(odd, 100)}' is only in the {'stored' if odd in kept else 'recomputed'} counts"
-    for name, before in kept.items():
-        now = ours[name]
-        if before.dtype != now.dtype or before.shape != now.shape:
-            forms = f"{before.dtype} of {before.shape}, its map gives {now.dtype} of {now.shape}"
-            return f"'{printable(name, 100)}' is {forms}"
-        is_near = before.dtype.kind == "f" and not to_the_bit
-        if before.tobytes() == now.tobytes() or (
-            is_near and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
-        ):
-            continue
-        places = np.flatnonzero((before != now).ravel())
-        k = int(places[0]) if len(places) else 0
-        return f"'{printable(name, 100)}' has {_verify_one(before, k)}, its map gives {_verify_one(now, k)}"
-    return None
-
-
-def _verify_one(array: NDArray[Any], k: int) -> str:
-    return printable(f"{array.ravel()[k]:.12g}" if array.dtype.kind in "fiu" else str(array.ravel()[k]), 60)
-
-
-def _of_maps(run: FinishedRun, folder: Path) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
-    """The scores of the maps of a run by this program, on this machine or another."""
+def _faults_of(run: FinishedRun, found: Verified) -> Iterator[str]:
     check_no_custom_code(run)
-    encoder = encoder_of(run.folder, device_of(run))
-    for job in _jobs(run, folder):
-        run.dataset(job.scene)  # raises if the data here differ
-        for part in job.methods:
-            if is_file(run.folder.job(job.scene, part.name).counts):
-                yield job.scene, part.name, scores_again(job, part, encoder)
-
-
-def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
-    """The jobs of a run with its folder here; machine settings are dropped, no image model is loaded."""
-    settings = tuple(
-        entry for entry in run.data.settings.entries
-        if entry.path[0] not in NEUTRAL_SETTINGS and entry.path[:3] != ("perception", "models", "device")
-    )  # fmt: skip
-    here = tuple(Setting((name,), value, "verify") for name, value in VERIFIER_SETTINGS.items())
-    plan = make_plan(Settings((*settings, *here)), (), folder / "planned" / run.folder.path.name)
-    wanted = set(run.scenes)
-    missing = wanted - {job.scene for job in plan.jobs}
-    if missing:
-        raise StoreError(f"{counted(len(missing), 'scene')} of the run missing, such as {printable(min(missing), 80)}")
-    return [replace(job, folder=run.folder.path) for job in plan.jobs if job.scene in wanted]
-
-
-def device_of(run: FinishedRun) -> str:
-    """The device on which the run encoded texts (other devices give other bits); the CPU if it is not available."""
-    try:
-        return device_for(str(run.settings.get(("perception", "models", "device"), "cpu")), 0)
-    except Su3dError:
-        return "cpu"
+    check_dataset_ground_truth(run)
+    wrong = [f"{where}: {fault}" for where, fault in examine(run, with_maps=True).faults]
+    yield from wrong
+    for one in () if wrong else rescored(run):
+        found.n_scores += one.n_scores
+        found.is_to_the_bit &= one.is_to_the_bit
+        if one.fault is not None:
+            yield one.fault
 
 
 def check_no_custom_code(run: FinishedRun) -> None:
@@ -401,36 +356,12 @@ def check_no_custom_code(run: FinishedRun) -> None:
     asked = {name: run.settings.get((name,), ()) for name in ("methods", "scenes", "protocols")}
     for name, texts in asked.items():
         for text in texts if isinstance(texts, list | tuple) else (texts,):
+            if name == "methods" and text in run.external:
+                continue
             base = str(text).partition("@")[0].partition("/")[0]
             known = registry.METHODS if name == "methods" else registry.DATASETS if name == "scenes" else None
             if ".py" in str(text) or str(text).endswith(".toml") or (known is not None and base not in known):
                 raise StoreError(f"uses the user-defined '{printable(str(text), 80)}', which a bundle cannot contain")
-
-
-def check_dataset_ground_truth(run: FinishedRun) -> None:
-    """Raise a ``StoreError`` if predictions were scored against ground-truth files instead of a dataset."""
-    truth = run.record.ground_truth
-    if run.record.predictions and (truth is None or truth.dataset is None):
-        raise StoreError("was scored against ground-truth files, which a bundle does not contain; use --dataset")
-
-
-def _of_predictions(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
-    """The scores of predictions made elsewhere, from the maps stored in the run."""
-    check_dataset_ground_truth(run)
-    truth = run.record.ground_truth
-    assert truth is not None
-    for one in run.record.predictions:
-        request = Request(
-            tuple(run.folder.job(scene, one.method).path for scene in run.scenes),
-            dataset=truth.dataset,
-            protocols=tuple(run.protocols),
-            confidences="file" if one.confidences == "file" else "protocol",
-        )
-        evaluation = evaluate(request)
-        for scene in run.scenes:
-            name = scene.partition("/")[2]
-            scores = {each.rules.name: each.scores[name] for each in evaluation.protocols if name in each.scores}
-            yield scene, one.method, scores
 
 
 def _cells(unpacked: Unpacked, found: Verified) -> Iterator[str]:

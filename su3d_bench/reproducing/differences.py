@@ -24,8 +24,9 @@ from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.recipe import Experiment, Recipe, method_of_row, methods_of
-from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run, read_update_times
+from su3d_bench.runs.finished import FinishedRun, encoder_of, read_update_times
 from su3d_bench.runs.job import GENERATED_ROOMS
+from su3d_bench.runs.verify import read_checked
 from su3d_bench.store.predictions import read_prediction
 
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
@@ -81,7 +82,7 @@ class Results:
 
     @cached_property
     def runs(self) -> Mapping[str, FinishedRun]:
-        return {str(folder): read_run(folder) for folder in self.folders}
+        return {str(folder): read_checked(folder) for folder in self.folders}
 
     @cached_property
     def measured(self) -> Sequence[Measured]:

@@ -13,7 +13,7 @@ from typing import Any
 from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_order, ranked
 from su3d_bench.core.config import NEUTRAL_SETTINGS, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import ConfigError, DataError, StoreError, Su3dError, counted, printable, reading, shown
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
 from su3d_bench.core.system.files import opened
 from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
@@ -81,7 +81,6 @@ NOT_STATED = "not stated"
 USES_GROUND_TRUTH = "none: it uses ground truth"
 NO_WEIGHTS = {"oracle": "none: ground-truth masks", "stored": f"{NOT_STATED}: detections of another program"}
 ROW_FILES = ("counts.npz", "updates.csv", "done.json")  # files of a job that a row needs; its map stays in the archive
-LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the first line of the specification's pointer files
 
 
 @dataclass(frozen=True)
@@ -143,13 +142,8 @@ class Row(RankingRow):
 def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
     """The rows of the bundle in ``file``, and its scores that cannot be ranked.
 
-    Raises ``StoreError`` if it is not a bundle, ``DataError`` if it is only a link or a Git LFS pointer.
+    Raises ``StoreError`` if it is not a bundle.
     """
-    with reading(shown(file), StoreError), opened(file) as stream:
-        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise DataError(f"{shown(file)}: is a Git LFS pointer, not the bundle itself; get it with: git lfs pull")
-    if file.is_symlink():
-        raise DataError(f"{shown(file)}: is a link; give or copy the bundle itself")
     with TemporaryFolder("su3d-bundle-") as folder:
         unpacked = unpack(file, folder, keep=_is_row_file)
         manifest = unpacked.manifest
@@ -399,7 +393,7 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
 
     It is rejected if its maps do not reproduce its numbers (see ``verify_bundle``), if a row of it cannot be ranked, or
     conflicts with existing rows. A bundle already in the registry, as in a pull request, is checked against all others
-    and stays. Raises ``StoreError`` or ``DataError`` if it is not a bundle, ``ConfigError`` if ``name`` is invalid or
+    and stays. Raises ``StoreError`` if it is not a bundle, ``ConfigError`` if ``name`` is invalid or
     the registry contains a damaged bundle.
     """
     others = [one for one in bundle_files(registry) if not _is_same_file(one, file)]
@@ -411,8 +405,6 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
     place = file if is_there else _place(registry, file, rows, name)
     found = Added(printable(file.name, 120), printable(str(place), 300), len(rows))
     reasons = [f"{one.what}: {one.reason}" for one in refused]
-    if not rows and not refused:
-        reasons.append("contains no runs; create a bundle with: su3d-bench report bundle RUN")
     reasons = reasons or list(_beside(rows, others, before))
     if not reasons and not is_there and os.path.lexists(place):
         reasons.append(f"{printable(place.name, 120)} is taken by another bundle; choose another with --name")

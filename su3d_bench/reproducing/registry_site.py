@@ -16,6 +16,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.page.page import PAGE, Kind, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
+from su3d_bench.runs.finished import AS_SUBMITTED
 
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
@@ -146,6 +147,7 @@ def _row(row: Row, address: str | None) -> dict[str, Any]:
     return {
         **{name: getattr(row, name) for name in ROW_FIELDS},
         "page": _page(METHODS, row.method),
+        "times": AS_SUBMITTED,
         "of_scenes": dict(row.values_of_scenes),
         "weights": [{**asdict(one), "files": dict(one.files)} for one in row.weights],
         "bundle": {
@@ -209,8 +211,17 @@ def _plain_tables(registry: Registry) -> Table | Prose:
     ]
     if not rows:
         return Prose(("This registry has no rows.",))
-    columns = ("protocol", "values", "rank", "scenes", "s per frame", "hardware", "weights trained on", "bundle")
-    return Table("registry", "All rows, in per cent.", "method", columns, tuple(rows), ())
+    columns = (
+        "protocol",
+        "values",
+        "rank",
+        "scenes",
+        "s per frame",
+        "hardware",
+        "weights trained on",
+        "bundle",
+    )
+    return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
 
 
 def _headline(row: Row) -> str:

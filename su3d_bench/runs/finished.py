@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ from su3d_bench.core.files.atomic import is_file, read_json
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.metric import SceneScore
@@ -49,6 +51,8 @@ if TYPE_CHECKING:
 
 
 MAX_NAMED = 8  # scenes or methods of a run in a message
+MAX_NAME_BYTES = 255  # of a folder's name
+AS_SUBMITTED = "as submitted"  # times that were not measured again
 
 
 def external(formats: Sequence[str]) -> str:
@@ -100,7 +104,7 @@ class FinishedRun:
     record: records.RunRecord
     protocols: Mapping[str, records.ProtocolRecord]
     results: Mapping[tuple[str, str], records.ResultRecord]
-    limit: int
+    metrics: records.MetricsRecord
     data: RunData
 
     @property
@@ -110,6 +114,16 @@ class FinishedRun:
     @property
     def methods(self) -> tuple[str, ...]:
         return self.record.methods
+
+    @property
+    def hardware(self) -> str:
+        """The machine of the run; its times are only known as submitted if this machine has another processor."""
+        is_here = self.record.processor == processor_digest()
+        return self.record.hardware if is_here else f"{self.record.hardware}; times {AS_SUBMITTED}, not measured here"
+
+    @property
+    def limit(self) -> int:
+        return self.metrics.limit
 
     @property
     def is_incomplete(self) -> bool:
@@ -211,11 +225,13 @@ class FinishedRun:
         is_name = "/" not in method
         return is_name and any(is_file(self.folder.job(scene, method).counts) for scene in self.scenes)
 
-    def scores(self, method: str) -> dict[str, dict[str, SceneScore]]:
+    def scores(
+        self, method: str, file_of: Callable[[JobFolder], Path] = attrgetter("counts")
+    ) -> dict[str, dict[str, SceneScore]]:
         """Protocol -> scene -> counts, for every scene that was scored."""
         scores: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
         for scene in self.scenes:
-            file = self.folder.job(scene, method).counts
+            file = file_of(self.folder.job(scene, method))
             if not is_file(file):
                 continue
             try:
@@ -254,6 +270,8 @@ def read_run(path: Path) -> FinishedRun:
         if twice := [name for name, n in Counter(names).items() if n > 1]:
             raise StoreError(f"{shown}: {what} '{printable(twice[0], 100)}' twice; run its command again")
     protocols = {rules.name: rules for rules in record.protocols}
+    if bad := [name for name in (*record.methods, *record.scenes) if not _is_name(name, name in record.scenes)]:
+        raise StoreError(f"{shown}: run.json: '{printable(bad[0], 80)}' is not a valid name of a method or scene")
     if unnamed := [one.protocol for one in metrics.results if one.protocol not in protocols]:
         raise StoreError(f"{shown}: run.json does not name the protocol '{unnamed[0]}'; run its command again")
     return FinishedRun(
@@ -261,9 +279,16 @@ def read_run(path: Path) -> FinishedRun:
         record=record,
         protocols=protocols,
         results={(result.method, result.protocol): result for result in metrics.results},
-        limit=metrics.limit,
+        metrics=metrics,
         data=RunData(read_file(path / "run.toml"), record.data_digests, record.truth_files),
     )
+
+
+def _is_name(name: str, is_scene: bool) -> bool:
+    """Whether a method or scene of this name can have a folder of its own."""
+    parts = name.split("/")
+    is_short = name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES
+    return is_short and not {"", ".", ".."} & set(parts) and (is_scene or len(parts) == 1)
 
 
 def _no_run_message(path: Path) -> str:

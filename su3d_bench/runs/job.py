@@ -14,12 +14,14 @@ from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import Method, UsesGroundTruth
 from su3d_bench.core.maps import Prediction
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import visible_truth
+from su3d_bench.perception.oracle import OraclePerception
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
@@ -200,6 +202,7 @@ def check_same_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool 
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
+TRUTH_CAVEAT = "uses the ground truth; a ceiling, not a result"
 DEVICE, CPU = "perception.models.device", '"cpu"'
 TORCH_PACKAGES = ("torch", "transformers")  # used in addition to the packages in every key
 
@@ -241,13 +244,17 @@ class JobInputs:
             key = {**key, "pictures": str(True)}
         return folder.is_whole(completion, key)
 
+    @property
+    def caveat(self) -> str | None:
+        return caveat_of(self.method, self.perception, self.info)
+
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are complete; ``remarks`` are stored with the completion record of the scores."""
         return MethodOutcome(
             self.job.scene,
             self.name,
             profile=self.perception.profile if self.method.needs.frames else None,
-            caveat=caveat_of(self.method, self.perception, self.info),
+            caveat=self.caveat,
             encoder=self.perception.encoder.name,
             encoder_digest=self.perception.encoder.digest,
             data_digest=self.data_digest,
@@ -263,9 +270,21 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     own = attribute_of(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
-    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
+    elif isinstance(method, UsesGroundTruth) and method.name != CEILING_METHOD:
+        own = TRUTH_CAVEAT
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
     made = f"{GENERATED_ROOMS} {scene.dataset}, not its scenes" if is_made else None
-    parts = [made, perception.caveat if is_seen_by_profile else None, own]
+    parts = [made, perception.caveat if sees_profile(method) else None, own]
     return "; ".join(part for part in parts if part) or None
+
+
+def sees_profile(method: Method) -> bool:
+    """Whether the method gets its masks and names from the perception of the run."""
+    return method.needs.frames and not getattr(method, "has_own_perception", False)
+
+
+def uses_ground_truth(method: Method, profile: str | None) -> bool:
+    """Whether the numbers of ``method`` under ``profile`` are a ceiling: ground truth reaches it in some form."""
+    is_told = isinstance(method, UsesGroundTruth) or method.needs.true_proposals
+    return is_told or (profile == OraclePerception.profile and sees_profile(method))

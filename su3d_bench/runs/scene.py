@@ -216,7 +216,7 @@ class _Scene:
             self._predict(part, inputs, folder, key, log)
         score_key = inputs.score_key(key, folder)
         if not inputs.is_scored(folder, folder.completion_records().get("score"), score_key):
-            self._score(part, perception, folder, score_key, log)
+            self._score(part, inputs, folder, score_key, log)
             was_resumed = False
         return inputs.outcome(folder.remarks("score"), was_resumed=was_resumed)
 
@@ -289,15 +289,15 @@ class _Scene:
         return frame_loop.true_proposals(self.truth(self.dataset.variants[0]))
 
     def _score(
-        self, part: jobs.Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
+        self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
         """Score under every protocol with ground truth here, draw the map, and record both as complete."""
         prediction = read_prediction(folder.prediction)
-        scores, unscored = self.scores(part, perception.encoder, prediction, folder)
+        scores, unscored = self.scores(part, inputs.perception.encoder, prediction, folder)
         files = [folder.counts]
         write_bytes(folder.counts, pack_scores(scores))
         for share in self.job.config.shares if jobs.build_method(part).needs.frames else ():
-            early, _ = self.scores(part, perception.encoder, read_prediction(folder.anytime(share)), None)
+            early, _ = self.scores(part, inputs.perception.encoder, read_prediction(folder.anytime(share)), None)
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
         if self.job.config.pictures:
@@ -308,6 +308,7 @@ class _Scene:
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
         doubts = folder.remarks("predict").get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
+        remarks["caveat"] = inputs.caveat
         folder.mark_complete("score", key, [*files, folder.log], remarks)
 
     def scores(

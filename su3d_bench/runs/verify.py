@@ -1,24 +1,242 @@
-"""Whether the numbers of a run follow from its own counts, and its files match their recorded digests."""
+"""Whether the records of a run follow from its counts and agree with each other, its request and its jobs.
+
+Whatever shows or compares numbers of a finished run opens it with ``read_checked``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
 
-from su3d_bench.core.config import flatten
-from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import ConfigError, Su3dError, printable
+from su3d_bench.core import registry
+from su3d_bench.core.config import flatten, resolve
+from su3d_bench.core.digests import digest_file, digest_json
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.registry import CEILING_METHOD, base_name
+from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import ProtocolResult, combine
+from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, plain_json
 from su3d_bench.predictions.run_predictions import read_stored
-from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.reports.tables.model import is_ceiling
+from su3d_bench.runs.existing import existing_run
+from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.runs.job import Part, build_method, options_model, uses_ground_truth
+from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.predictions import features_beside
-from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
+from su3d_bench.store.records import ROUNDING, CompletionRecord, NumbersRecord, ResultRecord, plain
 from su3d_bench.store.run_folder import JobFolder
 
-# Values in metrics.json that must follow from the counts; how intervals are formed may change without a new version.
+# Values in metrics.json that must follow from the counts. Intervals and warnings may change without a new version of
+# the protocol: those of the counts are shown.
 CHECKED_FIELDS = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
+MAX_FAULTS = 50  # of a run; records can name millions of scenes and methods without files
+TRUTH_CAVEAT = "its counts are those of the ground truth: a ceiling, not a result"
+Fault = tuple[str, str]  # where (``METHOD / PROTOCOL``, ``METHOD / scene SCENE`` or a file) and what is wrong
+Jobs = dict[tuple[str, str], Mapping[str, CompletionRecord]]  # (scene, method) -> completion records
+Scores = Mapping[str, Mapping[str, SceneScore]]  # protocol -> scene -> counts
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A run with the numbers that its counts give, and the faults of its records and files."""
+
+    run: FinishedRun
+    faults: tuple[Fault, ...]
+
+
+def read_checked(path: Path) -> FinishedRun:
+    """The run at ``path`` with the numbers of its counts; ``StoreError`` with the first fault of its records."""
+    found = examine(read_run(path))
+    for where, fault in found.faults[:1]:
+        hint = "" if ";" in fault else "; run its command again"
+        raise StoreError(f"{found.run.name}: {where}: {fault}{hint}")
+    return found.run
+
+
+def examine(run: FinishedRun, *, with_maps: bool = False) -> Examined:
+    """The numbers of the counts of ``run``, and at most ``MAX_FAULTS`` faults; ``with_maps``: its maps are read too."""
+    results = dict(run.results)
+    faults = islice(_faults(run, results, with_maps), MAX_FAULTS)
+    shown = tuple((printable(where, 200), printable(fault, 300)) for where, fault in faults)
+    return Examined(replace(run, results=results), shown)
+
+
+def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with_maps: bool) -> Iterator[Fault]:
+    """The faults of ``run``; its ``results`` are replaced by those of its counts."""
+    yield from _record_faults(run)
+    jobs: Jobs = {}
+    failed = {(failure.scene, failure.method) for failure in run.record.failed}
+    settings = {".".join(path): json.dumps(value, ensure_ascii=False) for path, value in run.settings.items()}
+    own = [one.result for one in run.results.values() if one.result is not None and one.method not in run.external]
+    scored = {scene for result in own for scene in result.scenes}  # the ceiling's counts exist, too
+    for method in dict.fromkeys((*run.methods, CEILING_METHOD)):
+        for scene in run.scenes:
+            job = run.folder.job(scene, method)
+            if (scene, method) not in failed and (method in run.methods or scene in scored):
+                jobs[scene, method] = steps = job.completion_records()
+                for fault in (*_wrong_files(job, steps, with_maps), *_wrong_key(run, scene, method, steps, settings)):
+                    yield f"{method} / scene {scene}", fault
+    perfect: Scores | None = None
+    for method in run.methods:
+        maps = [[_map_digest(jobs.get((scene, one), {})) for one in (method, CEILING_METHOD)] for scene in run.scenes]
+        caveats = [one.caveat for one in run.results.values() if one.method == method]
+        if all(own and own == truth for own, truth in maps) and not any(is_ceiling(method, one) for one in caveats):
+            yield method, "its maps are the ground truth (same digests as those of the oracle)"
+        try:
+            perfect = run.scores(CEILING_METHOD) if perfect is None else perfect
+            scores = run.scores(method)
+            read_update_times(run, method)
+        except Su3dError as error:
+            yield method, str(error)
+            continue
+        for protocol in run.protocols:
+            where, record = f"{method} / {protocol}", run.results.get((method, protocol))
+            if record is None:
+                yield where, "has no result in metrics.json"
+                continue
+            yield from ((where, f"metrics.json: {fault}") for fault in _wrong_claims(run, record, jobs))
+            try:
+                results[method, protocol], contradicts = _recomputed(run, record, scores, perfect)
+            except Su3dError as error:
+                contradicts = str(error)
+            if contradicts is not None:
+                yield where, contradicts
+
+
+def _map_digest(steps: Mapping[str, CompletionRecord]) -> str | None:
+    return steps["predict"].files.get("prediction.npz") if "predict" in steps else None
+
+
+# ---- records
+
+
+def _record_faults(run: FinishedRun) -> Iterator[Fault]:
+    """Contradictions between run.json, metrics.json and run.toml."""
+    record, metrics, asked = run.record, run.metrics, run.settings
+    has_failed = any(failure.method in run.methods for failure in record.failed)
+    for file, what, value, expected in (
+        ("metrics.json", "scenes", metrics.scenes or record.scenes, record.scenes),
+        ("metrics.json", "is_partial", metrics.is_partial, metrics.limit > 0),
+        ("run.json", "is_partial", record.is_partial, metrics.limit > 0),
+        ("metrics.json", "limit", metrics.limit, asked.get(("limit",), 0)),
+        ("metrics.json", "seed", metrics.seed, record.seed or 0),
+        ("run.json", "seed", record.seed or 0, asked.get(("seed",), 0)),
+        ("run.json", "status", record.status, "incomplete" if has_failed else "complete"),
+    ):
+        if value != expected:
+            yield file, f"{what} is {printable(str(value), 80)}, the other records give {printable(str(expected), 80)}"
+    existing = existing_run(run.folder.path)
+    if existing is None or not existing.is_known:
+        yield "run.toml", "is not the file that the run wrote"
+    named = {base_name(str(name)) for name in asked.get(("methods",), ())}
+    others = [name for name in run.methods if base_name(name) not in named]
+    if others and named <= registry.METHODS.keys():  # plug-ins, and "all", have names of their own
+        yield "run.toml", f"does not name the method {others[0]}"
+
+
+def _wrong_files(job: JobFolder, steps: Mapping[str, CompletionRecord], with_maps: bool) -> Iterator[str]:
+    """Why the files of a job are not those that the run wrote."""
+    files = {name: digest for step in steps.values() for name, digest in step.files.items()}
+    maps = (job.prediction.name, features_beside(job.prediction).name)
+    for name in (job.prediction.name, job.updates.name, job.counts.name):
+        if name not in files:
+            yield f"done.json does not list {name}"
+    for name, digest in files.items():
+        file = job.path / name
+        if "/" in name or not (name.endswith("counts.npz") or name == job.updates.name or (with_maps and name in maps)):
+            continue
+        if not is_file(file) or file.is_symlink():
+            yield f"{name} is missing"
+        elif digest_file(file) != digest:
+            yield f"{name} is not the file that the run wrote"
+    if with_maps and is_file(job.prediction):
+        try:
+            read_stored(job.prediction)
+        except Su3dError as error:
+            yield f"contains no map: {error}"
+
+
+def _wrong_key(
+    run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], settings: Mapping[str, str]
+) -> Iterator[str]:
+    """Inputs in the completion records of a job that the records of the run contradict."""
+    if not {"predict", "score"} <= steps.keys():
+        return
+    key, score = steps["predict"].key, steps["score"].key
+    asked, profile = run.settings.get(("profile",), "auto"), key.get("profile")
+    stated = {
+        "method": method,
+        "data": run.record.data_digests.get(scene, "not stated"),
+        "seed": str(run.record.seed or 0),
+        "limit": str(run.limit or "none"),
+        "stride": str(run.settings.get(("stride",)) or run.settings.get(("method", method, "stride"), 1)),
+        "code": run.record.code,
+        "profile": str(asked if asked != "auto" else "embedded or paper"),
+        **{f"packages.{name}": version for name, version in run.record.packages.items()},
+    }
+    if method in run.external:
+        stated["predictions"] = digest_json(run.external[method].files.get(scene, {}))
+    for name, text in key.items():
+        if name.startswith(("method.", "dataset.", "perception.")) and method in run.methods:
+            stated[name] = settings.get(name, "null")
+        if name in stated and text != stated[name] and text not in stated[name].split(" or "):
+            yield f"done.json: {name} is {printable(text, 60)}, the run says {printable(stated[name], 60)}"
+    for what, own in (("profile", profile), ("encoder_digest", score.get("encoder"))):
+        if own is not None and own not in (getattr(run.record, what) or "").split(", "):
+            yield f"done.json: {what} is {own}, run.json says {getattr(run.record, what)}"
+    if score.get("predict") != digest_json(dict(key)):
+        yield "done.json: the counts are those of another map"
+
+
+def _wrong_claims(run: FinishedRun, record: ResultRecord, jobs: Jobs) -> Iterator[str]:
+    """What a result states about its method and scenes that run.json or the jobs contradict."""
+    scored = () if record.result is None else record.result.scenes
+    if record.n_planned != len(scored) + len(record.failed) + len(record.unscored):
+        yield f"n_planned is {record.n_planned}, but {len(scored) + len(record.unscored)} scenes did not fail"
+    if set(record.failed) - {failure.scene for failure in run.record.failed if failure.method == record.method}:
+        yield "failed names a scene that did not fail"
+    if record.method in run.external:
+        return
+    steps = [jobs.get((scene, record.method), {}) for scene in (*scored, *record.unscored)]
+    mine = [one for one in steps if {"predict", "score"} <= one.keys()]
+    profiles = {one["predict"].key.get("profile") for one in mine}
+    stated = [
+        ("profile", record.profile, profiles),
+        ("encoder_digest", record.encoder_digest, {one["score"].key.get("encoder") for one in mine}),
+    ]
+    if all("caveat" in one["score"].remarks for one in mine):
+        caveats = dict.fromkeys(one["score"].remarks["caveat"] for one in mine)
+        stated.append(("caveat", record.caveat, {"; ".join(filter(None, caveats))}))
+    for what, value, own in stated:
+        if {*(value or "").split(", " if what != "caveat" else "\n")} - {""} != own - {None, ""}:
+            yield f"{what} is {value}, the jobs have {', '.join(sorted(map(str, own)))}"
+    if any(run.protocols[record.protocol].digest not in one["score"].key.values() for one in mine[: len(scored)]):
+        yield f"the rules of {record.protocol} in run.json are not those that scored it"
+    if (record.encoder is None) != (record.profile is None):
+        yield f"encoder is {record.encoder}, but profile is {record.profile}"
+    if not is_ceiling(record.method, record.caveat) and any(_uses_truth(run, record.method, one) for one in profiles):
+        yield f"caveat is {record.caveat}, but the method used ground truth"
+
+
+def _uses_truth(run: FinishedRun, method: str, profile: str | None) -> bool:
+    """Whether a built-in method used ground truth; False for others, whose code is not loaded to find out."""
+    base = base_name(method)
+    if base in registry.METHODS:
+        with suppress(Su3dError):  # its weights or its program may be missing here
+            options = resolve(run.data.settings, ("method", method), options_model("method", base))
+            return uses_ground_truth(build_method(Part(base, method, options.model_dump_json())), profile)
+    return False
+
+
+# ---- numbers
 
 
 def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
@@ -28,22 +246,68 @@ def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
     return run.rules(protocol, to_the_letter=True)
 
 
-def contradiction(stated: NumbersRecord, counted: ProtocolResult) -> str | None:
-    """The first value of ``stated`` that differs from the counts or is missing; None if all follow from the counts."""
-    if set(stated.scenes) != set(counted.scenes):
-        return f"it has {len(stated.scenes)} scenes, the counts {len(counted.scenes)}"
-    record, numbers = plain(stated), counted.to_json()
-    for table in CHECKED_FIELDS:
-        known = dict(flatten(numbers[table]))
-        for where, value in flatten(record[table]):
-            if where not in known or not _agree(value, known[where]):
-                shown = _shown(known[where]) if where in known else "nothing"
+def _recomputed(
+    run: FinishedRun, record: ResultRecord, scores: Scores, perfect: Scores
+) -> tuple[ResultRecord, str | None]:
+    """A result with the numbers of the counts, and the first value of ``record`` that contradicts them."""
+    protocol, stated = record.protocol, record.result
+    counts = {scene: one for scene, one in scores.get(protocol, {}).items() if scene not in record.failed}
+    if stated is None:
+        return record, f"metrics.json has no numbers, the counts have {len(counts)} scenes" if counts else None
+    rules, is_elsewhere = rules_of_run(run, protocol), record.method in run.external
+    numbers = NumbersRecord(**combine(rules, counts).to_json())
+    truths = {scene: perfect.get(protocol, {}).get(scene) for scene in counts}
+    early = {}
+    for point in record.anytime or ():
+        of_share = run.scores(record.method, partial(JobFolder.anytime_counts, share=point.share)).get(protocol, {})
+        early[f"{point.share:g}"] = _metrics(rules, {scene: of_share.get(scene) for scene in counts})
+    known = plain(numbers) | {"ceiling": _metrics(rules, truths), "anytime": early}
+    written = plain(stated) | {"ceiling": record.ceiling or {}}
+    written |= {"anytime": {f"{point.share:g}": point.metrics for point in record.anytime or ()}}
+    fault = contradiction(written, known, rules.headline)
+    if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
+        fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
+    is_truth = is_elsewhere and all(_is_same(score, truths[scene]) for scene, score in counts.items())
+    recomputed = replace(
+        record,
+        caveat=f"{record.caveat}; {TRUTH_CAVEAT}" if is_truth else record.caveat,
+        kind=rules.kind,
+        headline=rules.headline,
+        ceiling=known["ceiling"] or None,
+        result=replace(
+            numbers,
+            coverage=stated.coverage if is_elsewhere else numbers.coverage,
+            warnings=tuple(dict.fromkeys((*stated.warnings, *numbers.warnings))),
+        ),
+        confidences=record.confidences if is_elsewhere else confidences_of(rules, numbers),
+        labels=record.labels if is_elsewhere else labels_counted(rules, by_features=record.encoder is not None),
+    )
+    return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
+
+
+def _is_same(score: SceneScore, truth: SceneScore | None) -> bool:
+    """Whether two scores have the same counts, whatever their warnings."""
+    same = [None if one is None else pack_scores({one.protocol: replace(one, warnings=())}) for one in (score, truth)]
+    return same[0] == same[1]
+
+
+def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> dict[str, float | None]:
+    """The metrics over these scenes; empty if one has no counts."""
+    whole = {scene: score for scene, score in scores.items() if score is not None}
+    return dict(plain_json(combined_metrics(rules, whole))) if len(whole) == len(scores) else {}
+
+
+def contradiction(written: Mapping[str, Any], known: Mapping[str, Any], headline: Sequence[str]) -> str | None:
+    """The first value of ``written`` that differs from ``known``, or a headline value that it lacks; None if none."""
+    for table in (*CHECKED_FIELDS, "ceiling", "anytime"):
+        values = dict(flatten(known[table]))
+        for where, value in flatten(written[table]):
+            if where not in values or not _agree(value, values[where]):
+                shown = _shown(values[where]) if where in values else "nothing"
                 return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
-    for name in counted.headline:
-        of_scenes = {f"per_scene.{scene}": stated.per_scene.get(scene) for scene in stated.scenes}
-        rows = {"metrics": stated.metrics, **of_scenes}
-        lacking = next((where for where, row in rows.items() if row is None or name not in row), None)
-        if lacking is not None:
+    for name in headline:
+        rows = {"metrics": written["metrics"], **{f"per_scene.{key}": row for key, row in written["per_scene"].items()}}
+        if lacking := next((where for where, row in rows.items() if name not in row), None):
             return f"{lacking} has no {name}"
     return None
 
@@ -54,62 +318,3 @@ def _agree(stated: float | None, known: float | None) -> bool:
 
 def _shown(value: float | None) -> str:
     return "undefined" if value is None else f"{value:.12g}"
-
-
-def count_mismatch(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
-    """Why the numbers of a method under a protocol do not follow from ``scores``, its counts; None if they do."""
-    record = run.results.get((method, protocol))
-    if record is None or record.result is None:
-        return "was not scored"
-    try:
-        counted = combine(rules_of_run(run, protocol), scores, with_intervals=False)
-    except Su3dError as error:
-        return str(error)
-    fault = contradiction(record.result, counted)
-    if fault is None and record.version != counted.version:
-        fault = f"version is {record.version}, the counts are of {counted.version}"
-    return None if fault is None else f"metrics.json does not follow from the counts: {fault}; run its command again"
-
-
-def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
-    """Location and fault of every scene and method whose map, counts or times differ from those that the run wrote."""
-    for scene in run.scenes:
-        for method in run.methods:
-            fault = _damage(run.folder.job(scene, method))
-            if fault is not None:
-                yield f"{printable(method, 80)} / scene {printable(scene, 80)}", fault
-
-
-def _damage(job: JobFolder) -> str | None:
-    completed: dict[str, str] = {}
-    for completion in job.completion_records().values():
-        completed |= completion.files
-    for file in (job.prediction, features_beside(job.prediction), job.updates, job.counts):
-        if file.name not in completed:
-            if file != features_beside(job.prediction):
-                return f"done.json does not list {file.name}"
-        elif not is_file(file):
-            return f"{file.name} is missing"
-        elif digest_file(file) != completed[file.name]:
-            return f"{file.name} is not the file that the run wrote"
-    try:
-        read_stored(job.prediction)
-    except Su3dError as error:
-        return f"contains no map: {error}"
-    return None
-
-
-def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
-    """Location and fault: files that are not those of the run, numbers that do not follow from its counts."""
-    yield from damaged_files(run)
-    for method in dict.fromkeys(method for method, _ in run.results):
-        try:
-            scores = run.scores(method)
-        except Su3dError as error:
-            yield printable(method, 80), printable(str(error), 300)
-            continue
-        for (name, protocol), record in run.results.items():
-            if name == method and record.result is not None:
-                fault = count_mismatch(run, method, protocol, scores.get(protocol, {}))
-                if fault is not None:
-                    yield f"{printable(method, 80)} / {printable(protocol, 80)}", printable(fault, 300)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted_runs import painted_run, see_painted
+from painted_runs import consistent, painted_run, see_painted
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 from su3d_bench.analysis.attribution import attribute
@@ -168,6 +168,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree("whole", "oracle")
         text = Path("oracle/run.json").read_text()
         Path("oracle/run.json").write_text(text.replace('"profile": "embedded"', '"profile": "oracle"'))
+        toml = Path("oracle/run.toml")
+        toml.write_text(toml.read_text().replace('profile = "auto"', 'profile = "oracle"', 1))
+        consistent(Path("oracle"))
     return folder
 
 

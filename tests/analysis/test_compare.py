@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted_runs import painted_run
+from painted_runs import consistent, painted_run
 from scored_room import noisy_scores
 
 from su3d_bench.analysis.comparison import Difference, compare, difference_of
 from su3d_bench.analysis.sides import Numbers
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -41,7 +41,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("other-data", "abc", ["--set", "painted.n_frames=5"]),
         ):
             painted_run(Path(out), "--quiet", *more, scenes=scenes)
-        copy_as("a", "other-encoder", "metrics.json", lambda text: text.replace("words-1", "words-2"))
+        copy_as("a", "other-encoder", "run.json", lambda text: text.replace("words-1", "words-2"))
+        consistent(Path("other-encoder"))
         copy_as(
             "a", "other-rules", "run.json", lambda one: one.replace(load_protocol("rooms-instance").digest, "0" * 64)
         )
@@ -98,6 +99,7 @@ def test_interval_is_a_jackknife_over_scenes() -> None:
         for k, scene in enumerate("abc"):
             packed = pack_scores({name: scores[k] for name, scores in made.items()})
             RunFolder(Path(f"noisy-{run}")).job(f"painted/{scene}", "collector").counts.write_bytes(packed)
+        consistent(Path(f"noisy-{run}"))
     for one in compare("noisy-a", "noisy-b").protocols:
         metric = metric_of(load_protocol(one.protocol))
         for name, value in one.metrics.items():
@@ -181,8 +183,8 @@ REFUSED = [
         ("a", "other-data"),
         "a:collector and other-data:collector cannot be compared: data digest of painted/a is ",
     ),
-    (("a", "other-rules"), "cannot be compared: digest of protocol rooms-instance is "),
-    (("a", "old-rules"), "cannot be compared: version of protocol rooms-semantic is "),
+    (("a", "other-rules"), "other-rules: collector / rooms-instance: metrics.json: the rules of rooms-"),
+    (("a", "old-rules"), "was scored under rooms-semantic version 92, now it is version 2"),
     (("a", "other-encoder"), "cannot be compared: encoder is words (words-1) and words (words-2)"),
     (("a", "a"), "a: both sides are the same; name two runs, or two methods of one run as a:METHOD"),
     (("a:oracle", "a:oracle"), "a:oracle: both sides are the same"),
@@ -194,7 +196,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("sides", "message"), REFUSED)
 def test_incomparable_runs_are_an_error_naming_the_field(sides: tuple[str, str], message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(Su3dError) as caught:
         compare(*sides)
     assert message in str(caught.value)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, consistent, painted_run
 from scored_room import noisy_scores
 
 from su3d_bench.analysis.comparison import compare, plan
@@ -50,6 +50,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for s, scene in enumerate("abc"):
             packed = pack_scores({name: scores[N_SCENES * k + s] for name, scores in made.items()})
             RunFolder(folder / f"seed-{k // 2}").job(f"painted/{scene}", METHODS[k % 2]).counts.write_bytes(packed)
+    for seed in range(3):
+        consistent(folder / f"seed-{seed}")
     return folder
 
 

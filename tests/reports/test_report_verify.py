@@ -10,14 +10,12 @@ from pathlib import Path
 
 import pytest
 from painted import ColourPerception
-from painted_runs import see_painted
+from painted_runs import consistent, see_painted
 from places import SCENES
 
-from su3d_bench.analysis.tables import check_paper, measured_results
+from su3d_bench.analysis.tables import measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.latex import latex
-from su3d_bench.reports.tables.paper import Shown, selection_tables
 
 
 @pytest.fixture(scope="module")
@@ -104,17 +102,37 @@ def test_verify_checks_files_included_from_the_papers_folder(
     assert capsys.readouterr().out == f"{n_cells} cells checked, 0 differ\n"
 
 
-def test_numbers_are_computed_from_counts_not_metrics_json(sweep: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "run"
-    shutil.copytree(sweep, copy)
-    record = json.loads((copy / "metrics.json").read_text())
+def raise_metrics(run: Path) -> None:
+    record = json.loads((run / "metrics.json").read_text())
     for one in record["results"]:
         one["result"]["metrics"] = dict.fromkeys(one["result"]["metrics"], 0.123)
-    (copy / "metrics.json").write_text(json.dumps(record))
-    found = measured_results([copy])
-    paper = tmp_path / "paper.tex"
-    paper.write_text(latex(selection_tables(found, Shown(), with_published=False)))
-    assert sum(check.fault is not None for check in check_paper(paper)) == len(found) / 2 * 5
+    (run / "metrics.json").write_text(json.dumps(record))
+
+
+def name_a_key_twice(run: Path) -> None:
+    text = (run / "metrics.json").read_text()
+    (run / "metrics.json").write_text(text.replace('"limit": 0', '"limit": 0, "limit": 0', 1))
+
+
+JOB = "scenes/painted.a/collector"
+EDITS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "numbers": (raise_metrics, "does not follow from the counts"),
+    "a key twice": (name_a_key_twice, "metrics.json: has the key 'limit' twice"),
+    "no counts": (lambda run: (run / JOB / "counts.npz").unlink(), "counts.npz is missing"),
+    "faster": (lambda run: (run / JOB / "updates.csv").write_text("total_ms\n1\n"), "updates.csv is not the file"),
+}
+
+
+@pytest.mark.parametrize("verb", ["tables", "html", "timing", "instances", "bundle", "attribution --method collector"])
+@pytest.mark.parametrize("edit", EDITS)
+def test_reports_of_edited_runs_are_refused(
+    edit: str, verb: str, sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(sweep, tmp_path / "run")
+    change, message = EDITS[edit]
+    change(tmp_path / "run")
+    assert main(["report", *verb.split(), str(tmp_path / "run"), "--out", str(tmp_path / "out.zip")]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out.zip").exists()
 
 
 def test_runs_on_different_data_are_not_combined(sweep: Path, tmp_path: Path) -> None:
@@ -123,6 +141,7 @@ def test_runs_on_different_data_are_not_combined(sweep: Path, tmp_path: Path) ->
     record = json.loads((copy / "run.json").read_text())
     record["data_digests"] = dict.fromkeys(record["data_digests"], "0" * 64)
     (copy / "run.json").write_text(json.dumps(record))
+    consistent(copy)
     with pytest.raises(ConfigError, match="cannot be compared: data digest of painted/a"):
         measured_results([sweep, copy])
     assert len(measured_results([sweep, sweep])) == len(measured_results([sweep]))

@@ -11,6 +11,8 @@ import yaml
 from registry_bundles import ROOM, Files, flip_labels, read_bundle, rewrite_bundle, room_bundle
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_bytes, digest_json
+from su3d_bench.perception.oracle import ORACLE_CAVEAT
 
 RUN = "runs/room"
 JOB = f"{RUN}/scenes/{ROOM.replace('/', '.')}/opensu3d"
@@ -50,12 +52,44 @@ def other_data(files: Files) -> None:
     files[f"{RUN}/run.json"] = json.dumps(record).encode()
 
 
+def updated(files: Files, job: str) -> None:
+    """Let the done.json of ``job`` agree with its files and inputs."""
+    done = json.loads(files[f"{job}/done.json"])
+    for step in done["steps"].values():
+        step["files"] = {name: digest_bytes(files[f"{job}/{name}"]) for name in step["files"] if name != "log.txt"}
+    done["steps"]["score"]["key"]["predict"] = digest_json(done["steps"]["predict"]["key"])
+    files[f"{job}/done.json"] = json.dumps(done).encode()
+
+
+def not_a_ceiling(files: Files) -> None:
+    """The caveat of perception by ground truth removed from every record."""
+    caveat = json.dumps(ORACLE_CAVEAT).encode()
+    for name in (f"{RUN}/metrics.json", f"{JOB}/done.json", f"{JOB.replace('opensu3d', 'conceptfusion')}/done.json"):
+        assert caveat in files[name]
+        files[name] = files[name].replace(caveat, b"null")
+
+
+def maps_of_the_oracle(files: Files) -> None:
+    files[f"{JOB}/prediction.npz"] = files[f"{JOB.replace('opensu3d', 'oracle')}/prediction.npz"]
+    updated(files, JOB)
+    not_a_ceiling(files)
+
+
+def negative_times(files: Files) -> None:
+    head, *rows = files[f"{JOB}/updates.csv"].decode().splitlines()
+    files[f"{JOB}/updates.csv"] = "\n".join([head, *(f"-{row}" for row in rows), ""]).encode()
+    updated(files, JOB)
+
+
 @pytest.mark.parametrize(
     ("tamper", "says"),
     [
+        (not_a_ceiling, "caveat is None, but the method used ground truth"),
+        (maps_of_the_oracle, "opensu3d: its maps are the ground truth"),
+        (negative_times, "updates.csv: has -"),
         (lambda files: flip_labels(files, JOB), "by opensu3d: its counts do not match its map"),
         (other_rules, "are not those that scored it"),
-        (other_data, "its data have changed since the run"),
+        (other_data, "done.json: data is "),
     ],
 )
 def test_tampered_bundle_is_rejected_with_a_reason(
@@ -66,6 +100,8 @@ def test_tampered_bundle_is_rejected_with_a_reason(
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
     assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
     assert "t.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
+    assert main(["report", "verify", str(tmp_path / "t.zip")]) == 1
+    assert says in capsys.readouterr().out
     assert not (tmp_path / "bundles").exists()
 
 

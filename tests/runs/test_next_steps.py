@@ -48,7 +48,7 @@ def run_with(**given: Any) -> FinishedRun:
     """A run whose folder is never read; ``__`` separates the parts of a path."""
     entries = tuple(Setting(tuple(name.split("__")), value, "run.toml:1") for name, value in given.items())
     record: Any = None
-    return FinishedRun(RunFolder(Path("run")), record, {}, {}, 0, RunData(Settings(entries), {}))
+    return FinishedRun(RunFolder(Path("run")), record, {}, {}, record, RunData(Settings(entries), {}))
 
 
 def test_changed_settings_are_listed_with_their_values() -> None:

@@ -32,6 +32,7 @@ from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
+from su3d_bench.runs.verify import read_checked
 from su3d_bench.store.records import ResultRecord, plain
 
 MAX_BINS = 160  # points of a line: more than a plot can show
@@ -159,7 +160,7 @@ def _shown(result: ResultRecord) -> dict[str, Any]:
 def _about(run: FinishedRun) -> dict[str, Any]:
     record = run.record
     of_record = plain(record)
-    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "hardware", "packages", "data_digests")
+    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "packages", "data_digests")
     return {
         "name": run.name,
         "is_partial": record.is_partial,
@@ -168,6 +169,7 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "scenes": run.scenes,
         "methods": run.methods,
         **{key: of_record[key] for key in shared},
+        "hardware": run.hardware,
         "protocols": [{key: rules[key] for key in ("name", "version", "digest")} for rules in of_record["protocols"]],
         "settings": [{"key": ".".join(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
@@ -323,7 +325,7 @@ def page_contents(
     no finished run; parts that cannot be computed have a reason on the page.
     """
     folders = tuple(dict.fromkeys(folders))
-    runs = [read_run(folder) for folder in folders]
+    runs = [read_checked(folder) for folder in folders]
     maps = scored_maps(runs) if options.with_maps else []
     max_points = points_of_each(len(maps), options.max_bytes)
     explained = _explained(runs) if options.with_errors and are_all_read(runs) else {}

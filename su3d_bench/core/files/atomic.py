@@ -19,6 +19,7 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -223,9 +224,27 @@ def read_json(path: Path) -> Any:
     """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
     try:
         with reading(str(path), StoreError):
-            return json.loads(file_text(path))
+            return json_value(file_text(path))
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: not readable as JSON; run the same command again to repair it") from error
+        what = str(error) if isinstance(error, _DuplicateKeyError) else "not readable as JSON"
+        raise StoreError(f"{path}: {what}; run the same command again to repair it") from error
+
+
+class _DuplicateKeyError(ValueError):
+    """An object has a key twice: one program would read the first value, another the last."""
+
+
+def json_value(text: str) -> Any:
+    """The value of a JSON text; a ``ValueError`` if it is not one, or an object in it has a key twice."""
+    return json.loads(text, object_pairs_hook=_unique)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]
+        raise _DuplicateKeyError(f"has the key '{printable(twice, 80)}' twice")
+    return value
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:

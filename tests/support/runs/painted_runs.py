@@ -13,8 +13,14 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_file, digest_json
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.existing import SEAL, with_end_marker
+from su3d_bench.store.run_folder import scene_of_folder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -56,6 +62,37 @@ def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,),
         see_painted(patch)
         assert main([*named, "--jobs", "1", "--out", str(folder), *more]) == 0
     return folder
+
+
+def consistent(run: Path) -> Path:
+    """The run with jobs, results and end marker that agree with its run.json, run.toml and counts."""
+    record = json.loads((run / "run.json").read_text())
+    toml = run / "run.toml"
+    toml.write_text(with_end_marker(toml.read_text().rpartition(SEAL)[0]))
+    scores: dict[str, dict[str, dict[str, SceneScore]]] = {}  # method -> protocol -> scene -> counts
+    for done in run.rglob("done.json"):
+        value, scene = json.loads(done.read_text()), scene_of_folder(done.parent.parent.name)
+        predict, score = (value["steps"][step]["key"] for step in ("predict", "score"))
+        predict |= {"seed": str(record["seed"]), "data": record["data_digests"][scene]}
+        predict |= {"profile": record["profile"]} if "profile" in predict else {}
+        score |= {"predict": digest_json(predict), "encoder": record["encoder_digest"]}
+        score |= {f"protocol.{one['name']}": one["digest"] for one in record["protocols"]}
+        for step in value["steps"].values():
+            step["files"] = {name: digest_file(done.parent / name) for name in step["files"]}
+        done.write_text(json.dumps(value))
+        for protocol, one in unpack_scores((done.parent / "counts.npz").read_bytes()).items():
+            scores.setdefault(done.parent.name, {}).setdefault(protocol, {})[scene] = one
+    metrics = json.loads((run / "metrics.json").read_text()) | {"seed": record["seed"]}
+    for result in metrics["results"]:
+        rules, of_method = load_protocol(result["protocol"]), scores[result["method"]][result["protocol"]]
+        result["result"] = combine(rules, of_method).to_json()
+        if result["ceiling"] is not None:
+            result["ceiling"] = combine(rules, scores["oracle"][result["protocol"]]).to_json()["metrics"]
+        result["encoder_digest"] = record["encoder_digest"]
+        if result["profile"] is not None:
+            result["profile"] = record["profile"]
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    return run
 
 
 def painted_page(run: Path, page: Path, *more: str) -> str:
