@@ -40,7 +40,7 @@ from su3d_bench.questions.query_files import ObjectId, Words, only_words, valida
 PAGE = "https://github.com/beacon-3d/beacon-3d"
 MAX_BYTES = 64 << 20  # the largest file of the release has 0.5 MiB
 MAX_CHARACTERS = 10_000  # per answer
-# Data sets by the form of a scene's name, and what to add to an object id for ground-truth values, in which 0 is no object
+# Datasets by the form of a scene's name, and the ground-truth value of their object 0 (0 itself is no object).
 ORIGINS = (
     (re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"), "3rscan", 0),
     (re.compile(r"scene_\d{5}_\d{2}"), "multiscan", 0),

@@ -73,7 +73,9 @@ def test_each_object_has_three_questions_and_three_chains() -> None:
     assert sum(len(of_class) for of_class in fewer["room"].values()) == 1
 
 
-@pytest.mark.parametrize("scene, dataset, first", [("scene0011_00", "scannet", 1), ("scene_00116_03", "multiscan", 0)])
+@pytest.mark.parametrize(
+    ("scene", "dataset", "first"), [("scene0011_00", "scannet", 1), ("scene_00116_03", "multiscan", 0)]
+)
 def test_texts_that_end_in_a_line_break_and_scenes_of_other_datasets(
     scene: str, dataset: str, first: int, tmp_path: Path
 ) -> None:
