@@ -115,7 +115,7 @@ def _exit_code(words: Sequence[str]) -> int:
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
         how = f"stopped by {end}" if isinstance(end, Terminated) else "interrupted"
-        again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
+        again = "resumes" if getattr(arguments, "resumes", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
     except SystemExit as stop:

@@ -154,7 +154,7 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
-    parser.option("--out FILE", ".pdf, .png or .svg file to write", required=True)
+    parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
