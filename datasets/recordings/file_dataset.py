@@ -78,6 +78,11 @@ class SceneTree:
     made: frozenset[str] = frozenset()
 
 
+def described(root: Path) -> str:
+    """The data root for a message, which says so if there is no such folder."""
+    return f"{root}{'' if root.is_dir() else ' (there is no such folder)'}"
+
+
 def find_scenes(
     root: Path, names: Iterable[str], is_scene: Callable[[Path], bool], first: Sequence[str] = ()
 ) -> SceneTree:
@@ -174,7 +179,7 @@ class FileDataset(ABC, Generic[OptionsT]):
         """The location of the scenes; a ``ScenesMissing`` that states how to get data if there are none."""
         tree = self.find_tree()
         if not tree.folders:
-            raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
+            raise ScenesMissing(f"{self.name}: no scene in {described(self.root)}{self.how_to_get}")
         return tree
 
     def scenes(self) -> Sequence[str]:

@@ -170,7 +170,7 @@ def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[
         if event.label == SCENE_DONE and not event.activity:
             n_done += 1
             left = _time_left(started, n_done, n_scenes)
-            remark(f"{event.unit} done, {n_done} of {counted(n_scenes, 'scene')}{left}", quiet=is_quiet)
+            remark(f"{event.unit} finished, {n_done} of {counted(n_scenes, 'scene')}{left}", quiet=is_quiet)
 
     with drawn_bars(is_quiet=is_quiet) as bars:
         yield print_line if bars is None else _Board(bars, n_scenes, last_step).report
