@@ -313,8 +313,8 @@ def check_key(config: LanguageConfig) -> None:
     """Raises ``ModelMissing`` if the hosted service is used without a key."""
     if _address_of(config) == HOSTED and not _key_of(config):
         raise ModelMissing(
-            f"${config.key_variable} is not set; set it to the key of {urlsplit(HOSTED).netloc}, or use your own server "
-            "with --base-url or --set perception.language.base_url=URL"
+            f"${config.key_variable} is not set; set it to the key of {urlsplit(HOSTED).netloc}, or use your own "
+            "server with --base-url or --set perception.language.base_url=URL"
         )
 
 
