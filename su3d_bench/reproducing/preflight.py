@@ -163,7 +163,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     if name == TAGGER:  # its original checkpoint requires its own package
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
-    remark = "" if is_required else "without it, objects from a word list are detected"
+    remark = "" if is_required else "without it the detector gets words of a fixed list instead of tags of the image, unlike in the paper"
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
@@ -194,7 +194,9 @@ def preflight_tables(known: Preflight) -> list[Table]:
 
 
 def _state(need: Need) -> str:
-    return "yes" if need.is_available else "no" if need.is_required else "no (optional)"
+    if need.is_available or need.is_required:
+        return "yes" if need.is_available else "no"
+    return "no (replaced)" if need.kind == "model" else "no (optional)"
 
 
 def _bytes(need: Need) -> str:
