@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, no_scene, suggest
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
 from su3d_bench.datasets.openlex3d import release as openlex3d
@@ -174,7 +174,7 @@ class FileDataset(ABC, Generic[OptionsT]):
         """The location of the scenes; a ``ScenesMissing`` that states how to get data if there are none."""
         tree = self.find_tree()
         if not tree.folders:
-            raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
+            raise no_scene(self.name, self.root, self.how_to_get)
         return tree
 
     def scenes(self) -> Sequence[str]:

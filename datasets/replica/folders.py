@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.core.errors import ScenesMissing
+from su3d_bench.core.errors import ScenesMissing, no_scene
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import LabelSet
 
@@ -128,10 +128,12 @@ def find_label_file(root: Path, scene: str, folders: tuple[str, ...], prefix: st
 
 def no_render_tree(root: Path) -> ScenesMissing:
     """Message if no scene was found: where they are expected and how to get data."""
-    return ScenesMissing(
-        f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
-        f"results/); download them with {FETCH_FRAMES}, set SU3D_DATA to their folder, "
-        f"or create rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
+    return no_scene(
+        "replica",
+        root,
+        " or in its folder Replica (a scene is a folder such as room0 with traj.txt and results/); download "
+        f"them with {FETCH_FRAMES}, set SU3D_DATA to their folder, "
+        f"or create rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}",
     )
 
 

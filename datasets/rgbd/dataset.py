@@ -132,7 +132,11 @@ def open_recording(path: Path, description: files.RgbdDescription, where: str) -
     place = f"{where}: {path.name}"
     folder = _folder(path, description, place)
     colours, depths = (files.files_of(folder, name, place) for name in (description.colour, description.depth))
-    poses = _poses(folder, description, sorted(colours.keys() | depths.keys()), where, place)
+    intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
+    is_mirrored = bool(intrinsics[1, 1] < 0)
+    if is_mirrored and description.mesh is not None:
+        raise DataError(f"{place}: fy is negative: the world is left-handed, which is not supported with a mesh")
+    poses = _poses(folder, description, sorted(colours.keys() | depths.keys()), where, place, is_mirrored=is_mirrored)
     if files.INDEX not in description.colour and not len(colours) == len(depths) == len(poses.of_number):
         raise DataError(
             f"{place}: {len(colours)} colour files, {len(depths)} depth files and {len(poses.of_number)} poses match; "
@@ -151,11 +155,10 @@ def open_recording(path: Path, description: files.RgbdDescription, where: str) -
         raise DataError(f"{place}: no frame has colour, depth and a pose (the first: {missing[0]})")
     what = "frames lack an image or a usable pose"
     remarks = recorded_frames.left_out(where, missing, what, len(frames))
-    intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
     sources = (path, *camera_files, *poses.files, *mesh)
     return recorded_frames.Recording(
-        where, folder, tuple(frames), intrinsics, depth_table(description), sources, size, tuple(remarks)
+        where, folder, tuple(frames), np.abs(intrinsics), depth_table(description), sources, size, tuple(remarks)
     )
 
 
@@ -178,14 +181,20 @@ class _Poses:
 
 
 def _poses(
-    folder: recorded_frames.Folder, description: files.RgbdDescription, images: list[int], where: str, place: str
+    folder: recorded_frames.Folder,
+    description: files.RgbdDescription,
+    images: list[int],
+    where: str,
+    place: str,
+    *,
+    is_mirrored: bool,
 ) -> _Poses:
     if description.pose is not None:
         pose_of, contradicting = {}, []
         names = files.files_of(folder, description.pose, place)
         for number, name in names.items():
             matrix, header = files.read_pose(folder.path, name, where)
-            pose_of[number] = files.camera_to_world(matrix, description, f"{where}: {name}")
+            pose_of[number] = files.camera_to_world(matrix, description, f"{where}: {name}", is_mirrored=is_mirrored)
             if files.direction_in(header) not in (None, description.pose_direction):
                 contradicting.append(f"{name} begins with {printable(header, 40)!r}")
         if contradicting:
@@ -210,7 +219,8 @@ def _poses(
         )
     rows = zip(numbers, matrices, strict=True)
     pose_of = {
-        n: files.camera_to_world(matrix, description, f"{where}, pose {k}") for k, (n, matrix) in enumerate(rows)
+        n: files.camera_to_world(matrix, description, f"{where}, pose {k}", is_mirrored=is_mirrored)
+        for k, (n, matrix) in enumerate(rows)
     }
     return _Poses(pose_of, dict(zip(numbers, times_s or (), strict=False)), (path,))
 
@@ -220,7 +230,7 @@ def _intrinsics(
 ) -> tuple[Float64Array, tuple[int, int] | None, tuple[Path, ...]]:
     """Intrinsics, the image size if a file states it, and that file."""
     if description.intrinsics is not None:
-        return recorded_frames.pinhole(*description.intrinsics, where=place), None, ()
+        return files.signed_pinhole(description.intrinsics, place), None, ()
     assert description.intrinsics_file is not None
     path = folder.file(description.intrinsics_file, place)
     return *files.read_intrinsics(path, f"{where}: {description.intrinsics_file}"), (path,)

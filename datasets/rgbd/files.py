@@ -36,14 +36,15 @@ class RgbdDescription(BaseModel):
       with ``*`` or ``?`` in all of them, files pair up in numeric order. JPEG, PNG, PPM; PNG, PGM of 16 bits
     - ``pose``: text files of a 4x4 matrix; or ``trajectory``: one file with a pose per image or, if images are
       missing, for every number from the first to the last. ``trajectory_format``: ``open3d`` (blocks of five lines,
-      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers per line) or
+      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw, or without time) or ``kitti`` (12 numbers per line) or
       ``matrix`` (16 numbers per line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
     - ``pose_direction`` and ``camera_axes``: what the matrices map, and whether y points down and z into the scene
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
       left; with 3, a value p is ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: values that, besides 0,
       mean no depth; 65535 is not needed, it means none if it is far from all other depths of its image
-    - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
+    - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON).
+      A negative fy (ICL-NUIM) means that y points up in the camera, in a left-handed world: y of both is negated
     - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are rotated so that it is z.
       Without it the world is unchanged, with a warning if the frames show another axis to point up
     - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that need one
@@ -127,6 +128,7 @@ def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> Non
 MAX_NUMBER = 2**31 - 1  # maps store frame numbers in 32 bits; time stamps in names do not fit
 MAX_DISTANCE_M = 1e6  # of a camera from the origin
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 MATRIX_ROWS = {"kitti": (3, "the upper rows of a 4x4 matrix"), "matrix": (4, "a 4x4 matrix row by row")}
 FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers per line
 HEADER = re.compile(r"[#%/\s]*[A-Za-z_](?!(?i:nf|an)\b)")  # a word, which is neither inf nor nan
@@ -192,12 +194,12 @@ def read_trajectory_file(path: Path, form: str, where: str) -> tuple[Float64Arra
         lower = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 4 - n_rows, 1)).reshape(len(rows), 4 - n_rows, 4)
         return np.concatenate([upper, lower], axis=1), None
     values, times_s = [], []
-    for n, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
-        row = numbers(words[1:], f"{where} line {n}")
-        times_s.append(seconds(words[0], f"{where} line {n}"))
+    for n, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw', or the last seven", 1):
+        row = numbers(words[-7:], f"{where} line {n}")
+        times_s += [seconds(word, f"{where} line {n}") for word in words[:-7]]
         values.append([*row[:3], *unit_quaternion(row[3:], f"{where} line {n}")])
     table = np.array(values)
-    return quaternion_poses(table[:, :3], table[:, 3:]), times_s
+    return quaternion_poses(table[:, :3], table[:, 3:]), times_s or None
 
 
 def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
@@ -240,8 +242,11 @@ def direction_in(header: str) -> str | None:
     return "world_to_camera" if found[1].lower().startswith("w") else "camera_to_world"
 
 
-def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str) -> Pose:
-    """The pose with OpenCV axes in a z-up world, from a matrix (4, 4) in the convention of the description."""
+def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str, *, is_mirrored: bool) -> Pose:
+    """The pose with OpenCV axes in a z-up world, from a matrix (4, 4) in the convention of the description.
+
+    ``is_mirrored``: y of camera and world is negated, as in a left-handed world.
+    """
     if not np.isfinite(matrix).all():
         return None
     if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
@@ -250,11 +255,21 @@ def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: s
         matrix = np.asarray(np.linalg.inv(matrix), np.float64)
     if description.camera_axes == "opengl":
         matrix = matrix @ OPENGL_TO_OPENCV
+    if is_mirrored:
+        matrix = MIRROR_Y @ matrix @ MIRROR_Y
     if description.up is None:
         return matrix
     turned = matrix.copy()
     turned[:3] = turn_to_z(description.up) @ matrix[:3]
     return turned
+
+
+def signed_pinhole(values: tuple[float, float, float, float], where: str) -> Float64Array:
+    """Intrinsics (3, 3) of fx, fy, cx, cy, of which fy may be negative."""
+    fx, fy, cx, cy = values
+    matrix = pinhole(fx, abs(fy), cx, cy, where)
+    matrix[1, 1] = fy
+    return matrix
 
 
 def read_intrinsics(path: Path, where: str) -> tuple[Float64Array, tuple[int, int] | None]:
@@ -287,4 +302,4 @@ def _pinhole_matrix(matrix: Float64Array, where: str) -> Float64Array:
     (fx, skew, cx), (below, fy, cy) = matrix[:2]
     if max(abs(skew), abs(below)) > 1e-6 * max(abs(fx), 1) or not np.array_equal(matrix[2], (0, 0, 1)):
         raise DataError(f"{where}: not a pinhole camera; expected fx 0 cx, 0 fy cy, 0 0 1")
-    return pinhole(float(fx), float(fy), float(cx), float(cy), where)
+    return signed_pinhole((float(fx), float(fy), float(cx), float(cy)), where)

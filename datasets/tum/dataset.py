@@ -160,12 +160,17 @@ def associate(folder: Path, where: str, max_difference_s: float) -> list[tuple[S
     return [(colours[i], depths[j]) for i, j in sorted(partner.items())]
 
 
-def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:
-    """(line number, words) of every non-comment line; commas and tabs separate words, as in associate.py."""
-    rows = []
+def rows_of(path: Path, where: str, n_words: int, form: str, n_fewer: int = 0) -> list[tuple[int, list[str]]]:
+    """(line number, words) of every non-comment line; commas and tabs separate words, as in associate.py.
+
+    Each line has ``n_words``, or, if the first line does, ``n_fewer`` less.
+    """
+    rows: list[tuple[int, list[str]]] = []
     for number, line in enumerate(read_text(path, where).replace(",", " ").split("\n"), start=1):
         words = line.split()
         if words and not words[0].startswith("#"):
+            if not rows and len(words) == n_words - n_fewer:
+                n_words = len(words)
             if len(words) != n_words:
                 raise DataError(f"{where} line {number}: has {len(words)} values; expected {form}")
             rows.append((number, words))

@@ -14,12 +14,15 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.core.compiled import njit
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.protocols.loading import class_names
 
 DPI = 100
 DARK, GREY = "#222222", "#666666"
+# Fonts are embedded as TrueType, text in an SVG stays text, and a fixed salt makes it reproducible.
+FONTS = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench"}
 METADATA = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}  # without dates
 
 
@@ -55,15 +58,33 @@ class Canvas:
         return axes
 
     def write(self, path: Path) -> None:
-        """Write the page as a PNG, with its folder."""
-        make_folder(path.parent)
-        write_bytes(path, figure_bytes(self.figure, "png"))
+        """Write the page as PDF, PNG or SVG by the suffix of ``path``, with its folder."""
+        write_figure(self.figure, path)
+
+
+def write_figure(figure: Any, path: Path, dpi: float | None = None) -> None:
+    """Write a figure as PDF, PNG or SVG by the suffix of ``path``, with its folder; ``ConfigError`` for others."""
+    content = figure_bytes(figure, figure_format(path), dpi)
+    make_folder(path.parent)
+    write_bytes(path, content)
+
+
+def figure_format(path: Path) -> str:
+    """The format of a figure by the suffix of ``path``; ``ConfigError`` if it is not one of ``METADATA``."""
+    if (kind := path.suffix.lower().removeprefix(".")) not in METADATA:
+        raise ConfigError(
+            f"--out {printable(str(path), 200)}: unknown format of a figure; use a suffix of {', '.join(METADATA)}"
+        )
+    return kind
 
 
 def figure_bytes(figure: Any, kind: str, dpi: float | None = None) -> bytes:
     """Return the file of a figure: the same bytes for the same figure."""
+    from matplotlib import rc_context
+
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=METADATA[kind])
+    with rc_context(FONTS):
+        figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=METADATA[kind])
     return buffer.getvalue()
 
 

@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import ConfigError, printable
-from su3d_bench.core.files.atomic import make_folder, write_bytes
+from su3d_bench.core.errors import printable
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned
 
-FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
 LEGEND_WIDTH_IN = 2.6
 DPI = 200  # of pictures within the figure
@@ -48,21 +46,7 @@ class GridRow:
 
 def draw_grid(path: Path, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> None:
     """Write the figure as PDF, PNG or SVG by the suffix of ``path``; ``scale`` (256, 3): colour bar of similarity."""
-    suffix = path.suffix.lower().removeprefix(".")
-    if suffix not in FORMATS:
-        raise ConfigError(f"--out {printable(str(path), 200)}: unknown format; use a suffix of {', '.join(FORMATS)}")
-    from matplotlib import rc_context
-
-    # 42: TrueType fonts, so that text in a PDF stays text; a fixed hash salt makes the SVG reproducible
-    with rc_context(
-        {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench", "font.family": "DejaVu Sans"}
-    ):
-        content = _figure_bytes(suffix, columns, rows, scale)
-    make_folder(path.parent)
-    write_bytes(path, content)
-
-
-def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> bytes:
+    canvas.figure_format(path)
     aspect = max(cell.picture.shape[0] / cell.picture.shape[1] for row in rows for cell in row.cells)
     cell_height = CELL_WIDTH_IN * aspect
     width = len(columns) * (CELL_WIDTH_IN + GAP_IN) + GAP_IN
@@ -90,7 +74,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
                 page.text(left, top + ROW_IN + cell_height + 0.02 + CAPTION_IN * k, line, 6.5, colour=SOFT_INK)
     if scale is not None:
         page.scale(height - LEGEND_IN + 0.06, scale)
-    return canvas.figure_bytes(page.figure, suffix, DPI)
+    canvas.write_figure(page.figure, path, DPI)
 
 
 def _caption_lines(row: GridRow) -> list[list[str]]:

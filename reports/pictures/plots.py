@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.types import Float64Array
 from su3d_bench.formats.tables.table import signed
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes
+from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes, write_figure
 from su3d_bench.reports.tables.instances import LEFT, n_text
 from su3d_bench.reports.tables.timing import AnytimePoint
 
@@ -61,7 +60,7 @@ def draw_timing(
         figures["anytime"] = _anytime(anytime)
     paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}
     for path, figure in paths.items():
-        write_bytes(path, figure_bytes(figure, path.suffix[1:], DPI))
+        write_figure(figure, path, DPI)
     return list(paths)
 
 
@@ -354,7 +353,7 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
-    """Write the plot as a PNG: one row of panels per protocol, one panel per metric."""
+    """Write the plot as PDF, PNG or SVG: one row of panels per protocol, one panel per metric."""
     protocols = attribution["protocols"]
     n_columns = max(len(protocol["values"]) for protocol in protocols)
     heights = [
@@ -433,7 +432,7 @@ MAX_NAME_CHARACTERS = 44  # characters
 
 
 def draw_walk(apart: Mapping[str, Any], path: Path) -> None:
-    """Write the plot as a PNG: one panel per metric, from the first protocol (top) to the second (bottom)."""
+    """Write the plot as PDF, PNG or SVG: one panel per metric, from the first protocol (top) to the second (bottom)."""
     walk = apart["walk"]
     names = list(walk["start"])
     n_rows = len(walk["steps"]) + 2

@@ -32,10 +32,10 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--jobs", "--set")
     parser = add_verb(actions, "show", call_show)
     parser.option("scene SCENE", "scene, such as rooms/living0")
-    parser.option("--out FILE", "PNG file to write (default: DATASET-SCENE.png)", type=output_path)
+    parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
     parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)
     parser.shared("--set")
-    parser = add_verb(actions, "make", call_make, takes_up=True)
+    parser = add_verb(actions, "make", call_make, resumes=True)
     parser.option("dataset", "dataset to generate: rooms")
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'DATASET/*')")
     parser.option(

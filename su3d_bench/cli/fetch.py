@@ -168,7 +168,7 @@ def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
 
 
 def add_models(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "fetch", call_models, takes_up=True)
+    parser = add_verb(verbs, "fetch", call_models, resumes=True)
     parser.option("names [MODEL...]", "names from models list")
     parser.option("--for PROFILE", "all models of a profile: paper", dest="profile")
     _add_fetch_options(parser)
@@ -197,11 +197,11 @@ def add_data(verbs: Verbs) -> None:
     su3d-bench datasets fetch scannet --dry-run
     """
     actions = add_group(verbs, "fetch", add_data)
-    parser = add_verb(actions, "replica", call_replica, takes_up=True)
+    parser = add_verb(actions, "replica", call_replica, resumes=True)
     parser.option("parts [PART...]", "frames or meshes (default: both)")
     parser.option("--keep-archives", "keep the archives, in .fetched")
     _add_fetch_options(parser)
-    parser = add_verb(actions, "scannet", call_scannet, takes_up=True)
+    parser = add_verb(actions, "scannet", call_scannet, resumes=True)
     parser.option("scans [SCAN...]", "scans or splits: scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
     parser.option("--script FILE", "your official download script", given)

@@ -106,7 +106,7 @@ def _exit_code(words: Sequence[str]) -> int:
         return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
         how = "interrupted" if str(end) in ("", "SIGINT") else f"stopped by {end}"
-        again = "resumes" if getattr(arguments, "takes_up", False) else "starts again"
+        again = "resumes" if getattr(arguments, "resumes", False) else "starts again"
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
     except BaseException as error:  # noqa: BLE001 - the one place that turns every other exception into a line

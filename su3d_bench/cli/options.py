@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Verbs = Any  # argparse._SubParsersAction
 Call = Callable[[argparse.Namespace], int | None]  # runs a command; returns its exit code or None
-PATHS = ("FILE", "DIR", "RUN", "PNG", "BUNDLE")
+PATHS = ("FILE", "DIR", "RUN", "BUNDLE")
 TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 LANGUAGE = ("perception", "language")
 
@@ -80,7 +80,7 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
     """The name and the ``add_argument`` settings of an option or argument, from the form that help shows.
 
     ``--out FILE`` takes one value, ``RUN...`` one or more, ``[RUN...]`` any number, ``[DIR]`` at most one. FILE, DIR,
-    RUN, PNG and BUNDLE are paths; an option without a value is a flag.
+    RUN and BUNDLE are paths, FIGURE one that ends in .pdf, .png or .svg; an option without a value is a flag.
 
     >>> option("--scenes SCENE...", "scenes to use")
     ('--scenes', {'help': 'scenes to use', 'metavar': 'SCENE', 'nargs': '+'})
@@ -98,21 +98,23 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
         settings["nargs"] = "?" if several == metavar else "*" if is_optional else "+"
     if metavar in PATHS:
         settings["type"] = Path
+    if metavar == "FIGURE":
+        settings["type"] = figure_path
     if name.startswith("--") and not value and not {"action", "choices", "nargs"} & more.keys():
         settings["action"] = "store_true"
     return name, settings | more
 
 
 def add_verb(
-    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, takes_up: bool = False
+    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, resumes: bool = False
 ) -> Parser:
     """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
-    Numerical libraries use one thread unless it ``uses_all_cores``. A command that ``takes_up`` resumes after an
+    Numerical libraries use one thread unless it ``uses_all_cores``. A command that ``resumes`` resumes after an
     interruption; others start again.
     """
     parser = _parser(verbs, name, about or call.__doc__)
-    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
+    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, resumes=resumes, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
@@ -161,6 +163,14 @@ def index(text: str) -> int:
 
 def output_path(text: str) -> Path:
     """Option type: a file or folder that the command writes."""
+    return Path(text)
+
+
+def figure_path(text: str) -> Path:
+    """Option type: a figure that the command writes, in a format that its suffix names."""
+    from su3d_bench.reports.pictures.canvas import figure_format
+
+    figure_format(Path(text))
     return Path(text)
 
 
@@ -308,7 +318,7 @@ def chat_client(
     usual = () if text_model is None else (Setting((*LANGUAGE, "text_model"), text_model, "default"),)
     config = resolve(Settings(usual) + settings + assigned + Settings(given), LANGUAGE, LanguageConfig)
     store = ReplyStore(run.path / "language")
-    arguments.takes_up = True  # from the stored replies
+    arguments.resumes = True  # from the stored replies
     return ChatClient(config, store, offline=arguments.offline, retry_failed=arguments.retry_failed), config
 
 

@@ -156,16 +156,32 @@ def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
 
 @contextmanager
 def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[Report]:
-    """A ``Report`` that draws progress bars while the block runs, if stderr is a terminal.
+    """A ``Report`` that shows progress while the block runs: bars on a terminal, elsewhere a line per finished scene.
 
     ``last_step`` labels what happens after the last frame of a scene.
     """
+    from su3d_bench.runs.executors import SCENE_DONE
+
+    n_done, started = 0, time.monotonic()
+
+    def print_line(event: Event) -> None:
+        nonlocal n_done
+        if event.label == SCENE_DONE and not event.activity:
+            n_done += 1
+            left = _time_left(started, n_done, n_scenes)
+            remark(f"{event.unit} finished, {n_done} of {counted(n_scenes, 'scene')}{left}", quiet=is_quiet)
+
     with drawn_bars(is_quiet=is_quiet) as bars:
-        yield _Board(bars, n_scenes, last_step).report if bars is not None else lambda event: None
+        yield print_line if bars is None else _Board(bars, n_scenes, last_step).report
+
+
+def _time_left(started: float, n: int, n_all: int) -> str:
+    """The estimated time left after ``n`` of ``n_all`` equal steps since ``started``, empty after the last."""
+    return "" if n >= n_all else f", about {(time.monotonic() - started) * (n_all / n - 1):.0f} s left"
 
 
 @contextmanager
-def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Progress | None]:
+def drawn_bars(*, is_quiet: bool) -> Iterator[Progress | None]:
     """Progress bars on stderr, each with a field ``remark``; None if stderr is not a terminal."""
     if is_quiet or not sys.stderr.isatty():
         yield None
@@ -178,7 +194,6 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
         ProgressColumn,
         Task,
         TextColumn,
-        TimeElapsedColumn,
         TimeRemainingColumn,
     )
     from rich.table import Column
@@ -193,10 +208,10 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
     console = Console(file=stream_behind(sys.stderr))
     remarks = TextColumn("{task.fields[remark]}", markup=False)
     # In a narrow terminal only the column of names may be folded.
-    time = (TimeRemainingColumn if tells_time_left else TimeElapsedColumn)(table_column=Column(no_wrap=True))
+    left = TimeRemainingColumn(elapsed_when_finished=True, table_column=Column(no_wrap=True))
     width = BAR if console.width >= WIDE else NARROW_BAR
     bar = BarColumn(bar_width=width, table_column=Column(width=width))
-    columns = (Description(), bar, MofNCompleteColumn(table_column=Column(no_wrap=True)), remarks, time)
+    columns = (Description(), bar, MofNCompleteColumn(table_column=Column(no_wrap=True)), remarks, left)
     bars = Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
     with bars, _above(bars):
         yield bars
@@ -220,7 +235,7 @@ def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[i
     """
     n_done: dict[str, int] = {}
     n_all, started = 0, time.monotonic()
-    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
+    with drawn_bars(is_quiet=is_quiet) as bars:
         task = None if bars is None else bars.add_task(what, total=None, remark="")
 
         def begin(n_steps: int) -> None:
@@ -235,8 +250,7 @@ def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[i
             if bars is not None and task is not None:
                 bars.update(task, completed=n, description=f"{event.unit}: {event.label}")
             elif event.done == event.total and n:
-                seconds_left = (time.monotonic() - started) * (n_all / n - 1)
-                left = f", about {seconds_left:.0f} s left" if n < n_all else ""
+                left = _time_left(started, n, n_all)
                 remark(f"{what}: {event.unit} done, {n} of {n_all} steps{left}", quiet=is_quiet)
 
         yield begin, report

@@ -39,7 +39,7 @@ def add_parser(verbs: Verbs) -> None:
         "--prediction RUN[:METHOD]",
         "run to score under both, to show the effect of each rule",
     )
-    parser.option("--out PNG", "plot of the effect of each rule (with --prediction)", type=output_path)
+    parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --prediction)")
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol P", "protocol, or .toml file", required=True)

@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--run", "--method")
     parser.option("--top N", "number of instances to list (default: 10)", type=count, default=10)
     parser.shared("--device")
-    parser.option("--out FILE", "picture to write (default: next to the map)", type=output_path)
+    parser.option("--out FIGURE", ".pdf, .png or .svg file to write (default: next to the map)")
     parser = add_verb(actions, "ask", call_ask)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("question", "question in English")
@@ -55,7 +55,7 @@ def add_parser(verbs: Verbs) -> None:
         type=float,
         metavar=("X", "Y", "Z"),
     )
-    parser.option("--out FILE", "picture to write (default: next to the map)", type=output_path)
+    parser.option("--out FIGURE", ".pdf, .png or .svg file to write (default: next to the map)")
     options.add_language_options(parser)
     questions.add_parser(actions)
 

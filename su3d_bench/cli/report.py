@@ -226,7 +226,7 @@ def _add_attribution(verbs: Verbs) -> None:
     parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
     parser.shared("--protocols")
     parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
-    parser.option("--out PNG", "plot to write", type=output_path)
+    parser.option("--out FIGURE", ".pdf, .png or .svg plot to write")
     parser.shared("--format")
 
 

@@ -18,7 +18,7 @@ MEGABYTE = 10**6
 
 
 def add_pages(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "html", call_html, takes_up=True)
+    parser = add_verb(verbs, "html", call_html, resumes=True)
     parser.shared("runs")
     parser.option("--out FILE", "page to write (default: page.html)", type=output_path, default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
@@ -66,7 +66,7 @@ def call_html(arguments: argparse.Namespace) -> None:
         with_gallery=not (arguments.no_gallery or arguments.no_errors),
         jobs=arguments.jobs or 0,
     )
-    arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # otherwise nothing is cached
+    arguments.resumes = all(os.access(run, os.W_OK) for run in arguments.runs)  # otherwise nothing is cached
     with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
         contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))

@@ -146,8 +146,6 @@ def show(arguments: argparse.Namespace) -> None:
     dataset, scene = scenes[0]
     name = f"{dataset.name}/{scene}"
     path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
-    if path.suffix.lower() != ".png" or path.is_dir():
-        raise ConfigError(f"--out {path}: expected a file name that ends in .png")
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
         draw_scene_picture(look, path)

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 from su3d_bench.cli import output, sheets_make
 from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import ConfigError, DataError, counted
+from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 
 if TYPE_CHECKING:
     from su3d_bench.human_eval.scores import Scores
+    from su3d_bench.human_eval.sources import RunSource
 
 SHOWN_FAULTS = 200  # lines; the total is printed
 
@@ -157,7 +158,7 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures)
     parser.shared("run")
-    parser.option("--out FILE", ".pdf, .png or .svg file to write", type=output_path, required=True)
+    parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
@@ -166,6 +167,18 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.option("--view", "viewpoint (default: corner)", choices=("corner", "above"), default="corner")
     parser.option("--colours", "colour map (default: paper)", choices=("paper", "cividis"), default="paper")
     parser.shared("--device")
+
+
+def _with_maps_to_draw(source: RunSource, arguments: argparse.Namespace) -> RunSource:
+    """``source`` without the methods whose maps have nothing to draw, unless that is all; a remark names them."""
+    needed = "features" if arguments.draw == "similarity" else "instances"
+    has = source.has_features if needed == "features" else source.has_instances
+    left_out = [method for method in source.methods if not all(has(scene, method) for scene in source.scenes)]
+    drawn = [method for method in source.methods if method not in left_out] or source.methods
+    if len(drawn) < len(source.methods):
+        names = ", ".join(printable(method, 80) for method in left_out)
+        remark(f"without {names}: maps without {needed} cannot be drawn", quiet=arguments.quiet)
+    return source.of_methods(drawn)
 
 
 def call_pictures(arguments: argparse.Namespace) -> None:
@@ -191,6 +204,8 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     if len(scenes) * max(1, len(texts)) > MAX_ROWS:
         raise ConfigError(f"--queries, --scenes: give {len(scenes) * len(texts)} rows; at most {MAX_ROWS} fit a figure")
     source = RunSource(run, arguments.methods, scenes)
+    if not arguments.methods:
+        source = _with_maps_to_draw(source, arguments)
     figures = Figures(source, with_photo=arguments.photo, view=arguments.view)
     scale, columns = None, figures.columns
     if arguments.draw == "labels":

@@ -97,6 +97,13 @@ class ScenesMissing(DataError):
     """No scene of a dataset was found."""
 
 
+def no_scene(dataset: str, root: Path, advice: str) -> ScenesMissing:
+    """The error if ``root`` has no scene of a dataset, or does not exist; ``advice`` on how to get one."""
+    return ScenesMissing(
+        f"{dataset}: no scene in {root}{'' if root.is_dir() else ' (there is no such folder)'}{advice}"
+    )
+
+
 class FramesMissing(DataError):
     """The scene has no frames: its ground truth can be viewed, but no method can run on it."""
 

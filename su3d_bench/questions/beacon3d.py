@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
 from su3d_bench.core.errors import ConfigError, DataError, counted, printable, shown
 from su3d_bench.core.system.files import file_text, parse_toml
@@ -35,11 +35,17 @@ from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Pla
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.chat import Reply as ModelReply
 from su3d_bench.perception.language.client import LanguageModel
-from su3d_bench.questions.query_files import ObjectId, Words, validated
+from su3d_bench.questions.query_files import ObjectId, Words, only_words, validated
 
 PAGE = "https://github.com/beacon-3d/beacon-3d"
 MAX_BYTES = 64 << 20  # the largest file of the release has 0.5 MiB
 MAX_CHARACTERS = 10_000  # per answer
+# Datasets by the form of a scene's name, and the ground-truth value of their object 0 (0 itself is no object).
+ORIGINS = (
+    (re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}"), "3rscan", 0),
+    (re.compile(r"scene_\d{5}_\d{2}"), "multiscan", 0),
+    (re.compile(""), "scannet", 1),
+)
 ANSWER_KEYS = ("response_pred", "answer_pred", "text", "answer_top10", "pred_response", "pred")  # in this order
 
 
@@ -96,14 +102,32 @@ def read_metadata(path: Path) -> Any:
     return parsed_json(read_bytes(path, where, advice, MAX_BYTES), where)
 
 
+def origin(scene: str) -> tuple[str, int]:
+    """The dataset of a scene, and the ground-truth value of its object 0.
+
+    >>> origin("scene0011_00"), origin("scene_00116_03")
+    (('scannet', 1), ('multiscan', 0))
+    """
+    return next((dataset, first) for pattern, dataset, first in ORIGINS if pattern.match(scene))
+
+
+def _verbatim(text: str) -> str:
+    only_words(" ".join(text.split()))
+    return text
+
+
+# A text of the release, which may end in a line break: answers are in the order of the different texts.
+Text = Annotated[str, AfterValidator(_verbatim)]
+
+
 class _Case(BaseModel):
-    text: Words
+    text: Text
     obj_id: list[ObjectId] = Field(min_length=1)
     tag: Words
 
 
 class _Asked(BaseModel):
-    question: Words
+    question: Text
     answer: Words
     tag: Words
     extra_knowledge: Any
@@ -134,7 +158,7 @@ Asking = Annotated[dict[str, dict[str, dict[str, _AskedObject]]], Field(min_leng
 
 
 def chains_of(content: Any, where: str) -> Chains:
-    """The chains of all objects; an object's id is one more than in the file, as in ScanNet's ground truth here.
+    """The chains of all objects; object ids become ground-truth values (see ``ORIGINS``).
 
     A text with several spellings is one case, with the objects of the last spelling, as in the original. Its tags must
     agree in all places.
@@ -143,12 +167,13 @@ def chains_of(content: Any, where: str) -> Chains:
     order: dict[tuple[str, str], None] = {}
     for scene, classes in validated(Grounding, content, where).items():
         known = cases.setdefault(scene, {})
+        _, first = origin(scene)
         objects = (chains for of_class in classes.values() for chains in of_class.values())
         for number, chains in enumerate(objects):
             for k, chain in enumerate(chains.values()):
                 for step, entry in enumerate(chain):
                     key, tags = entry.text.lower(), frozenset(entry.tag.lower().split("-"))
-                    ids = tuple(dict.fromkeys(object_id + 1 for object_id in entry.obj_id))
+                    ids = tuple(dict.fromkeys(object_id + first for object_id in entry.obj_id))
                     before = known.get(key) or ChainedText(entry.text, ids, tags=tags)
                     if before.tags != tags:
                         raise DataError(f"{where}: '{printable(entry.text, 60)}' of {scene} has two different tags")
@@ -189,7 +214,7 @@ def read_found(path: Path, chains: Chains) -> dict[str, dict[int, bool]]:
         if answer.correct is None and answer.object_id is None:
             fault = "expected 'correct' (true or false) or 'object_id' (integer)"
             raise DataError(f"{shown(path)}: answer {number}: {fault}")
-        object_id = -1 if answer.object_id is None else answer.object_id + 1
+        object_id = -1 if answer.object_id is None else answer.object_id + origin(scene)[1]
         is_right = object_id in chains.cases[scene][case].object_ids
         right.setdefault(scene, {})[case] = is_right if answer.correct is None else bool(answer.correct)
     return right

@@ -29,7 +29,7 @@ from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.tables.table import no_formula
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.questions import query_files
-from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
+from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, origin, questions_of_objects, read_metadata
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
 from su3d_bench.questions.query_files import COLUMNS, ObjectId, only_words, validated
 
@@ -236,11 +236,11 @@ def _of_objects(content: Any, where: str) -> Iterator[Question]:
         for scene, cases in chains_of(content, where).cases.items():
             for case in cases:
                 text = " ".join(case.text.split())
-                yield new_question(f"{DATASET}/{scene}", "relative", text, case.object_ids, "Beacon3D")
+                yield new_question(f"{origin(scene)[0]}/{scene}", "relative", text, case.object_ids, "Beacon3D")
         return
     for asked in questions_of_objects(content, where).entries:
         text, reply = " ".join(asked.question.split()), " ".join(asked.answer.split())
-        yield new_question(f"{DATASET}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
+        yield new_question(f"{origin(asked.scene)[0]}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
 
 
 def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:

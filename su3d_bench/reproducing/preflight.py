@@ -30,7 +30,7 @@ OPTIONAL_MODELS = (TAGGER,)  # without RAM++, a word list provides the detector'
 
 @dataclass(frozen=True)
 class Need:
-    """One requirement of runs: ``kind`` is package, model, scene, mesh or truth.
+    """One requirement of runs: ``kind`` is package, model, scene, data (of all scenes), mesh or truth.
 
     ``n_bytes``: download size, None if unknown.
     ``is_required`` false: the run works without it, and ``remark`` explains how.
@@ -82,6 +82,7 @@ def _data(run: RecipeRun) -> Iterator[Need]:
     dataset = dataset_named(run.dataset)
     known = known_scenes(dataset)
     n_bytes, how = _fetched(run.dataset)
+    is_complete = True
     for scene in scene_names(run.dataset, run.scenes):
         address = f"{run.dataset}/{scene}"
         fault = "" if scene in known else f"not found in {data_root()}"
@@ -91,11 +92,15 @@ def _data(run: RecipeRun) -> Iterator[Need]:
             except Su3dError as error:
                 fault = str(error)
         if fault:
+            is_complete = False
             yield Need("scene", address, is_available=False, n_bytes=n_bytes, how=how, remark=fault)
             continue
         yield Need("scene", address, is_available=True, n_bytes=0.0)
         yield from _surface(run, dataset, scene, how)
         yield from _truths(run, dataset, scene, how)
+    for source in () if is_complete else built_in().entries.values():
+        if source.group == run.dataset and source.scenes is None:  # such as Replica's meshes, for all scenes at once
+            yield Need("data", source.name, is_available=False, n_bytes=source.n_bytes, how=how)
 
 
 def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
@@ -158,7 +163,11 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     if name == TAGGER:  # its original checkpoint requires its own package
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
-    remark = "" if is_required else "without it, objects from a word list are detected"
+    remark = (
+        ""
+        if is_required
+        else "without it the detector gets words of a fixed list instead of tags of the image, unlike in the paper"
+    )
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
@@ -189,7 +198,9 @@ def preflight_tables(known: Preflight) -> list[Table]:
 
 
 def _state(need: Need) -> str:
-    return "yes" if need.is_available else "no" if need.is_required else "no (optional)"
+    if need.is_available or need.is_required:
+        return "yes" if need.is_available else "no"
+    return "no (replaced)" if need.kind == "model" else "no (optional)"
 
 
 def _bytes(need: Need) -> str:
@@ -200,7 +211,7 @@ def _bytes(need: Need) -> str:
 
 def _lines(known: Preflight) -> str:
     missing = known.missing
-    n_bytes = sum(need.n_bytes or 0.0 for need in missing if need.kind in ("model", "scene"))
+    n_bytes = sum(need.n_bytes or 0.0 for need in missing if need.kind in ("model", "scene", "data"))
     if not missing:
         return "all requirements are available."
     return f"{counted(len(missing), 'requirement')} missing, about {size(n_bytes)} to fetch."

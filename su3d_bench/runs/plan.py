@@ -33,6 +33,7 @@ from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.perception.language.client import check_key
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors import ELSEWHERE, check_execution
 from su3d_bench.runs.existing import (
@@ -242,6 +243,10 @@ def make_plan(
         existing = existing_run(place.folder.path)
     if place.url is None:
         place.folder.check_is_run_folder()
+    uses_captions = config.profile == "paper" and of_perception.paper.captions == "model"
+    has_replies = config.offline or (place.folder.path / "language").is_dir()  # else requests are sent
+    if (config.question_solver == "llm" or uses_captions) and not has_replies and config.executor not in ELSEWHERE:
+        check_key(of_perception.language)
     root = os.environ.get("SU3D_DATA") or ""
     with data_place(root) if is_url(root) else nullcontext(DataPlace(data_root())) as data_root_here:
         chosen, notes = expand_scenes(config.scenes, datasets, data_root_here.root)

@@ -236,6 +236,12 @@ def test_attribution_command_prints_a_table_and_draws_the_plot(capsys: pytest.Ca
     assert picture.startswith(b"\x89PNG")
     assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
     assert Path("again.png").read_bytes() == picture
+    for name, start in (("errors.pdf", b"%PDF"), ("errors.svg", b"<?xml")):
+        assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", name, "--quiet"]) == 0
+        assert Path(name).read_bytes().startswith(start)
+    capsys.readouterr()
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "errors.eps"]) == 2
+    assert "unknown format of a figure; use a suffix of pdf, svg, png" in capsys.readouterr().err
     capsys.readouterr()
     assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

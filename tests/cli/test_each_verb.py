@@ -52,7 +52,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "runs remove": ("sweep --yes", 0, "removed sweep: complete"),
     "sheets make": ("out --kind retrieval --per-kind 1 --jobs 1 --out sheets", 0, "sheets"),
     "sheets score": ("--key sheets-key --out scores", 0, "scores/scores.json"),
-    "sheets pictures": ("out --draw labels --out labels.png", 0, "labels.png"),
+    "sheets pictures": ("out --queries toilet --out heat.svg", 0, "heat.svg"),
     "query text": ("rooms/bathroom0 'plant on shelf' --run out", 0, "opensu3d"),
     "query make": (f"--scenes {PAINTED}/a --per-kind 1 --out queries.toml", 0, "queries.toml"),
     "query audit": (f"--scenes {PAINTED}/a --n-questions 2 --out audit", 0, "audit/index.html"),

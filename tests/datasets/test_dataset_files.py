@@ -242,6 +242,8 @@ def test_each_file_fault_is_one_line(tmp_path: Path, name: str, file: str, conte
 def test_missing_data_hints_how_to_get_it_and_unknown_scene_suggests_another(tmp_path: Path, name: str) -> None:
     with pytest.raises(ScenesMissing, match=rf"^{name}: no scene in "):
         opened(tmp_path, name).scenes()
+    with pytest.raises(ScenesMissing, match=r"nothere \(there is no such folder\)"):
+        opened(tmp_path / "nothere", name).scenes()
     scene, make = MAKERS[name]
     make(tmp_path)
     for unknown, hint in ((f"{scene}x", f"; did you mean '{scene}'"), ("../tum", "")):

@@ -24,6 +24,7 @@ from su3d_bench.questions.beacon3d import (
     score_of,
 )
 from su3d_bench.questions.chains import made_files, questions_about
+from su3d_bench.questions.question_files import read_external_questions
 from su3d_bench.questions.scene_map import SceneMap
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())["qa"]
@@ -70,6 +71,21 @@ def test_each_object_has_three_questions_and_three_chains() -> None:
     assert made_files({"room": ROOM}) == (grounding, questions)
     fewer, _ = made_files({"room": ROOM}, 1)
     assert sum(len(of_class) for of_class in fewer["room"].values()) == 1
+
+
+@pytest.mark.parametrize(
+    ("scene", "dataset", "first"), [("scene0011_00", "scannet", 1), ("scene_00116_03", "multiscan", 0)]
+)
+def test_texts_that_end_in_a_line_break_and_scenes_of_other_datasets(
+    scene: str, dataset: str, first: int, tmp_path: Path
+) -> None:
+    chain = [{"text": text, "obj_id": [14], "tag": "class"} for text in ("Range hood\n", "Range hood")]
+    content = {scene: {"range hood": {"14": {f"chain_{k}": chain for k in (1, 2, 3)}}}}
+    chains = chains_of(content, "here")
+    assert [chains.cases[scene][case].text for _, case in chains.entries] == ["Range hood\n", "Range hood"]
+    (path := tmp_path / "metadata.json").write_text(json.dumps(content))
+    read = read_external_questions(path)
+    assert {(one.scene, one.text, one.answers) for one in read} == {(f"{dataset}/{scene}", "Range hood", (14 + first,))}
 
 
 # By the number of the object that it is about.

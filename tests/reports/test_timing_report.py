@@ -106,4 +106,5 @@ def test_timing_report_prints_tables_and_writes_plots(
     assert int(method["peak_rss_bytes"]) > 1e6
     for name in ("update-cost", "update-course", "memory", "stages", "anytime"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-        assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        pdf = (tmp_path / f"{name}.pdf").read_bytes()
+        assert pdf.startswith(b"%PDF") and b"/CIDFontType2" in pdf and b"/Type3" not in pdf  # TrueType fonts

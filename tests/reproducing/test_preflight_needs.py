@@ -20,6 +20,16 @@ def missing_meshes(methods: tuple[str, ...]) -> list[Need]:
     return [need for need in preflight([replace(run, methods=methods)]).needs if need.kind == "mesh"]
 
 
+def test_size_of_missing_data_includes_files_of_all_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    assert main(["reproduce", "sam3d", "--profile", "embedded", "--encoder", "embedded", "--dry-run"]) == 1
+    text = capsys.readouterr().out
+    assert "replica-meshes" in text and "33,859,047,808" in text
+    assert "9 requirements missing, about 46.30 GB to fetch" in text  # 12.44 GB of frames, 33.86 GB of meshes
+
+
 def test_missing_scan_mesh_is_reported_for_methods_that_require_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

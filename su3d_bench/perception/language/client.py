@@ -219,11 +219,7 @@ class Server:
 
     def _connected(self) -> Any:
         openai = require("openai", "a language model")
-        if not self._key and self._address == HOSTED:
-            raise ModelMissing(
-                f"${self._config.key_variable} is not set; set it to the key of {self.name}, or use your own "
-                "server with --base-url"
-            )
+        check_key(self._config)
         return openai.OpenAI(
             api_key=self._key or NO_KEY,
             base_url=self._address,
@@ -311,6 +307,15 @@ def _address_of(config: LanguageConfig) -> str:
         except ValueError as error:
             raise ConfigError(f"$OPENAI_BASE_URL: {error}") from error
     return address.rstrip("/") or HOSTED
+
+
+def check_key(config: LanguageConfig) -> None:
+    """Raises ``ModelMissing`` if the hosted service is used without a key."""
+    if _address_of(config) == HOSTED and not _key_of(config):
+        raise ModelMissing(
+            f"${config.key_variable} is not set; set it to the key of {urlsplit(HOSTED).netloc}, or use your own "
+            "server with --base-url or --set perception.language.base_url=URL"
+        )
 
 
 def _key_of(config: LanguageConfig) -> str:

@@ -50,9 +50,10 @@ _NO_NAME = frozenset(
         "is", "are", "was", "be", "am", "i", "you", "we", "it", "its", "they", "cannot", "could", "would", "should",
         "not", "no", "sorry", "based", "list", "given", "names", "name", "assign", "description", "unknown", "none",
         "null", "error", "unclear", "which", "that", "this", "there", "because", "however", "since", "as", "if",
-        "please", "sure", "here",
+        "please", "sure", "here", "unidentified", "unidentifiable", "unrecognized", "unrecognised", "unspecified",
     )
 )  # fmt: skip
+_KEY = re.compile(r"^\s*(?:name|object)\s*:", re.IGNORECASE)
 _NO_OBJECT = frozenset({"object", "objects", "thing", "item", "image", "n/a"})
 _KEYS_OF_ERRORS = frozenset({"error", "message", "refusal", "reason", "status"})
 # Ids have 64 bits: a part of a segment has an id of about a dozen digits (opensu3d/postprocess.py).
@@ -116,10 +117,11 @@ def described(text: str) -> Described | None:
             if (found := next(filter(None, (_pair(*pair) for pair in pairs)), None)) is not None:
                 return found
     patterns = [_LABELLED, _QUOTED_PAIR, *([] if is_refusal(plain) else [_BARE_PAIR])]
-    for match in (match for pattern in patterns for match in pattern.finditer(plain)):
+    unlabelled = _KEY.sub("", plain)
+    for match in (match for pattern in patterns for each in (plain, unlabelled) for match in pattern.finditer(each)):
         if (found := _pair(match["name"], match["caption"])) is not None:
             return found
-    name = None if is_refusal(plain) or "\n" in plain.strip() else clean_name(plain)
+    name = None if is_refusal(plain) or "\n" in plain.strip() else clean_name(unlabelled)
     return None if name is None else Described(name, "")
 
 

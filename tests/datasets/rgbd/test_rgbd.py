@@ -117,6 +117,27 @@ def test_rotated_bits_are_restored_and_invalid_values_have_no_depth(tmp_path: Pa
     assert expected[0, 0] == 0 and (expected > 0).sum() > 90
 
 
+@pytest.mark.parametrize("intrinsics", ["intrinsics", "intrinsics_file"])
+def test_negative_fy_and_poses_without_time_as_in_icl_nuim(tmp_path: Path, intrinsics: str) -> None:
+    write_scene(tmp_path / "plain")
+    expected = open_scene(tmp_path / "plain")
+    (fx, _, cx), (_, fy, cy), _ = expected[0].intrinsics.tolist()
+    values: dict[str, Any] = {"intrinsics": [fx, -fy, cx, cy]}
+    if intrinsics == "intrinsics_file":
+        values = {"intrinsics": None, "intrinsics_file": "negative.txt"}
+    folder = write_scene(tmp_path, pose=None, trajectory="lines.txt", trajectory_format="tum", **values)
+    (folder / "data/negative.txt").write_text(f"{fx} 0 {cx}\n0 {-fy} {cy}\n0 0 1")
+    half = [0.05 * k for k in range(3)]  # y negated: angle around z, too
+    lines = [f"{k} {-1 / 3} {-k} 0 0 {-np.sin(a)} {np.cos(a)}" for k, a in enumerate(half)]
+    (folder / "data/lines.txt").write_text("\n".join(lines))
+    for one, other in zip(open_scene(tmp_path), expected, strict=True):
+        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=1e-15)
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+    (folder / "data/lines.txt").write_text("\n".join([lines[0], "0 " + lines[1], lines[2]]))
+    with pytest.raises(DataError, match="line 2: has 8 values"):
+        open_scene(tmp_path)
+
+
 @pytest.mark.parametrize("axes", ["opencv", "opengl"])
 @pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
 def test_direction_and_axes_are_undone(tmp_path: Path, direction: str, axes: str) -> None:

@@ -49,6 +49,8 @@ class Spoken:
         ("1. Cushion - a soft, red pillow", "cushion", "a soft, red pillow"),
         ("I'm sorry for the blur. `chair':`a chair'", "chair", "a chair"),
         ("chair", "chair", ""),
+        ("object: chair - a wooden chair", "chair", "a wooden chair"),
+        ("Object: office chair", "office chair", ""),
     ],
 )  # fmt: skip
 def test_name_and_description_are_parsed_from_each_format(text: str, name: str, caption: str) -> None:
@@ -60,7 +62,7 @@ def test_name_and_description_are_parsed_from_each_format(text: str, name: str, 
     [
         "", "   ", "I'm sorry, I can't help with that.", "I cannot: determine what it is", "`name':`description'",
         '{"error": "cannot identify"}', "{" * 5000, "unknown: the object is not visible", "\x1b[31m", "?" * 9000,
-        "As an AI, I cannot see images.",
+        "As an AI, I cannot see images.", "Unidentified object", "`Unidentified object':`A blurred shape'",
     ],
 )  # fmt: skip
 def test_refusals_echoes_and_noise_give_no_caption(text: str) -> None:

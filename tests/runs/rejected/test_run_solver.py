@@ -90,3 +90,13 @@ def test_offline_uses_only_stored_replies(folder: Path, server: ChatServer, caps
     assert main(llm(server, "--offline")) == 2
     assert "no stored reply to this ask request of model 'tiny'" in capsys.readouterr().err
     assert server.n_asked == 0
+
+
+def test_missing_key_is_an_error_before_anything_starts(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    assert main([*RUN, *ASKED, "--question-solver", "llm", "--out", "hosted"]) == 2
+    assert "$OPENAI_API_KEY is not set; set it to the key of api.openai.com" in capsys.readouterr().err
+    assert not (folder / "hosted").exists()
