@@ -40,11 +40,11 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'DATASET/*')")
     parser.option(
         "--layout",
-        "file layout: native (frames rendered on demand), replica or scannet (default: native)",
+        "file layout: native (no frames written), replica or scannet (default: native)",
         choices=LAYOUTS,
         default="native",
     )
-    parser.option("--out DIR", "data root to write to (native: default $SU3D_DATA)", type=output_path)
+    parser.option("--out DIR", "data root (required; for native: default $SU3D_DATA)", type=output_path)
     parser.shared("--set", "--jobs")
     fetch.add_data(actions)
     add_new(actions, "dataset")
@@ -84,7 +84,7 @@ def call_make(arguments: argparse.Namespace) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> None:
-    """List datasets and available scenes; for named datasets, also how to obtain missing ones.
+    """List datasets and available scenes; for named datasets, also how to get missing scenes.
 
     su3d-bench datasets list
     su3d-bench datasets list scannet --json

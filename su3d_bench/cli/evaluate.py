@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "name of the method (default: name of --out), or METHOD=PREDICTIONS to score several",
+        "name of the method (default: name of --out); as METHOD=PREDICTIONS, score several",
         action="extend",
         default=[],
     )
@@ -37,7 +37,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--dataset NAME", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
     parser.option(
         "--ground-truth DIR",
-        "folder of ground truth as text, one <scene>.txt each; or OpenLex3D's release",
+        "folder of ground truth, one <scene>.txt per scene; or OpenLex3D's release",
     )
     parser.option(
         "--ground-truth-values",
@@ -45,11 +45,11 @@ def add_parser(verbs: Verbs) -> None:
         choices=("classes", "instances", "numbers"),
     )
     parser.shared("--protocols", "--scenes")
-    parser.option("--format FORMAT", "format of the predictions (default: recognised)")
+    parser.option("--format FORMAT", "format of the predictions (default: detected)")
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "use those of the protocol or of the file (default: protocol; ScanNet text and MaskClustering: file)",
+        "by the protocol's rule or from the file (default: file for ScanNet, MaskClustering)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

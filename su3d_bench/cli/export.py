@@ -35,7 +35,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--out DIR", "new folder for the files", type=output_path, required=True)
     parser.option("--method METHOD", "method whose maps are exported (default: the only one of the run)")
     parser.shared("--scenes")
-    parser.option("--format FORMAT", "format of the predictions (default: recognised)")
+    parser.option("--format FORMAT", "format of the predictions (default: detected)")
     parser.option(
         "--protocol PROTOCOL",
         "protocol that defines the classes of scannet(pp) files (default: the only one)",

@@ -27,7 +27,7 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
     """Add ``--accept``, ``--dry-run``, ``--retries`` and, with ``has_servers``, ``--mirror`` and ``--sources``."""
     parser.option(
         "--accept NAME...",
-        "accept the licence of NAME, or a licence such as MIT (default: ask)",
+        "model, dataset or licence (such as MIT) to accept (default: ask)",
         action="extend",
         default=[],
     )
@@ -36,7 +36,7 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
     if has_servers:
         parser.option(
             "--mirror NAME=URL...",
-            "download NAME from another server or hub endpoint",
+            "download NAME (see --dry-run) from another server or hub",
             action="extend",
             default=[],
         )
@@ -170,7 +170,7 @@ def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
 def add_models(verbs: Verbs) -> None:
     parser = add_verb(verbs, "fetch", call_models, resumes=True)
     parser.option("names [MODEL...]", "names from models list")
-    parser.option("--for PROFILE", "all models of a profile: paper", dest="profile")
+    parser.option("--for PROFILE", "all models of PROFILE: paper", dest="profile")
     _add_fetch_options(parser)
     parser.shared("--set")
 

@@ -85,7 +85,7 @@ def _state_row(state: ModelState) -> dict[str, Any]:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
-    """Print the SHA-256 of every model file, as in run records, and report all problems.
+    """Print the SHA-256 of every model file, as in run.json, and report all problems.
 
     su3d-bench models check
     su3d-bench models check clip-vit-h-14 sam-vit-h --json

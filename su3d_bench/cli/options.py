@@ -201,13 +201,13 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("run RUN", "run folder"),
         option("runs RUN...", "folders of finished runs"),
         option("--jobs N", "number of parallel jobs (default: number of CPU cores)", type=count),
-        option("--device DEVICE", "device for models and matching: cpu, cuda or cuda:N (default: cpu)"),
+        option("--device DEVICE", "device for models and labels: cpu, cuda or cuda:N (default: cpu)"),
         option("--methods METHOD...", "methods to use (default: all)", default=[]),
         option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
         option("--protocols PROTOCOL...", "protocols to use (default: all that fit)", action="extend", default=[]),
         option(
             "--set KEY=VALUE...",
-            "settings, such as opensu3d.top_m=10 or perception.models.folder=/data/models",
+            "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data",
             action="extend",
             default=[],
         ),
@@ -216,7 +216,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--method METHOD", "method whose maps are used (default: opensu3d)", default="opensu3d"),
         option(
             "--format",
-            "table format (default: text on stdout, markdown in files)",
+            "table format (default: text; in files markdown)",
             dest="table_format",
             choices=TABLE_FORMATS,
         ),
@@ -249,7 +249,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--retries N", "retries of a scene after a lost worker (default: 2)", type=int),
         option("--slurm KEY=VALUE...", "submitit options, such as slurm_partition=gpu timeout_min=60"),
         option("--offline", "use only stored replies of language models", action=argparse.BooleanOptionalAction),
-        option("--dry-run", "show what would be done and the time, memory and disk it needs, and exit"),
+        option("--dry-run", "show what would be done and what it needs, and exit"),
     ]
 )
 SHARED["--table-format"] = SHARED["--format"]  # where --format is an input format

@@ -1,7 +1,7 @@
 """Paths on the command line: which options are outputs, and the check that no output replaces or lies in an input.
 
-An option is an output if its type is ``output_path``, ``figure_path`` or ``run_place``, or if it is ``--json``; every other path is an
-input. Folders that are only searched, such as that of ``report leaderboard``, may contain outputs.
+An option is an output if its type is ``output_path``, ``figure_path`` or ``run_place``, or if it is ``--json``; every
+other path is an input. Folders that are only searched, such as that of ``report leaderboard``, may contain outputs.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol P", "protocol, or .toml file", required=True)
-    parser.option("--encoder E", "encoder from models list (default: that of the protocol)")
+    parser.option("--encoder E", "embedded, or from models list (default: the protocol's)")
     parser.shared("--queries", "--device", "--set")
     parser.option("--out FILE", ".npz file to write", type=output_path, required=True)
     add_new(actions, "protocol")

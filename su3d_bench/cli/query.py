@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import options, output, questions
-from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count, output_path
+from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted
 
@@ -44,7 +44,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.option(
         "--names",
-        "labels of the map, or refined by runs refine (default: refined if available)",
+        "original labels or those of runs refine (default: refined if available)",
         choices=("auto", "label", "refined"),
         default="auto",
     )

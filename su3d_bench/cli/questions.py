@@ -58,7 +58,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--format")
     parser = add_verb(verbs, "score", _score)
     parser.option("file FILE", "metadata_*.json of Beacon3D")
-    parser.option("--answers FILE", "JSON file of answers, in Beacon3D's order", required=True)
+    parser.option("--answers FILE", "JSON list of answers, in the order of Beacon3D's scannet_*.json", required=True)
     parser.option("--judge", "score unmatched free-form answers with an LLM judge")
     options.add_language_options(parser, JUDGE_MODEL)
     parser.shared("--format")

@@ -98,7 +98,7 @@ def _add_timing(verbs: Verbs) -> None:
     parser.shared("runs")
     parser.shared("--methods")
     parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
-    parser.option("--camera-rate HZ", "frame rate of the camera (default: 30)", type=positive, default=30.0)
+    parser.option("--camera-rate HZ", "frame rate, for the real-time factor (default: 30)", type=positive, default=30.0)
     parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots", type=output_path)
     parser.shared("--format")
 
@@ -231,7 +231,7 @@ def _add_attribution(verbs: Verbs) -> None:
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
-    """Show the score lost to each type of error: the gain in each metric if the type were corrected.
+    """Show the gain in each metric if all errors of one type were corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
     su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json

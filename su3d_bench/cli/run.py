@@ -50,7 +50,7 @@ def _add_run_options(parser: Parser) -> None:
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option(
         "--out DIR",
-        "run folder or URL, such as s3://bucket/run (default: runs/<name>)",
+        "run folder or URL, such as s3://bucket/run (default: a folder in runs/)",
         type=run_place,
     )
     into = parser.add_mutually_exclusive_group()

@@ -23,7 +23,7 @@ def add_parser(verbs: Verbs) -> None:
     """Human evaluation: create annotation sheets, score answers, and draw figures.
 
     su3d-bench sheets make runs/my-run --kind retrieval --out sheets
-    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json
+    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key
     """
     actions = add_group(verbs, "sheets", add_parser)
     sheets_make.add_parser(actions)
@@ -33,19 +33,19 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: only the ground truth's verdicts)")
+    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: score with the ground truth only)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
-    parser.option("--disputed FILE", "CSV file to write with disputed questions, for --exclude-ids", type=output_path)
+    parser.option("--disputed FILE", "write disputed questions to this CSV file, for --exclude-ids", type=output_path)
     parser.shared("--format")
 
 
 def call_score(arguments: argparse.Namespace) -> None:
     """Score the answers of all annotators: accuracy, tests, agreement, comparison with the ground truth.
 
-    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores
-    su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv
+    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key --out scores
+    su3d-bench sheets score ann.csv bob.csv --key sheets-key --disputed disputed.csv
     """
     from dataclasses import asdict
 

@@ -34,7 +34,12 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call)
     parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
-    parser.option("--kind ...", "what annotators rate; one folder per kind if several", choices=KINDS, required=True)
+    parser.option(
+        "--kind ...",
+        "what annotators rate (annotation: labels and masks); a folder per kind if several",
+        choices=KINDS,
+        required=True,
+    )
     parser.option("--out DIR", "folder for the sheets", type=output_path, required=True)
     parser.option("--key DIR", "folder for the key: which method made what (default: <--out>-key)", type=output_path)
     parser.option(

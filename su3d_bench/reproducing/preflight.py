@@ -163,11 +163,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     if name == TAGGER:  # its original checkpoint requires its own package
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
-    remark = (
-        ""
-        if is_required
-        else "without it the detector gets words of a fixed list instead of tags of the image, unlike in the paper"
-    )
+    remark = "" if is_required else "a fixed list of words replaces its tags of the image, unlike in the paper"
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
