@@ -22,7 +22,7 @@ from su3d_bench.metrics.protocols.loading import class_names
 DPI = 100
 DARK, GREY = "#222222", "#666666"
 # Fonts are embedded as TrueType, text in an SVG stays text, and a fixed salt makes it reproducible.
-FONTS = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench"}
+FONTS: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench"}
 METADATA = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}  # without dates
 
 

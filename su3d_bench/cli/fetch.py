@@ -149,7 +149,7 @@ def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> No
 @contextmanager
 def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
     """A progress callback that draws one bar per file if stderr is a terminal."""
-    with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
+    with drawn_bars(is_quiet=arguments.quiet) as bars:
         if bars is None:
             yield lambda name, done, total: None
             return
