@@ -1,4 +1,4 @@
-"""HOV-SG's and OpenLex3D's scripts on synthetic files of Replica and maps; plyfile must be installed.
+"""HOV-SG's and OpenLex3D's scripts on synthetic files of Replica and maps; they need plyfile, queries also faiss.
 
 Open3D orders the voxels of a cloud by chance, unless it has one thread as here.
 """
@@ -20,21 +20,17 @@ from original_code import STOPS, Ask, Original, load, recorded, silence
 from original_instances import emptied
 from original_points import SHORT
 from places import CASES
-from synthetic_maps import DIMENSIONS, ORIGINAL, PROMPTS, RELEASE, Problem, PromptEncoder, Scene, scored, written
+from synthetic_maps import DIMENSIONS, ORIGINAL, PROMPTS, RELEASE, Problem, PromptEncoder, Scene, values_of, written
 from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import combine
 
 HYDRA = {"hydra": {"main": lambda **_: lambda function: function}}
-HOVSG_VALUES = {
-    "mIoU": "mean_iou",
-    "F-mIoU": "frequency_weighted_iou",
-    "mAcc": "mean_accuracy",
-    "pAcc": "pixel_accuracy",
-}
+SEABORN = {"seaborn": {"color_palette": lambda *_, n_colors: [(0.0, 0.0, 0.0)] * n_colors}}
+LEX_SCRIPT, LEX_QUERIES = (f"openlex3d/scripts/evaluate_{name}.py" for name in ("segmentation", "queries"))
+HOVSG_FUNCTIONS = ("mean_iou", "frequency_weighted_iou", "mean_accuracy", "pixel_accuracy")
 
 
 def _mesh(rng: np.random.Generator) -> tuple[Scene, Int64Array]:
@@ -97,6 +93,16 @@ def drawn_for_openlex3d(seed: int, index: int) -> Problem:
     return scenes
 
 
+def drawn_with_queries(seed: int, index: int) -> Problem:
+    """Problem ``index`` with texts that ask for objects, some of them without points."""
+    rng, scenes = np.random.default_rng([seed, index, 8]), drawn_for_openlex3d(seed, index)
+    for scene in scenes:
+        ids = [*map(int, scene["objects"]), *set(scene["owner"]), 99]
+        texts = rng.choice(PROMPTS, rng.integers(1, 5), replace=False).tolist()
+        scene["queries"] = {text: rng.permutation(list({*rng.choice(ids, 3).tolist()})).tolist() for text in texts}
+    return scenes
+
+
 def hovsg(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     """Its main function on the files of each scene; the features of objects and classes are axes."""
     others = ["omegaconf", "open_clip", "segment_anything", "torchmetrics", "cv2", "matplotlib.pyplot", "PIL"]
@@ -106,7 +112,7 @@ def hovsg(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     module.open_clip = types.SimpleNamespace(create_model_and_transforms=lambda *_, **__: (model, None, None))
     axis = {"background": 0, **dict(zip(replica_label_set().names, replica_label_set().ids, strict=True))}
     module.text_prompt = lambda _, __, features, labels, **___: features[:, [axis[name] for name in labels]]
-    answers = [recorded(module, name) for name in HOVSG_VALUES.values()]
+    answers = [recorded(module, name) for name in HOVSG_FUNCTIONS]
     colours = folder / "colours.json"
     colours.write_text(json.dumps({one: [0, 0, 0] for one in range(-1, 102)}))
     clip = types.SimpleNamespace(type="ViT-H-14", checkout="", checkpoint="")
@@ -133,12 +139,8 @@ def openlex3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     """Its main function on the files of each scene, with its own settings and given text features."""
     import yaml
 
-    colours = {"seaborn": {"color_palette": lambda *_, n_colors: [(0.0, 0.0, 0.0)] * n_colors}}
-    script = checkout / "openlex3d/scripts/evaluate_segmentation.py"
-    module = load(script, [checkout], absent=["omegaconf"], replaced=HYDRA | colours)
-    base: Any = importlib.import_module("openlex3d.models.base").VisualLanguageEncoder
-    texts = {"compute_text_features": lambda self, prompts, **_: PromptEncoder().encode_texts(prompts)}
-    module.load_model = lambda _: type("Given", (base,), texts)()
+    module = load(checkout / LEX_SCRIPT, [checkout], absent=["omegaconf"], replaced=HYDRA | SEABORN)
+    module.load_model = _given_texts
     results: list[dict[str, Any]] = []
     module.save_results = lambda **found: results.append(found["results"])
     settings = yaml.safe_load((checkout / "openlex3d/config/eval_segmentation.yaml").read_text())["evaluation"]
@@ -160,17 +162,45 @@ def openlex3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     return ask
 
 
+def _given_texts(settings: object) -> Any:
+    base: Any = importlib.import_module("openlex3d.models.base").VisualLanguageEncoder
+    texts = {"compute_text_features": lambda self, prompts, **_: PromptEncoder().encode_texts(prompts)}
+    return type("Given", (base,), texts)()
+
+
+def openlex3d_queries(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """Its matches of each scene and their AP, with its own settings and given text features; needs faiss."""
+    import yaml
+
+    module = load(checkout / LEX_QUERIES, [checkout], absent=["omegaconf"], replaced=HYDRA | SEABORN)
+    vars(importlib.import_module("openlex3d.core.cosine_similarity"))["load_model"] = _given_texts
+    vars(importlib.import_module("openlex3d.core.align_masks"))["use_gpu"] = False
+    settings = yaml.safe_load((checkout / "openlex3d/config/eval_query.yaml").read_text())
+    settings["evaluation"]["predictions_path"] = folder / "files/maps"
+    parts = {name: types.SimpleNamespace(**settings[name]) for name in ("masks", "evaluation")}
+    dataset = types.SimpleNamespace(name="replica", path=folder / "files" / ORIGINAL)
+    paths = types.SimpleNamespace(openlex_gt_path=folder / "files" / RELEASE, output_path=folder / "out")
+    words = types.SimpleNamespace(**parts, dataset=dataset, paths=paths, model=None)
+
+    def ask(problem: Problem) -> Float64Array:
+        matches: dict[str, Any] = {}
+        for name in written(emptied(folder / "files"), problem):
+            matches |= module.get_matches_for_scene(words, name)[0]
+        found = module.compute_ap_averages(module.compute_ap(matches)[0], factor=1)
+        return np.array([[found[key] for key in ("all_ap", "all_ap_50%", "all_ap_25%")]], float)
+
+    return ask
+
+
 def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
-    """The values of each scene."""
-    names = HOVSG_VALUES if rules.metric == "hovsg" else rules.value_names
+    """The values of each scene, of queries those of all scenes."""
     with tempfile.TemporaryDirectory() as folder, silence():
-        rows = combine(rules, scored(rules, problem, Path(folder)), with_intervals=False).per_scene.values()
-    return np.array([[row[name] for name in names] for row in rows], float)
+        return values_of(rules, problem, Path(folder))
 
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
     """The original's answers to the first ``n`` problems with a new answer."""
-    drawn = drawn_for_hovsg if rules.metric == "hovsg" else drawn_for_openlex3d
+    drawn = next(one.drawn for one in ORIGINALS if rules.name in one.protocols)
     kept: dict[str, str] = {}
     for problem in (drawn(seed, index) for index in itertools.count()):
         with silence():
@@ -193,10 +223,11 @@ ORIGINALS = (
     Original(("replica-hovsg",), "application/eval/evaluate_sem_seg.py", hovsg, drawn_for_hovsg, ours, keep),
     Original(
         ("openlex3d-topn", "openlex3d-ranking"),
-        "openlex3d/scripts/evaluate_segmentation.py",
+        LEX_SCRIPT,
         openlex3d,
         drawn_for_openlex3d,
         ours,
         keep,
     ),
+    Original(("openlex3d-queries",), LEX_QUERIES, openlex3d_queries, drawn_with_queries, ours, keep),
 )

@@ -2,8 +2,8 @@
 
 A problem is a list of scenes. A scene has ``vertices`` and ``faces`` with their ``owner``, the class ``listed`` for
 some of the objects, and a map: for HOV-SG ``clouds`` and the class ``called`` for each; for OpenLex3D ``cloud``, the
-``index`` of the object of each point and ``features``, with ``objects``, their four tiers of labels, and ``visible``
-points. Positions are integers, ``per_m`` of them in a metre.
+``index`` of the object of each point and ``features``, with ``objects``, their four tiers of labels, ``visible``
+points, and the objects of ``queries``. Positions are integers, ``per_m`` of them in a metre.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from typing import Any
 import numpy as np
 from prediction_files import write_hovsg, write_openlex
 
-from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.datasets.openlex3d.release import truth_below
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.truth import corner_truth, read_annotated_mesh
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import score_scene
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.dense import openlex3d
 from su3d_bench.predictions.hovsg import hovsg
 
@@ -36,6 +35,7 @@ PROMPTS = (
     "window ledge",
 )  # fmt: skip
 DIMENSIONS = 6
+HOVSG_VALUES = ("mIoU", "F-mIoU", "mAcc", "pAcc")
 RELEASE, ORIGINAL = "gt_openlex3d", "replica_v1"
 
 
@@ -83,6 +83,8 @@ def written(root: Path, problem: Problem) -> list[str]:
             for one, labels in scene["objects"].items()
         ]
         (folder / "gt_categories.json").write_text(json.dumps({"dataset": {"samples": samples}}))
+        queries = json.dumps({"level0": scene.get("queries", {})})
+        (folder / "gt_categories_query_to_object_mapping_l0.json").write_text(queries)
         write_pcd_points(folder / "gt_visible_cloud.pcd", metres(scene, scene["visible"]))
     return names
 
@@ -109,8 +111,8 @@ def _write_mesh(folder: Path, scene: Scene) -> None:
     (folder / "info_semantic.json").write_text(json.dumps({"classes": classes, "objects": objects}))
 
 
-def scored(rules: ProtocolRules, problem: Problem, root: Path) -> dict[str, SceneScore]:
-    """The score of each scene, from its files below ``root``, which are written first."""
+def values_of(rules: ProtocolRules, problem: Problem, root: Path) -> Float64Array:
+    """The values of each scene, of queries those of all scenes, from files below ``root``, which are written first."""
     scores, labels = {}, replica_label_set()
     for name, scene in zip(written(root, problem), problem, strict=True):
         if "clouds" in scene:
@@ -122,4 +124,7 @@ def scored(rules: ProtocolRules, problem: Problem, root: Path) -> dict[str, Scen
             truth = truth_below(root, "replica", name, rules.ground_truth)
             found = openlex3d(root / "maps" / name, name)[0]
             scores[name] = score_scene(rules, truth, found, PromptEncoder())
-    return scores
+    found = combine(rules, scores, with_intervals=False)
+    names = {"hovsg": HOVSG_VALUES, "query-ap": rules.headline}.get(rules.metric) or rules.value_names
+    rows = [found.metrics] if rules.metric == "query-ap" else [found.per_scene[name] for name in scores]
+    return np.array([[row[name] for name in names] for row in rows], float)
