@@ -17,7 +17,7 @@ ENDS = (
     ("sys.exit(0)", "1"),
     ("sys.exit(0)", "2"),
     ("raise KeyboardInterrupt", "1"),
-    ("raise type('Odd', (BaseException,), {})", "2"),
+    ("raise type('Odd', (BaseException,), {'__str__': lambda error: sys.exit(0)})", "2"),
 )
 METHOD = """
 import os, signal, sys
