@@ -110,7 +110,7 @@ def _exit_code(words: Sequence[str]) -> int:
         remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Terminated) else EXIT_INTERRUPTED
     except BaseException as error:  # noqa: BLE001 - the one place that turns every other exception into a line
-        if isinstance(error, SystemExit) and not errors.user_code_line(error):  # of the parser
+        if isinstance(error, SystemExit) and "call" not in arguments:  # of the parser
             return error.code if isinstance(error.code, int) else EXIT_WRONG_INPUT if error.code else EXIT_DONE
         is_debug = "--debug" in words
         if is_debug:

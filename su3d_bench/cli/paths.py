@@ -38,7 +38,7 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     Links and the case of letters make no difference, because files are compared by their identity. If the working
     directory or one above it is an input, new files may be created there.
     """
-    inputs: dict[tuple[int, int] | None, tuple[Path, bool]] = {}
+    inputs: dict[tuple[int, int], tuple[Path, bool]] = {}
     outputs: dict[str, Path] = {}
     for action in parser._actions:
         value = getattr(arguments, action.dest, None)
@@ -48,18 +48,17 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
             outputs |= {name: value} if isinstance(value, Path) else {}
         else:
             searched = action.type is searched_folder
-            inputs |= {_identity(path): (path, searched) for path in _paths(action, value)}
+            inputs |= {key: (path, searched) for path in _paths(action, value) if (key := _identity(path))}
     if not outputs:
         return
     from su3d_bench.store.run_folder import JOBS, is_run  # slow to import
 
-    inputs.pop(None, None)
     data, here, written = _identity(data_root()), Path.cwd(), dict[Path, str]()
     for name, path in outputs.items():
         real = Path(os.path.realpath(path))
         for place in (real, *real.parents, *Path(os.path.abspath(path)).parents):
             identity = _identity(place)
-            found, is_searched = inputs.get(identity, (None, False))
+            found, is_searched = inputs.get(identity or (0, 0), (None, False))
             fault = None
             if found is not None and place == real:
                 fault = "is an input of this command"

@@ -6,7 +6,6 @@ The form of a message is *where: what is wrong (value); what to do*, in lower ca
 from __future__ import annotations
 
 import errno
-import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -197,6 +196,8 @@ def is_unusable_path(error: BaseException) -> TypeGuard[OSError]:
 
 def user_code_line(error: BaseException) -> str:
     """``my_method.py:12``: the deepest line of a user-defined file in the traceback of ``error``; empty without one."""
+    import traceback
+
     if isinstance(error, SyntaxError) and error.filename and not error.filename.startswith(_library_folders()):
         return printable(f"{Path(error.filename).name}:{error.lineno}", 200)
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
@@ -208,6 +209,8 @@ def user_code_line(error: BaseException) -> str:
 
 def error_line(error: BaseException) -> str:
     """One line for any error; other than a ``Su3dError``, with its type and the line of the user-defined file."""
+    import traceback
+
     text = printable(str(traceback.TracebackException(type(error), error, None)), MAX_CHARACTERS)  # never raises
     if isinstance(error, MemoryError):
         return f"out of memory ({text or 'no details'}); try fewer --jobs or a machine with more memory"

@@ -79,3 +79,14 @@ def test_command_that_would_replace_an_input_is_rejected(attack: str, capsys: py
     (line,) = capsys.readouterr().err.splitlines()
     assert reason in line
     assert {path.read_text() for path in Path().rglob("*") if path.is_file()} == {"kept"}
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["runs list LONG", "compare LONG LONG", "methods new LONG.py", "run --methods LONG.py:X", "report leaderboard LONG",
+     "evaluate LONG --ground-truth LONG", "sheets score --key LONG", "query text rooms/a x --run LONG"],
+)  # fmt: skip
+def test_name_that_the_system_rejects_is_an_input_error(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.replace("LONG", "n" * 300).split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "File name too long; choose another file or folder" in line
