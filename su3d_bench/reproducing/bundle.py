@@ -342,13 +342,12 @@ def verify_bundle(bundle: Path) -> Verified:
 def _faults_of(run: FinishedRun, found: Verified) -> Iterator[str]:
     check_no_custom_code(run)
     check_dataset_ground_truth(run)
-    wrong = [f"{where}: {fault}" for where, fault in examine(run, with_maps=True).faults]
+    wrong = [f"{where}: {fault}" for where, fault in examine(run, with_maps=True)[1]]
     yield from wrong
-    for one in () if wrong else rescored(run):
-        found.n_scores += one.n_scores
-        found.is_to_the_bit &= one.is_to_the_bit
-        if one.fault is not None:
-            yield one.fault
+    for n_scores, is_to_the_bit, fault in () if wrong else rescored(run):
+        found.n_scores += n_scores
+        found.is_to_the_bit &= is_to_the_bit
+        yield from [] if fault is None else [fault]
 
 
 def check_no_custom_code(run: FinishedRun) -> None:

@@ -244,17 +244,13 @@ class JobInputs:
             key = {**key, "pictures": str(True)}
         return folder.is_whole(completion, key)
 
-    @property
-    def caveat(self) -> str | None:
-        return caveat_of(self.method, self.perception, self.info)
-
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are complete; ``remarks`` are stored with the completion record of the scores."""
         return MethodOutcome(
             self.job.scene,
             self.name,
             profile=self.perception.profile if self.method.needs.frames else None,
-            caveat=self.caveat,
+            caveat=caveat_of(self.method, self.perception, self.info),
             encoder=self.perception.encoder.name,
             encoder_digest=self.perception.encoder.digest,
             data_digest=self.data_digest,

@@ -90,7 +90,7 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
     "other weights": (
         in_record(lambda r: r["models"].update(sam={"w.pt": "0" * 64})),
-        "weights: sam/w.pt was not set, now 000000000000...",
+        "run: sam/w.pt was not set, now 000000000000...",
     ),
     "more scenes claimed": (
         in_metrics(lambda m: m["results"][0]["result"].update(n_scenes=9)),
