@@ -30,7 +30,7 @@ LOCAL = {"profile": "embedded", "executor": "auto", "offline": True, "pictures":
 
 
 def rescored(run: FinishedRun) -> Iterator[tuple[int, bool, str | None]]:
-    """Every map of ``run``, scored again on this machine: the number of scores, whether they are identical, the fault."""
+    """Number of scores, whether they are identical, and the fault, of every map of ``run`` scored again here."""
     is_same_machine = run.record.processor == processor_digest()
     for scene, method, scores in _of_predictions(run) if run.record.predictions else _of_maps(run):
         counts = read_arrays(io.BytesIO(file_bytes(run.folder.job(scene, method).counts)))

@@ -230,8 +230,6 @@ class SideNumbers:
         found = []
         for side, of_side in zip(sides, scores, strict=True):
             own = {scene: of_side[scene] for scene in common}
-            for scene, score in own.items():
-                metric.check(f"{side.name}: {printable(scene, 100)}", score.counts)
             key = side.run.folder.path, side.method, protocol, tuple(common)
             if key not in self._over_scenes:
                 result = combine(rules, own, with_intervals=False)

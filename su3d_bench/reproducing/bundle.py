@@ -7,6 +7,7 @@ on every machine. Predictions are already compressed.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import stat
@@ -234,7 +235,7 @@ def is_safe(name: str) -> bool:
 
 def _manifest(content: bytes, where: str) -> Manifest:
     try:
-        atomic.json_value(content.decode())
+        json.loads(content, object_pairs_hook=atomic.unique_keys)
         return Manifest.model_validate_json(content)
     except (ValueError, RecursionError) as error:
         places = error.errors()[0]["loc"] if isinstance(error, ValidationError) else ()
@@ -265,7 +266,7 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
 def _check_jobs(run: str, content: bytes, manifest: Manifest, where: str) -> None:
     """Raise ``StoreError`` if the manifest has files of jobs that run.json, with this content, does not name."""
     try:
-        record = checked(RunRecord, atomic.json_value(content.decode()))
+        record = checked(RunRecord, json.loads(content, object_pairs_hook=atomic.unique_keys))
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{where}: {run}/run.json is invalid for a bundle") from error
     scenes, methods = set(map(folder_of_scene, record.scenes)), {*record.methods, CEILING_METHOD}

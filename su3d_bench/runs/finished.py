@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 
 MAX_NAMED = 8  # scenes or methods of a run in a message
-MAX_NAME_BYTES = 255  # of a folder's name
 AS_SUBMITTED = "as submitted"  # times that were not measured again
 
 
@@ -262,10 +261,9 @@ def read_run(path: Path) -> FinishedRun:
         if twice := [name for name, n in Counter(names).items() if n > 1]:
             raise StoreError(f"{shown}: {what} '{printable(twice[0], 100)}' twice; run its command again")
     protocols = {rules.name: rules for rules in record.protocols}
-    for name in (*record.methods, *record.scenes):
-        is_scene = name not in record.methods
-        if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES or (not is_scene and "/" in name):
-            raise StoreError(f"{shown}: run.json: '{printable(name, 80)}' is not a valid name of a method or scene")
+    bad = [name for name in (*record.methods, *record.scenes) if not name.isprintable() or len(name.encode()) > 255]
+    if bad := [*bad, *(name for name in record.methods if "/" in name)]:
+        raise StoreError(f"{shown}: run.json: '{printable(bad[0], 80)}' is not a valid name of a method or scene")
     if unnamed := [one.protocol for one in metrics.results if one.protocol not in protocols]:
         raise StoreError(f"{shown}: run.json does not name the protocol '{unnamed[0]}'; run its command again")
     return FinishedRun(

@@ -21,7 +21,6 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import visible_truth
-from su3d_bench.perception.oracle import OraclePerception
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
@@ -278,9 +277,3 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
 def sees_profile(method: Method) -> bool:
     """Whether the method gets its masks and names from the perception of the run."""
     return method.needs.frames and not getattr(method, "has_own_perception", False)
-
-
-def uses_ground_truth(method: Method, profile: str | None) -> bool:
-    """Whether the numbers of ``method`` under ``profile`` are a ceiling: ground truth reaches it in some form."""
-    is_told = isinstance(method, UsesGroundTruth) or method.needs.true_proposals
-    return is_told or (profile == OraclePerception.profile and sees_profile(method))

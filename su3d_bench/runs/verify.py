@@ -19,16 +19,18 @@ from su3d_bench.core.config import flatten, resolve
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import StoreError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.interfaces import UsesGroundTruth
 from su3d_bench.core.registry import CEILING_METHOD, base_name
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, plain_json
+from su3d_bench.perception.oracle import OraclePerception
 from su3d_bench.predictions.run_predictions import read_stored
 from su3d_bench.reports.tables.model import is_ceiling
 from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
-from su3d_bench.runs.job import Part, build_method, options_model, uses_ground_truth
+from su3d_bench.runs.job import Part, build_method, options_model, sees_profile
 from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, CompletionRecord, NumbersRecord, ResultRecord, plain
@@ -73,11 +75,9 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
                 jobs[scene, method] = steps = run.folder.job(scene, method).completion_records()
                 for fault in _job_faults(run, scene, method, steps, with_maps):
                     yield f"{method} / scene {scene}", fault
-    perfect: Scores | None = None
     for method in run.methods:
         try:
-            perfect = run.scores(CEILING_METHOD) if perfect is None else perfect
-            scores = run.scores(method)
+            scores, perfect = run.scores(method), run.scores(CEILING_METHOD)
             read_update_times(run, method)
         except Su3dError as error:
             yield method, str(error)
@@ -100,15 +100,16 @@ def _record_faults(run: FinishedRun) -> Iterator[Fault]:
     """Contradictions between run.json, metrics.json and run.toml."""
     record, metrics, asked = run.record, run.metrics, run.settings
     status = "incomplete" if any(failure.method in run.methods for failure in record.failed) else "complete"
-    for what, *values in (
-        ("scenes", record.scenes, metrics.scenes or record.scenes),
-        ("is_partial", record.is_partial, metrics.is_partial, metrics.limit > 0),
-        ("limit", metrics.limit, asked.get(("limit",), 0)),
-        ("seed", record.seed or 0, metrics.seed, asked.get(("seed",), 0)),
-        ("status", record.status, status),
-    ):
-        if any(value != values[0] for value in values):
-            yield "run.json", f"{what} is {' and '.join(printable(str(value), 60) for value in values)} in its records"
+    told: dict[str, tuple[object, ...]] = {
+        "scenes": (record.scenes, metrics.scenes or record.scenes),
+        "limit": (metrics.limit, asked.get(("limit",), 0)),
+        "is_partial": (record.is_partial, metrics.is_partial, metrics.limit > 0),
+        "seed": (record.seed or 0, metrics.seed, asked.get(("seed",), 0)),
+        "status": (record.status, status),
+    }
+    for what, values in told.items():
+        if len(set(values)) > 1:
+            yield "run.json", f"{what} is {' and '.join(printable(str(value), 60) for value in values)} in the records"
     existing = existing_run(run.folder.path)
     if existing is None or not existing.is_known:
         yield "run.toml", "is not the file that the run wrote"
@@ -117,7 +118,7 @@ def _record_faults(run: FinishedRun) -> Iterator[Fault]:
 def _job_faults(
     run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], with_maps: bool
 ) -> Iterator[str]:
-    """Files of a job that are not those that the run wrote, and inputs of it that the records of the run contradict."""
+    """Files of a job that are not those that the run wrote, and its inputs that the records of the run contradict."""
     job, record = run.folder.job(scene, method), run.record
     files = {name: digest for step in steps.values() for name, digest in step.files.items()}
     maps = (job.prediction.name, features_beside(job.prediction).name)
@@ -150,49 +151,47 @@ def _job_faults(
             stated[name] = settings.get(name, "null")
         if name in stated and text != stated[name] and text not in stated[name].split(" or "):
             yield f"done.json: {name} is {printable(text, 60)}, the run says {printable(stated[name], 60)}"
-    for own, known in ((key.get("profile"), record.profile), (score.get("encoder"), record.encoder_digest)):
-        if own is not None and own not in (known or "").split(", "):
-            yield f"done.json: the profile or encoder is {own}, run.json says {known}"
     if score.get("predict") != digest_json(dict(key)):
         yield "done.json: the counts are those of another map"
+    own = [one for one in run.results.values() if one.method == method and method not in run.external]
+    results = [one for one in own if one.result is not None and scene in one.result.scenes]
+    known = [(record.profile, record.encoder_digest), *((one.profile, one.encoder_digest) for one in results)]
+    for names in known:
+        for used, claimed in zip((key.get("profile"), score.get("encoder")), names, strict=True):
+            if used is not None and used not in (claimed or "").split(", "):
+                yield f"done.json: the profile or encoder is {used}, the records have {claimed}"
+    for one in results:
+        if (steps["score"].remarks.get("caveat") or "") not in (one.caveat or ""):
+            yield f"metrics.json: the caveat '{steps['score'].remarks['caveat']}' is missing under {one.protocol}"
+        if run.protocols[one.protocol].digest not in score.values():
+            yield f"the rules of {one.protocol} in run.json are not those that scored it"
 
 
 def _wrong_claims(run: FinishedRun, record: ResultRecord, jobs: Jobs) -> Iterator[str]:
-    """What a result states about its method and scenes that run.json or the jobs contradict."""
-    scored, method = () if record.result is None else record.result.scenes, record.method
-    if record.n_planned != len(scored) + len(record.failed) + len(record.unscored):
-        yield f"n_planned is {record.n_planned}, but {len(scored) + len(record.unscored)} scenes did not fail"
-    if method in run.external:
+    """What a result states about its scenes and its method that run.json or the jobs contradict."""
+    n_scored, method = 0 if record.result is None else len(record.result.scenes), record.method
+    if record.n_planned != n_scored + len(record.failed) + len(record.unscored):
+        yield f"n_planned is {record.n_planned}, but {n_scored + len(record.unscored)} scenes did not fail"
+    if method in run.external or is_ceiling(method, record.caveat):
         return
-    found = [(jobs.get((scene, method), {}), jobs.get((scene, CEILING_METHOD), {})) for scene in run.scenes]
-    maps = [[steps["predict"].files.get("prediction.npz") for steps in pair if "predict" in steps] for pair in found]
-    if not is_ceiling(method, record.caveat) and maps and all(len(pair) == 2 and pair[0] == pair[1] for pair in maps):
-        yield "its maps are the ground truth (same digests as those of the oracle)"
-    steps = [jobs.get((scene, method), {}) for scene in (*scored, *record.unscored)]
-    mine = [one for one in steps if {"predict", "score"} <= one.keys()]
-    profiles = {one["predict"].key.get("profile") for one in mine}
-    encoders = {one["score"].key.get("encoder") for one in mine}
-    for what, value, own in (("profile", record.profile, profiles), ("encoder", record.encoder_digest, encoders)):
-        if set(value.split(", ") if value else ()) != own - {None}:
-            yield f"the {what} is {value}, the jobs have {', '.join(sorted(map(str, own)))}"
-    for caveat in {str(one["score"].remarks.get("caveat") or "") for one in mine}:
-        if caveat not in (record.caveat or ""):
-            yield f"caveat is {record.caveat}, the jobs have {caveat}"
-    if any(run.protocols[record.protocol].digest not in one["score"].key.values() for one in mine[: len(scored)]):
-        yield f"the rules of {record.protocol} in run.json are not those that scored it"
     if (record.encoder is None) != (record.profile is None):
         yield f"encoder is {record.encoder}, but profile is {record.profile}"
-    if not is_ceiling(method, record.caveat) and any(_uses_truth(run, method, one) for one in profiles):
+    found = [[jobs.get((scene, one), {}).get("predict") for one in (method, CEILING_METHOD)] for scene in run.scenes]
+    maps = [[step and step.files.get("prediction.npz") for step in pair] for pair in found]
+    if all(own is not None and own == truth for own, truth in maps):
+        yield "its maps are the ground truth (same digests as those of the oracle)"
+    if _uses_truth(run, method, record.profile or ""):
         yield f"caveat is {record.caveat}, but the method used ground truth"
 
 
-def _uses_truth(run: FinishedRun, method: str, profile: str | None) -> bool:
-    """Whether a built-in method used ground truth; False for others, whose code is not loaded to find out."""
+def _uses_truth(run: FinishedRun, method: str, profiles: str) -> bool:
+    """Whether ground truth reached a built-in method; False for others, whose code is not loaded to find out."""
     base = base_name(method)
     with suppress(Su3dError):  # its weights or its program may be missing here
-        if base in registry.METHODS:
-            options = resolve(run.data.settings, ("method", method), options_model("method", base))
-            return uses_ground_truth(build_method(Part(base, method, options.model_dump_json())), profile)
+        options = resolve(run.data.settings, ("method", method), options_model("method", base)).model_dump_json()
+        made = build_method(Part(base, method, options)) if base in registry.METHODS else None
+        is_given = isinstance(made, UsesGroundTruth) or (made is not None and made.needs.true_proposals)
+        return is_given or (made is not None and OraclePerception.profile in profiles and sees_profile(made))
     return False
 
 
@@ -223,18 +222,14 @@ def _recomputed(
     numbers = replace(numbers, warnings=warnings, coverage=stated.coverage if is_elsewhere else numbers.coverage)
     recomputed = replace(record, kind=rules.kind, headline=rules.headline, ceiling=known["ceiling"] or None)
     recomputed = replace(recomputed, result=numbers)
-    if is_elsewhere and all(_is_same(score, truths[scene]) for scene, score in counts.items()):
+    sides = (counts, {scene: one for scene, one in truths.items() if one is not None})
+    bare = [pack_scores({key: replace(one, warnings=()) for key, one in side.items()}) for side in sides]
+    if is_elsewhere and bare[0] == bare[1]:
         recomputed = replace(recomputed, caveat=f"{record.caveat}; {TRUTH_CAVEAT}")
     if not is_elsewhere or record.labels is None:
         labels = labels_counted(rules, by_features=record.encoder is not None)
         recomputed = replace(recomputed, confidences=confidences_of(rules, numbers), labels=labels)
     return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
-
-
-def _is_same(score: SceneScore, truth: SceneScore | None) -> bool:
-    """Whether two scores have the same counts, whatever their warnings."""
-    same = [None if one is None else pack_scores({one.protocol: replace(one, warnings=())}) for one in (score, truth)]
-    return same[0] == same[1]
 
 
 def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> dict[str, float | None]:

@@ -96,7 +96,7 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
         in_metrics(lambda m: m["results"][0]["result"].update(n_scenes=9)),
         "it has 9 scenes of version 2, the counts 2",
     ),
-    "a partial run": (in_record(lambda r: r.update(is_partial=True)), "run.json: is_partial is True"),
+    "a partial run": (in_record(lambda r: r.update(is_partial=True)), "run.json: is_partial is True and False"),
     "an additional scene": (
         in_record(lambda r: r["scenes"].append("painted/c")),
         "run / scene painted/c: the reference does not have this scene",
