@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +67,7 @@ def test_damaged_record_is_a_one_line_error_that_names_the_field(tmp_path: Path,
 @pytest.mark.parametrize(
     ("changed", "printed"),
     [
-        ({"metrics": {"mAcc": math.inf}}, "result.metrics.mAcc is invalid ("),
+        ({"n_scenes": -1}, "result.n_scenes is invalid ("),
         ({"intervals": {"mAcc": (0.5, 100.0)}}, "result.intervals.mAcc.1 is invalid ("),
         ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a is invalid ("),
     ],
