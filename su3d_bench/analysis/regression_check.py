@@ -259,10 +259,9 @@ def learn(
             raise ConfigError(f"{run.name}: is incomplete; a reference can only be learned from complete runs")
         if differing := next(differing_keys(settings_of(first), settings_of(run)), None):
             raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
-        if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
-            raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
-        if weights_of(run) != weights_of(first):
-            raise ConfigError(f"{run.name}: has other weights or packages than {first.name}; learn from repeats")
+        inputs = [(one.record.data_digests, one.protocols, weights_of(one)) for one in (run, first)]
+        if inputs[0] != inputs[1]:
+            raise ConfigError(f"{run.name}: has other data, protocols, weights or packages than {first.name}")
     examined = [examine(run, with_maps=True) for run in runs]
     for run, faults in examined:
         for where, fault in faults:

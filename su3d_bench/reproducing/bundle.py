@@ -265,10 +265,7 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
 
 def _check_jobs(run: str, content: bytes, manifest: Manifest, where: str) -> None:
     """Raise ``StoreError`` if the manifest has files of jobs that run.json, with this content, does not name."""
-    try:
-        record = checked(RunRecord, json.loads(content, object_pairs_hook=atomic.unique_keys))
-    except (ValueError, RecursionError) as error:
-        raise StoreError(f"{where}: {run}/run.json is invalid for a bundle") from error
+    record = checked(RunRecord, json.loads(content, object_pairs_hook=atomic.unique_keys))
     scenes, methods = set(map(folder_of_scene, record.scenes)), {*record.methods, CEILING_METHOD}
     for name in manifest.files:
         parts = name.split("/")

@@ -6,7 +6,7 @@ Whatever shows or compares numbers of a finished run opens it with ``read_checke
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -215,7 +215,7 @@ def _recomputed(
         of_share = run.scores(record.method, partial(JobFolder.anytime_counts, share=point.share)).get(protocol, {})
         known["anytime"][f"{point.share:g}"] = _metrics(rules, {scene: of_share.get(scene) for scene in counts})
         written["anytime"][f"{point.share:g}"] = point.metrics
-    fault = contradiction(written, known, rules.headline)
+    fault = contradiction(written, known)
     if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
         fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
     warnings = tuple(dict.fromkeys((*stated.warnings, *numbers.warnings)))
@@ -238,18 +238,14 @@ def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> d
     return dict(plain_json(combined_metrics(rules, whole))) if len(whole) == len(scores) else {}
 
 
-def contradiction(written: Mapping[str, Any], known: Mapping[str, Any], headline: Sequence[str]) -> str | None:
-    """The first value of ``written`` that differs from ``known``, or a headline value that it lacks; None if none."""
+def contradiction(written: Mapping[str, Any], known: Mapping[str, Any]) -> str | None:
+    """The first value of ``written`` that differs from ``known``; None if none."""
     for table in (*CHECKED_FIELDS, "ceiling", "anytime"):
         values = dict(flatten(known[table]))
         for where, value in flatten(written[table]):
             if where not in values or not _agree(value, values[where]):
                 shown = _shown(values[where]) if where in values else "nothing"
                 return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
-    for name in headline:
-        rows = {"metrics": written["metrics"], **{f"per_scene.{key}": row for key, row in written["per_scene"].items()}}
-        if lacking := next((where for where, row in rows.items() if name not in row), None):
-            return f"{lacking} has no {name}"
     return None
 
 
