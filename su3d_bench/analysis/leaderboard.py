@@ -23,7 +23,6 @@ from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.files.locks import is_locked
 from su3d_bench.core.types import Interval
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
-from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -143,17 +142,17 @@ def runs_below(folder: Path) -> Iterator[Path]:
 
 def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[RankingRow | Refused]:
     """Each number of ``run``, called ``name``, that can be ranked, or why not; for ``protocols`` or all."""
-    found = examine(run)
-    faults = dict(reversed(found.faults))  # the first of each place
+    run, found = examine(run)
+    faults = dict(reversed(found))  # the first of each place
     places = {key: printable(" / ".join(key), 200) for key in run.results}
-    if others := [fault for fault in found.faults if fault[0] not in places.values()]:
+    if others := [fault for fault in found if fault[0] not in places.values()]:
         yield Refused(name, *others[0])
         return
-    for (method, protocol), record in found.run.results.items():
+    for (method, protocol), record in run.results.items():
         if protocols and protocol not in protocols:
             continue
         what, result = places[method, protocol], record.result
-        reason = _exclusion_reason(run, protocol, record.failed) or faults.get(what)
+        reason = _exclusion_reason(run, record.failed) or faults.get(what)
         if reason or result is None:
             yield Refused(name, what, reason or "was not scored")
             continue
@@ -176,14 +175,12 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         )
 
 
-def _exclusion_reason(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
+def _exclusion_reason(run: FinishedRun, failed: Sequence[str]) -> str | None:
     if run.record.is_partial:
         return f"is partial: only the first {counted(run.limit, 'frame')} of each scene"
     if failed:
         return f"is incomplete: {counted(len(failed), 'scene')} failed"
-    if protocol in protocol_names() or (protocol in run.protocols and run.protocols[protocol].rules is not None):
-        return None
-    return "its protocol is not installed here"  # protocol files named in a run are not searched for
+    return None
 
 
 def _alike(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:

@@ -219,7 +219,6 @@ class Reference(_Model):
     limit: int = Field(ge=0)
     settings: dict[str, str]
     weights: dict[str, str] | None = None
-    packages: dict[str, str] = {}
     data_digests: dict[str, str] = Field(min_length=1)
     protocols: dict[str, ProtocolKey] = Field(min_length=1)
     results: tuple[MethodResult, ...] = Field(min_length=1)
@@ -260,15 +259,14 @@ def learn(
             raise ConfigError(f"{run.name}: is incomplete; a reference can only be learned from complete runs")
         if differing := next(differing_keys(settings_of(first), settings_of(run)), None):
             raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
-        if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
-            raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
-        if weights_of(run) != weights_of(first):
-            raise ConfigError(f"{run.name}: has other weights than {first.name}; learn from repeats of one run")
+        inputs = [(one.record.data_digests, one.protocols, weights_of(one)) for one in (run, first)]
+        if inputs[0] != inputs[1]:
+            raise ConfigError(f"{run.name}: has other data, protocols, weights or packages than {first.name}")
     examined = [examine(run, with_maps=True) for run in runs]
-    for one in examined:
-        for where, fault in one.faults[:1]:
-            raise ConfigError(f"{one.run.name}: {where}: {fault}; run its command again")
-    tables = [one.run.results for one in examined]
+    for run, faults in examined:
+        for where, fault in faults:
+            raise ConfigError(f"{run.name}: {where}: {fault}; run its command again")
+    tables = [run.results for run, _ in examined]
     if any(set(table) != set(tables[0]) for table in tables):
         raise ConfigError(f"{first.name}: the runs have different methods or protocols; learn from repeats of one run")
     known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in first.methods}
@@ -283,7 +281,6 @@ def learn(
         limit=first.limit,
         settings=settings_of(first),
         weights=weights_of(first),
-        packages=_numeric_packages(first),
         data_digests=dict(first.record.data_digests),
         protocols={name: ProtocolKey(version=key.version, digest=key.digest) for name, key in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
@@ -336,17 +333,14 @@ def settings_of(run: FinishedRun) -> dict[str, str]:
 
 
 def weights_of(run: FinishedRun) -> dict[str, str]:
-    """SHA-256 of every weight file that the run recorded, and of the other files that its methods read."""
-    weights = {f"{model}/{name}": sha for model, files in run.record.models.items() for name, sha in files.items()}
+    """SHA-256 of every weight file that the run recorded and of other files of its methods; versions of packages."""
+    weights = {f"package {name}": text for name, text in run.record.packages.items() if name in NUMERIC_PACKAGES}
+    weights |= {f"{model}/{name}": sha for model, files in run.record.models.items() for name, sha in files.items()}
     for job in run.folder.jobs():
         step = job.completion_records().get("predict")
         inputs = {} if step is None else step.key
         weights |= {f"{job.path.name}/{name}": sha for name, sha in inputs.items() if name.startswith("input.")}
     return weights
-
-
-def _numeric_packages(run: FinishedRun) -> dict[str, str]:
-    return {name: version for name, version in run.record.packages.items() if name in NUMERIC_PACKAGES}
 
 
 def differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
@@ -378,12 +372,13 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
     ``recompute``: also score its maps again and compare these scores with its counts.
     """
     is_same_machine = run.record.processor == reference.processor
-    findings, examined = [*_identity(run, reference)], examine(run, with_maps=True)
-    findings += [Finding("changed", where, fault) for where, fault in examined.faults]
-    if recompute and not examined.faults:
-        faults = (one.fault for one in rescored(run))
-        findings += [Finding("changed", "maps", fault) for fault in faults if fault is not None]
-    table = examined.run.results
+    findings, (run, faults) = [*_identity(run, reference)], examine(run, with_maps=True)
+    findings += [Finding("changed", where, fault) for where, fault in faults]
+    if faults:  # whatever such records say is not compared
+        return Verdict(run.name, tuple(findings), 0, (), ())
+    if recompute:
+        findings += [Finding("changed", "maps", fault) for _, _, fault in rescored(run) if fault is not None]
+    table = run.results
     across = None if is_same_machine else reference.machine_tolerance
     numbers: list[Compared] = []
     for expected in reference.results:
@@ -402,13 +397,12 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
             Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
             for name, value in expected.metrics.items()
         ]
-    costs, limit = {} if examined.faults else reference.costs, reference.cost_limit
+    costs, limit = reference.costs, reference.cost_limit
     dearer, of_costs = compare_costs(run, costs, reference.calibration_ms, limit)
     findings += [one for one in dearer if is_same_machine or one.kind != "cost"]
     methods = {result.method for result in reference.results}
-    remarks = ["costs not checked: the records of the run are not its own"] if examined.faults else []
-    remarks += _remarks(run, reference, has_times=not examined.faults)
-    for method in () if examined.faults else run.methods:
+    remarks = [*_remarks(run, reference)]
+    for method in run.methods:
         if method in methods and method not in costs:
             if (reason := no_cost_reason(run, method)) is not None:
                 remarks.append(f"{printable(method, 80)}: cost not checked: it {reason}")
@@ -419,7 +413,7 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
     return Verdict(run.name, tuple(findings), len(numbers), tuple(remarks), shown)
 
 
-def _remarks(run: FinishedRun, reference: Reference, *, has_times: bool) -> Iterator[str]:
+def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
     """Remarks on what was not checked, and why."""
     if run.record.processor != reference.processor:
         here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
@@ -430,10 +424,8 @@ def _remarks(run: FinishedRun, reference: Reference, *, has_times: bool) -> Iter
             f"{which}: headline values are compared within {100 * reference.machine_tolerance:g} points, scenes and "
             "classes only for presence, costs are not checked"
         )
-    elif has_times and (busy := busy_remark(run, reference.calibration_ms)) is not None:
+    elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
-    for name, before, now in differing_keys(reference.packages, _numeric_packages(run)) if reference.packages else ():
-        yield f"{printable(name, 80)} was {printable(before, 40)}, now {printable(now, 40)}"
     yield from run.elsewhere_lines()
     known = {result.method for result in reference.results}
     others = [*(method for method in run.methods if method not in known)]
@@ -460,7 +452,7 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
         yield _changed("settings", key, before, now)
     for key, before, now in differing_keys(reference.weights or {}, weights_of(run)):
         if reference.weights is not None:
-            yield _changed("weights", key, before, now)
+            yield _changed("run", key, before, now)
     for scene, digest in reference.data_digests.items():
         if scene not in run.scenes:
             yield Finding("missing", printable(scene, 80), "the run does not have this scene", group=SCENES)

@@ -4,53 +4,33 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.config import NEUTRAL_SETTINGS, Setting, Settings
-from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError, counted, printable
+from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, read_arrays
-from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
-from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.scoring import pack_scores
-from su3d_bench.predictions.run_predictions import read_stored
-from su3d_bench.reports.tables.model import is_ceiling
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import SceneJob
 from su3d_bench.runs.plan import make_plan
 from su3d_bench.runs.scene import scores_again
 
 TOLERANCE = 1e-9  # of a value computed on another machine
-RESCORING_SETTINGS = {
-    "profile": "embedded",
-    "executor": "auto",
-    "offline": True,
-    "pictures": False,
-    "accept_poses": True,
-}
+LOCAL = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}
 
 
-@dataclass(frozen=True)
-class Rescored:
-    """One map scored again: the number of its scores, whether its counts are identical, and what is wrong."""
-
-    n_scores: int
-    is_to_the_bit: bool
-    fault: str | None
-
-
-def rescored(run: FinishedRun) -> Iterator[Rescored]:
-    """Every map of ``run``, scored again on this machine; then a fault for each method whose maps are ground truth."""
+def rescored(run: FinishedRun) -> Iterator[tuple[int, bool, str | None]]:
+    """Number of scores, whether they are identical, and the fault, of every map of ``run`` scored again here."""
     is_same_machine = run.record.processor == processor_digest()
     for scene, method, scores in _of_predictions(run) if run.record.predictions else _of_maps(run):
         counts = read_arrays(io.BytesIO(file_bytes(run.folder.job(scene, method).counts)))
@@ -58,41 +38,7 @@ def rescored(run: FinishedRun) -> Iterator[Rescored]:
         fault = difference(counts, ours, to_the_bit=is_same_machine)
         where = f"{printable(scene, 100)} by {printable(method, 80)}: its counts do not match its map: "
         is_identical = difference(counts, ours, to_the_bit=True) is None
-        yield Rescored(len(scores), is_identical, fault and f"{where}{fault}")
-    for method in run.methods:
-        caveats = [record.caveat for (name, _), record in run.results.items() if name == method]
-        if not any(is_ceiling(method, caveat) for caveat in caveats) and _has_only_true_masks(run, method):
-            yield Rescored(
-                0, True, f"{printable(method, 80)}: its maps are the ground truth (every mask is an object's)"
-            )
-
-
-def _has_only_true_masks(run: FinishedRun, method: str) -> bool:
-    """Whether every mask of every map has exactly the points of an object of the ground truth, whatever its name."""
-    n_masks = 0
-    for scene in run.scenes:
-        file = run.folder.job(scene, method).prediction
-        content = read_stored(file) if is_file(file) else None
-        if not isinstance(content, Instances):
-            continue
-        true_masks: set[str] = set()
-        dataset, name = run.dataset(scene), scene.partition("/")[2]
-        for variant in dataset.variants:
-            try:
-                truth = dataset.ground_truth(name, variant)
-            except GroundTruthMissing:
-                continue
-            if isinstance(truth, GroundTruth):
-                true_masks |= {_digest(truth.points[truth.instance == key]) for key in np.unique(truth.instance)}
-        if any(_digest(content.points[content.mask(row)]) not in true_masks for row in range(len(content))):
-            return False
-        n_masks += len(content)
-    return n_masks > 0
-
-
-def _digest(points: NDArray[np.float32]) -> str:
-    """A digest of points (N, 3) that does not depend on their order."""
-    return digest_bytes(np.unique(points, axis=0).tobytes())
+        yield len(scores), is_identical, fault and f"{where}{fault}"
 
 
 def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]], *, to_the_bit: bool) -> str | None:
@@ -143,7 +89,7 @@ def _jobs(run: FinishedRun) -> Sequence[SceneJob]:
         entry for entry in run.data.settings.entries
         if entry.path[0] not in NEUTRAL_SETTINGS and entry.path[:3] != ("perception", "models", "device")
     )  # fmt: skip
-    here = tuple(Setting((name,), value, "verify") for name, value in RESCORING_SETTINGS.items())
+    here = tuple(Setting((name,), value, "verify") for name, value in LOCAL.items())
     with TemporaryFolder("su3d-plan-") as folder:
         plan = make_plan(Settings((*settings, *here)), (), folder / run.folder.path.name)
     wanted = set(run.scenes)

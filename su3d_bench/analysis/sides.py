@@ -165,14 +165,10 @@ def check_comparable(left: Side, right: Side, protocol: str, scenes: Sequence[st
     to the method.
     """
     where = f"{left.name} and {right.name} cannot be compared"
-    rules, others = left.run.protocols[protocol], right.run.protocols[protocol]
-    for what in ("version", "digest"):
-        rule, other = getattr(rules, what), getattr(others, what)
-        if rule != other:
-            raise ConfigError(
-                f"{where}: {what} of protocol {protocol} is {_short(rule)} and {_short(other)}; score both again with "
-                "the same rules"
-            )
+    rules, others = left.run.protocols[protocol].digest, right.run.protocols[protocol].digest
+    if rules != others:
+        which = f"digest of protocol {protocol} is {_short(rules)} and {_short(others)}"
+        raise ConfigError(f"{where}: {which}; score both again with the same rules")
     for scene in scenes:
         pair = (left.run.record.data_digests.get(scene), right.run.record.data_digests.get(scene))
         if pair[0] != pair[1] or None in pair:
@@ -185,7 +181,8 @@ def check_comparable(left: Side, right: Side, protocol: str, scenes: Sequence[st
     if queries[0] != queries[1] and left.run.rules(protocol).ground_truth == QUERY_OBJECTS:
         raise ConfigError(f"{where}: their queries come from different files; evaluate both with the same --queries")
     if CEILING_METHOD not in (left.method, right.method):
-        given = [side.run.labels(side.method, protocol, left.run.rules(protocol)) for side in (left, right)]
+        results = [side.run.results.get((side.method, protocol)) for side in (left, right)]
+        given = [result and result.labels for result in results]
         if None not in given and given[0] != given[1]:
             raise ConfigError(
                 f"{where}: {protocol} uses {given[0]} and {given[1]}; give both predictions the same number of labels"
@@ -233,8 +230,6 @@ class SideNumbers:
         found = []
         for side, of_side in zip(sides, scores, strict=True):
             own = {scene: of_side[scene] for scene in common}
-            for scene, score in own.items():
-                metric.check(f"{side.name}: {printable(scene, 100)}", score.counts)
             key = side.run.folder.path, side.method, protocol, tuple(common)
             if key not in self._over_scenes:
                 result = combine(rules, own, with_intervals=False)

@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, check_comparable
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
 from su3d_bench.core.files.atomic import is_file
-from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.table import Origin, Table, is_count
 from su3d_bench.human_eval.items import SCHEMA
 from su3d_bench.human_eval.scores import FILE as SCORES_FILE
 from su3d_bench.human_eval.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.metrics.costs import UpdateTimes
-from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
 from su3d_bench.reports.tables.ablation import ablation_table
 from su3d_bench.reports.tables.judged import JUDGED, ROLE_LABELS, judged_table
@@ -246,7 +244,6 @@ class _Recomputed:
     def __init__(self, roots: Sequence[Path]) -> None:
         self._roots = roots
         self._runs: dict[str, FinishedRun] = {}
-        self._results: dict[tuple[str, str, str, str], ProtocolResult] = {}
 
     def _run(self, name: str) -> FinishedRun:
         if name not in self._runs:
@@ -258,7 +255,7 @@ class _Recomputed:
         places = [root / name for root in self._roots]
         return next(filter(is_it, places), places[0])
 
-    def numbers(self, origin: Origin) -> ProtocolResult | Measured:
+    def numbers(self, origin: Origin) -> Measured:
         """The numbers of a cell; ``Su3dError`` if they cannot be computed or have another version than the cell."""
         result = self._of_people(origin) if origin.protocol.endswith(ANNOTATED_SUFFIX) else self._result(origin)
         if result.version != origin.version:
@@ -272,20 +269,14 @@ class _Recomputed:
                 return row
         raise ConfigError(f"{path}: has no scores of '{printable(origin.method, 80)}' by annotators")
 
-    def _result(self, origin: Origin) -> ProtocolResult:
-        key = (origin.run, origin.method, origin.protocol, "ceiling" if origin.what == "ceiling" else "value")
-        if key not in self._results:
-            run = self._run(origin.run)
-            run.check_method(origin.method)
-            if origin.protocol not in run.protocols:
-                raise ConfigError(f"{run.name}: was not scored under '{printable(origin.protocol, 80)}'")
-            rules = run.rules(origin.protocol)
-            scores = run.scores(origin.method)[rules.name]
-            if origin.what == "ceiling":
-                perfect = run.scores(CEILING_METHOD)[rules.name]
-                scores = {scene: perfect[scene] for scene in scores if scene in perfect}
-            self._results[key] = combine(rules, scores)
-        return self._results[key]
+    def _result(self, origin: Origin) -> Measured:
+        run = self._run(origin.run)
+        run.check_method(origin.method)
+        record = run.results.get((origin.method, origin.protocol))
+        if record is None or record.result is None:
+            raise ConfigError(f"{run.name}: was not scored under '{printable(origin.protocol, 80)}'")
+        row = _measured(run.name, run, record, ())
+        return replace(row, metrics=row.ceilings) if origin.what == "ceiling" else row
 
 
 def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
@@ -361,7 +352,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     return CellCheck(file, cell.line, text, given, None)
 
 
-def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] | None:
+def _numbers(origin: Origin, result: Measured) -> list[float] | None:
     """The numbers the cell should show: a fraction in its unit or a count, then its interval; None if missing."""
     if origin.what == "scenes":
         return [float(len(result.scenes))]

@@ -7,6 +7,7 @@ on every machine. Predictions are already compressed.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import stat
@@ -234,7 +235,7 @@ def is_safe(name: str) -> bool:
 
 def _manifest(content: bytes, where: str) -> Manifest:
     try:
-        atomic.json_value(content.decode())
+        json.loads(content, object_pairs_hook=atomic.unique_keys)
         return Manifest.model_validate_json(content)
     except (ValueError, RecursionError) as error:
         places = error.errors()[0]["loc"] if isinstance(error, ValidationError) else ()
@@ -264,10 +265,7 @@ def _check_no_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest,
 
 def _check_jobs(run: str, content: bytes, manifest: Manifest, where: str) -> None:
     """Raise ``StoreError`` if the manifest has files of jobs that run.json, with this content, does not name."""
-    try:
-        record = checked(RunRecord, atomic.json_value(content.decode()))
-    except (ValueError, RecursionError) as error:
-        raise StoreError(f"{where}: {run}/run.json is invalid for a bundle") from error
+    record = checked(RunRecord, json.loads(content, object_pairs_hook=atomic.unique_keys))
     scenes, methods = set(map(folder_of_scene, record.scenes)), {*record.methods, CEILING_METHOD}
     for name in manifest.files:
         parts = name.split("/")
@@ -342,13 +340,12 @@ def verify_bundle(bundle: Path) -> Verified:
 def _faults_of(run: FinishedRun, found: Verified) -> Iterator[str]:
     check_no_custom_code(run)
     check_dataset_ground_truth(run)
-    wrong = [f"{where}: {fault}" for where, fault in examine(run, with_maps=True).faults]
+    wrong = [f"{where}: {fault}" for where, fault in examine(run, with_maps=True)[1]]
     yield from wrong
-    for one in () if wrong else rescored(run):
-        found.n_scores += one.n_scores
-        found.is_to_the_bit &= one.is_to_the_bit
-        if one.fault is not None:
-            yield one.fault
+    for n_scores, is_to_the_bit, fault in () if wrong else rescored(run):
+        found.n_scores += n_scores
+        found.is_to_the_bit &= is_to_the_bit
+        yield from [] if fault is None else [fault]
 
 
 def check_no_custom_code(run: FinishedRun) -> None:

@@ -183,17 +183,10 @@ def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
                 if isinstance(entry, Refused):
                     if entry.what not in unscored:
                         yield entry
-                elif (entry.method, entry.protocol) in run.results and is_plain(entry.method):
-                    yield _row(run, entry, unpacked, bundle)
                 else:
-                    yield Refused(name, entry.method, "invalid method name; use letters and digits")
+                    yield _row(run, entry, unpacked, bundle)
         except Su3dError as error:
             yield Refused(name, "run", printable(str(error), 300))
-
-
-def is_plain(name: str) -> bool:
-    """Whether a method's name is valid and can be shown unchanged on a page."""
-    return printable(name, 120) == name and name.strip(". ") != "" and "/" not in name
 
 
 def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: BundleFacts) -> Row:

@@ -211,16 +211,7 @@ def _plain_tables(registry: Registry) -> Table | Prose:
     ]
     if not rows:
         return Prose(("This registry has no rows.",))
-    columns = (
-        "protocol",
-        "values",
-        "rank",
-        "scenes",
-        "s per frame",
-        "hardware",
-        "weights trained on",
-        "bundle",
-    )
+    columns = ("protocol", "values", "rank", "scenes", "s per frame", "hardware", "weights trained on", "bundle")
     return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
 
 

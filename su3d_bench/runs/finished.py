@@ -33,7 +33,6 @@ from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
-from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
@@ -51,7 +50,6 @@ if TYPE_CHECKING:
 
 
 MAX_NAMED = 8  # scenes or methods of a run in a message
-MAX_NAME_BYTES = 255  # of a folder's name
 AS_SUBMITTED = "as submitted"  # times that were not measured again
 
 
@@ -172,13 +170,6 @@ class FinishedRun:
         of_methods = self.external.items()
         return [f"{printable(method, 80)}: {external(record.formats)}" for method, record in of_methods]
 
-    def labels(self, method: str, protocol: str, rules: ProtocolRules) -> str | None:
-        """How many labels per mask or point a result counts, see ``labels_counted``; None if no label counts."""
-        record = self.results.get((method, protocol))
-        if record is None:
-            return None
-        return record.labels or labels_counted(rules, by_features=record.encoder is not None)
-
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
         """The rules that scored the run: built-in ones, otherwise those stored in ``run.json``.
 
@@ -270,7 +261,8 @@ def read_run(path: Path) -> FinishedRun:
         if twice := [name for name, n in Counter(names).items() if n > 1]:
             raise StoreError(f"{shown}: {what} '{printable(twice[0], 100)}' twice; run its command again")
     protocols = {rules.name: rules for rules in record.protocols}
-    if bad := [name for name in (*record.methods, *record.scenes) if not _is_name(name, name in record.scenes)]:
+    bad = [name for name in (*record.methods, *record.scenes) if not name.isprintable() or len(name.encode()) > 255]
+    if bad := [*bad, *(name for name in record.methods if "/" in name)]:
         raise StoreError(f"{shown}: run.json: '{printable(bad[0], 80)}' is not a valid name of a method or scene")
     if unnamed := [one.protocol for one in metrics.results if one.protocol not in protocols]:
         raise StoreError(f"{shown}: run.json does not name the protocol '{unnamed[0]}'; run its command again")
@@ -282,13 +274,6 @@ def read_run(path: Path) -> FinishedRun:
         metrics=metrics,
         data=RunData(read_file(path / "run.toml"), record.data_digests, record.truth_files),
     )
-
-
-def _is_name(name: str, is_scene: bool) -> bool:
-    """Whether a method or scene of this name can have a folder of its own."""
-    parts = name.split("/")
-    is_short = name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES
-    return is_short and not {"", ".", ".."} & set(parts) and (is_scene or len(parts) == 1)
 
 
 def _no_run_message(path: Path) -> str:

@@ -21,7 +21,6 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import visible_truth
-from su3d_bench.perception.oracle import OraclePerception
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
@@ -244,17 +243,13 @@ class JobInputs:
             key = {**key, "pictures": str(True)}
         return folder.is_whole(completion, key)
 
-    @property
-    def caveat(self) -> str | None:
-        return caveat_of(self.method, self.perception, self.info)
-
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are complete; ``remarks`` are stored with the completion record of the scores."""
         return MethodOutcome(
             self.job.scene,
             self.name,
             profile=self.perception.profile if self.method.needs.frames else None,
-            caveat=self.caveat,
+            caveat=caveat_of(self.method, self.perception, self.info),
             encoder=self.perception.encoder.name,
             encoder_digest=self.perception.encoder.digest,
             data_digest=self.data_digest,
@@ -282,9 +277,3 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
 def sees_profile(method: Method) -> bool:
     """Whether the method gets its masks and names from the perception of the run."""
     return method.needs.frames and not getattr(method, "has_own_perception", False)
-
-
-def uses_ground_truth(method: Method, profile: str | None) -> bool:
-    """Whether the numbers of ``method`` under ``profile`` are a ceiling: ground truth reaches it in some form."""
-    is_told = isinstance(method, UsesGroundTruth) or method.needs.true_proposals
-    return is_told or (profile == OraclePerception.profile and sees_profile(method))

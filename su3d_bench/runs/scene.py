@@ -308,7 +308,7 @@ class _Scene:
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
         doubts = folder.remarks("predict").get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
-        remarks["caveat"] = inputs.caveat
+        remarks["caveat"] = jobs.caveat_of(inputs.method, inputs.perception, inputs.info)
         folder.mark_complete("score", key, [*files, folder.log], remarks)
 
     def scores(

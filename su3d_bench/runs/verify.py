@@ -6,9 +6,9 @@ Whatever shows or compares numbers of a finished run opens it with ``read_checke
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -17,18 +17,20 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten, resolve
 from su3d_bench.core.digests import digest_file, digest_json
-from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable
+from su3d_bench.core.errors import StoreError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.interfaces import UsesGroundTruth
 from su3d_bench.core.registry import CEILING_METHOD, base_name
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, plain_json
+from su3d_bench.perception.oracle import OraclePerception
 from su3d_bench.predictions.run_predictions import read_stored
 from su3d_bench.reports.tables.model import is_ceiling
 from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
-from su3d_bench.runs.job import Part, build_method, options_model, uses_ground_truth
+from su3d_bench.runs.job import Part, build_method, options_model, sees_profile
 from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, CompletionRecord, NumbersRecord, ResultRecord, plain
@@ -44,29 +46,20 @@ Jobs = dict[tuple[str, str], Mapping[str, CompletionRecord]]  # (scene, method) 
 Scores = Mapping[str, Mapping[str, SceneScore]]  # protocol -> scene -> counts
 
 
-@dataclass(frozen=True)
-class Examined:
-    """A run with the numbers that its counts give, and the faults of its records and files."""
-
-    run: FinishedRun
-    faults: tuple[Fault, ...]
-
-
 def read_checked(path: Path) -> FinishedRun:
     """The run at ``path`` with the numbers of its counts; ``StoreError`` with the first fault of its records."""
-    found = examine(read_run(path))
-    for where, fault in found.faults[:1]:
-        hint = "" if ";" in fault else "; run its command again"
-        raise StoreError(f"{found.run.name}: {where}: {fault}{hint}")
-    return found.run
+    run, faults = examine(read_run(path))
+    for where, fault in faults:
+        raise StoreError(f"{run.name}: {where}: {fault}{'' if ';' in fault else '; run its command again'}")
+    return run
 
 
-def examine(run: FinishedRun, *, with_maps: bool = False) -> Examined:
-    """The numbers of the counts of ``run``, and at most ``MAX_FAULTS`` faults; ``with_maps``: its maps are read too."""
+def examine(run: FinishedRun, *, with_maps: bool = False) -> tuple[FinishedRun, tuple[Fault, ...]]:
+    """``run`` with the numbers of its counts, and at most ``MAX_FAULTS`` faults; ``with_maps``: maps are read too."""
     results = dict(run.results)
     faults = islice(_faults(run, results, with_maps), MAX_FAULTS)
     shown = tuple((printable(where, 200), printable(fault, 300)) for where, fault in faults)
-    return Examined(replace(run, results=results), shown)
+    return replace(run, results=results), shown
 
 
 def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with_maps: bool) -> Iterator[Fault]:
@@ -74,25 +67,17 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
     yield from _record_faults(run)
     jobs: Jobs = {}
     failed = {(failure.scene, failure.method) for failure in run.record.failed}
-    settings = {".".join(path): json.dumps(value, ensure_ascii=False) for path, value in run.settings.items()}
     own = [one.result for one in run.results.values() if one.result is not None and one.method not in run.external]
     scored = {scene for result in own for scene in result.scenes}  # the ceiling's counts exist, too
     for method in dict.fromkeys((*run.methods, CEILING_METHOD)):
         for scene in run.scenes:
-            job = run.folder.job(scene, method)
             if (scene, method) not in failed and (method in run.methods or scene in scored):
-                jobs[scene, method] = steps = job.completion_records()
-                for fault in (*_wrong_files(job, steps, with_maps), *_wrong_key(run, scene, method, steps, settings)):
+                jobs[scene, method] = steps = run.folder.job(scene, method).completion_records()
+                for fault in _job_faults(run, scene, method, steps, with_maps):
                     yield f"{method} / scene {scene}", fault
-    perfect: Scores | None = None
     for method in run.methods:
-        maps = [[_map_digest(jobs.get((scene, one), {})) for one in (method, CEILING_METHOD)] for scene in run.scenes]
-        caveats = [one.caveat for one in run.results.values() if one.method == method]
-        if all(own and own == truth for own, truth in maps) and not any(is_ceiling(method, one) for one in caveats):
-            yield method, "its maps are the ground truth (same digests as those of the oracle)"
         try:
-            perfect = run.scores(CEILING_METHOD) if perfect is None else perfect
-            scores = run.scores(method)
+            scores, perfect = run.scores(method), run.scores(CEILING_METHOD)
             read_update_times(run, method)
         except Su3dError as error:
             yield method, str(error)
@@ -111,139 +96,106 @@ def _faults(run: FinishedRun, results: dict[tuple[str, str], ResultRecord], with
                 yield where, contradicts
 
 
-def _map_digest(steps: Mapping[str, CompletionRecord]) -> str | None:
-    return steps["predict"].files.get("prediction.npz") if "predict" in steps else None
-
-
-# ---- records
-
-
 def _record_faults(run: FinishedRun) -> Iterator[Fault]:
     """Contradictions between run.json, metrics.json and run.toml."""
     record, metrics, asked = run.record, run.metrics, run.settings
-    has_failed = any(failure.method in run.methods for failure in record.failed)
-    for file, what, value, expected in (
-        ("metrics.json", "scenes", metrics.scenes or record.scenes, record.scenes),
-        ("metrics.json", "is_partial", metrics.is_partial, metrics.limit > 0),
-        ("run.json", "is_partial", record.is_partial, metrics.limit > 0),
-        ("metrics.json", "limit", metrics.limit, asked.get(("limit",), 0)),
-        ("metrics.json", "seed", metrics.seed, record.seed or 0),
-        ("run.json", "seed", record.seed or 0, asked.get(("seed",), 0)),
-        ("run.json", "status", record.status, "incomplete" if has_failed else "complete"),
-    ):
-        if value != expected:
-            yield file, f"{what} is {printable(str(value), 80)}, the other records give {printable(str(expected), 80)}"
+    status = "incomplete" if any(failure.method in run.methods for failure in record.failed) else "complete"
+    told: dict[str, tuple[object, ...]] = {
+        "scenes": (record.scenes, metrics.scenes or record.scenes),
+        "limit": (metrics.limit, asked.get(("limit",), 0)),
+        "is_partial": (record.is_partial, metrics.is_partial, metrics.limit > 0),
+        "seed": (record.seed or 0, metrics.seed, asked.get(("seed",), 0)),
+        "status": (record.status, status),
+    }
+    for what, values in told.items():
+        if len(set(values)) > 1:
+            yield "run.json", f"{what} is {' and '.join(printable(str(value), 60) for value in values)} in the records"
     existing = existing_run(run.folder.path)
     if existing is None or not existing.is_known:
         yield "run.toml", "is not the file that the run wrote"
-    named = {base_name(str(name)) for name in asked.get(("methods",), ())}
-    others = [name for name in run.methods if base_name(name) not in named]
-    if others and named <= registry.METHODS.keys():  # plug-ins, and "all", have names of their own
-        yield "run.toml", f"does not name the method {others[0]}"
 
 
-def _wrong_files(job: JobFolder, steps: Mapping[str, CompletionRecord], with_maps: bool) -> Iterator[str]:
-    """Why the files of a job are not those that the run wrote."""
+def _job_faults(
+    run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], with_maps: bool
+) -> Iterator[str]:
+    """Files of a job that are not those that the run wrote, and its inputs that the records of the run contradict."""
+    job, record = run.folder.job(scene, method), run.record
     files = {name: digest for step in steps.values() for name, digest in step.files.items()}
     maps = (job.prediction.name, features_beside(job.prediction).name)
-    for name in (job.prediction.name, job.updates.name, job.counts.name):
-        if name not in files:
-            yield f"done.json does not list {name}"
+    yield from (
+        f"done.json does not list {name}" for name in (maps[0], "updates.csv", "counts.npz") if name not in files
+    )
     for name, digest in files.items():
-        file = job.path / name
-        if "/" in name or not (name.endswith("counts.npz") or name == job.updates.name or (with_maps and name in maps)):
-            continue
-        if not is_file(file) or file.is_symlink():
-            yield f"{name} is missing"
-        elif digest_file(file) != digest:
-            yield f"{name} is not the file that the run wrote"
+        if name.endswith("counts.npz") or name == "updates.csv" or (with_maps and name in maps):
+            if not is_file(job.path / name) or (job.path / name).is_symlink():
+                yield f"{name} is missing"
+            elif digest_file(job.path / name) != digest:
+                yield f"{name} is not the file that the run wrote"
     if with_maps and is_file(job.prediction):
         try:
             read_stored(job.prediction)
         except Su3dError as error:
             yield f"contains no map: {error}"
-
-
-def _wrong_key(
-    run: FinishedRun, scene: str, method: str, steps: Mapping[str, CompletionRecord], settings: Mapping[str, str]
-) -> Iterator[str]:
-    """Inputs in the completion records of a job that the records of the run contradict."""
     if not {"predict", "score"} <= steps.keys():
         return
-    key, score = steps["predict"].key, steps["score"].key
-    asked, profile = run.settings.get(("profile",), "auto"), key.get("profile")
-    stated = {
-        "method": method,
-        "data": run.record.data_digests.get(scene, "not stated"),
-        "seed": str(run.record.seed or 0),
-        "limit": str(run.limit or "none"),
-        "stride": str(run.settings.get(("stride",)) or run.settings.get(("method", method, "stride"), 1)),
-        "code": run.record.code,
-        "profile": str(asked if asked != "auto" else "embedded or paper"),
-        **{f"packages.{name}": version for name, version in run.record.packages.items()},
-    }
+    key, score, asked = steps["predict"].key, steps["score"].key, run.settings.get(("profile",), "auto")
+    stated = {"method": method, "data": record.data_digests.get(scene, "not stated"), "code": record.code}
+    stated |= {"seed": str(record.seed or 0), "limit": str(run.limit or "none")}
+    stated |= {"profile": str(asked if asked != "auto" else "embedded or paper")}
+    stated |= {f"packages.{name}": version for name, version in record.packages.items()}
     if method in run.external:
         stated["predictions"] = digest_json(run.external[method].files.get(scene, {}))
+    settings = {".".join(path): json.dumps(value, ensure_ascii=False) for path, value in run.settings.items()}
     for name, text in key.items():
         if name.startswith(("method.", "dataset.", "perception.")) and method in run.methods:
             stated[name] = settings.get(name, "null")
         if name in stated and text != stated[name] and text not in stated[name].split(" or "):
             yield f"done.json: {name} is {printable(text, 60)}, the run says {printable(stated[name], 60)}"
-    for what, own in (("profile", profile), ("encoder_digest", score.get("encoder"))):
-        if own is not None and own not in (getattr(run.record, what) or "").split(", "):
-            yield f"done.json: {what} is {own}, run.json says {getattr(run.record, what)}"
     if score.get("predict") != digest_json(dict(key)):
         yield "done.json: the counts are those of another map"
+    own = [one for one in run.results.values() if one.method == method and method not in run.external]
+    results = [one for one in own if one.result is not None and scene in one.result.scenes]
+    known = [(record.profile, record.encoder_digest), *((one.profile, one.encoder_digest) for one in results)]
+    for names in known:
+        for used, claimed in zip((key.get("profile"), score.get("encoder")), names, strict=True):
+            if used is not None and used not in (claimed or "").split(", "):
+                yield f"done.json: the profile or encoder is {used}, the records have {claimed}"
+    for one in results:
+        if (steps["score"].remarks.get("caveat") or "") not in (one.caveat or ""):
+            yield f"metrics.json: the caveat '{steps['score'].remarks['caveat']}' is missing under {one.protocol}"
+        if run.protocols[one.protocol].digest not in score.values():
+            yield f"the rules of {one.protocol} in run.json are not those that scored it"
 
 
 def _wrong_claims(run: FinishedRun, record: ResultRecord, jobs: Jobs) -> Iterator[str]:
-    """What a result states about its method and scenes that run.json or the jobs contradict."""
-    scored = () if record.result is None else record.result.scenes
-    if record.n_planned != len(scored) + len(record.failed) + len(record.unscored):
-        yield f"n_planned is {record.n_planned}, but {len(scored) + len(record.unscored)} scenes did not fail"
-    if set(record.failed) - {failure.scene for failure in run.record.failed if failure.method == record.method}:
-        yield "failed names a scene that did not fail"
-    if record.method in run.external:
+    """What a result states about its scenes and its method that run.json or the jobs contradict."""
+    n_scored, method = 0 if record.result is None else len(record.result.scenes), record.method
+    if record.n_planned != n_scored + len(record.failed) + len(record.unscored):
+        yield f"n_planned is {record.n_planned}, but {n_scored + len(record.unscored)} scenes did not fail"
+    if method in run.external or is_ceiling(method, record.caveat):
         return
-    steps = [jobs.get((scene, record.method), {}) for scene in (*scored, *record.unscored)]
-    mine = [one for one in steps if {"predict", "score"} <= one.keys()]
-    profiles = {one["predict"].key.get("profile") for one in mine}
-    stated = [
-        ("profile", record.profile, profiles),
-        ("encoder_digest", record.encoder_digest, {one["score"].key.get("encoder") for one in mine}),
-    ]
-    if all("caveat" in one["score"].remarks for one in mine):
-        caveats = dict.fromkeys(one["score"].remarks["caveat"] for one in mine)
-        stated.append(("caveat", record.caveat, {"; ".join(filter(None, caveats))}))
-    for what, value, own in stated:
-        if {*(value or "").split(", " if what != "caveat" else "\n")} - {""} != own - {None, ""}:
-            yield f"{what} is {value}, the jobs have {', '.join(sorted(map(str, own)))}"
-    if any(run.protocols[record.protocol].digest not in one["score"].key.values() for one in mine[: len(scored)]):
-        yield f"the rules of {record.protocol} in run.json are not those that scored it"
     if (record.encoder is None) != (record.profile is None):
         yield f"encoder is {record.encoder}, but profile is {record.profile}"
-    if not is_ceiling(record.method, record.caveat) and any(_uses_truth(run, record.method, one) for one in profiles):
+    found = [[jobs.get((scene, one), {}).get("predict") for one in (method, CEILING_METHOD)] for scene in run.scenes]
+    maps = [[step and step.files.get("prediction.npz") for step in pair] for pair in found]
+    if all(own is not None and own == truth for own, truth in maps):
+        yield "its maps are the ground truth (same digests as those of the oracle)"
+    if _uses_truth(run, method, record.profile or ""):
         yield f"caveat is {record.caveat}, but the method used ground truth"
 
 
-def _uses_truth(run: FinishedRun, method: str, profile: str | None) -> bool:
-    """Whether a built-in method used ground truth; False for others, whose code is not loaded to find out."""
+def _uses_truth(run: FinishedRun, method: str, profiles: str) -> bool:
+    """Whether ground truth reached a built-in method; False for others, whose code is not loaded to find out."""
     base = base_name(method)
-    if base in registry.METHODS:
-        with suppress(Su3dError):  # its weights or its program may be missing here
-            options = resolve(run.data.settings, ("method", method), options_model("method", base))
-            return uses_ground_truth(build_method(Part(base, method, options.model_dump_json())), profile)
+    with suppress(Su3dError):  # its weights or its program may be missing here
+        options = resolve(run.data.settings, ("method", method), options_model("method", base)).model_dump_json()
+        made = build_method(Part(base, method, options)) if base in registry.METHODS else None
+        is_given = isinstance(made, UsesGroundTruth) or (made is not None and made.needs.true_proposals)
+        return is_given or (made is not None and OraclePerception.profile in profiles and sees_profile(made))
     return False
 
 
 # ---- numbers
-
-
-def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
-    """The rules that scored ``run``, with the same digest; a ``ConfigError`` if there are none."""
-    if protocol not in run.protocols:
-        raise ConfigError("its protocol is not in run.json")
-    return run.rules(protocol, to_the_letter=True)
 
 
 def _recomputed(
@@ -254,41 +206,30 @@ def _recomputed(
     counts = {scene: one for scene, one in scores.get(protocol, {}).items() if scene not in record.failed}
     if stated is None:
         return record, f"metrics.json has no numbers, the counts have {len(counts)} scenes" if counts else None
-    rules, is_elsewhere = rules_of_run(run, protocol), record.method in run.external
+    rules, is_elsewhere = run.rules(protocol, to_the_letter=True), record.method in run.external
     numbers = NumbersRecord(**combine(rules, counts).to_json())
     truths = {scene: perfect.get(protocol, {}).get(scene) for scene in counts}
-    early = {}
+    written = plain(stated) | {"ceiling": record.ceiling or {}, "anytime": {}}
+    known = plain(numbers) | {"ceiling": _metrics(rules, truths), "anytime": {}}
     for point in record.anytime or ():
         of_share = run.scores(record.method, partial(JobFolder.anytime_counts, share=point.share)).get(protocol, {})
-        early[f"{point.share:g}"] = _metrics(rules, {scene: of_share.get(scene) for scene in counts})
-    known = plain(numbers) | {"ceiling": _metrics(rules, truths), "anytime": early}
-    written = plain(stated) | {"ceiling": record.ceiling or {}}
-    written |= {"anytime": {f"{point.share:g}": point.metrics for point in record.anytime or ()}}
-    fault = contradiction(written, known, rules.headline)
+        known["anytime"][f"{point.share:g}"] = _metrics(rules, {scene: of_share.get(scene) for scene in counts})
+        written["anytime"][f"{point.share:g}"] = point.metrics
+    fault = contradiction(written, known)
     if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
         fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
-    is_truth = is_elsewhere and all(_is_same(score, truths[scene]) for scene, score in counts.items())
-    recomputed = replace(
-        record,
-        caveat=f"{record.caveat}; {TRUTH_CAVEAT}" if is_truth else record.caveat,
-        kind=rules.kind,
-        headline=rules.headline,
-        ceiling=known["ceiling"] or None,
-        result=replace(
-            numbers,
-            coverage=stated.coverage if is_elsewhere else numbers.coverage,
-            warnings=tuple(dict.fromkeys((*stated.warnings, *numbers.warnings))),
-        ),
-        confidences=record.confidences if is_elsewhere else confidences_of(rules, numbers),
-        labels=record.labels if is_elsewhere else labels_counted(rules, by_features=record.encoder is not None),
-    )
+    warnings = tuple(dict.fromkeys((*stated.warnings, *numbers.warnings)))
+    numbers = replace(numbers, warnings=warnings, coverage=stated.coverage if is_elsewhere else numbers.coverage)
+    recomputed = replace(record, kind=rules.kind, headline=rules.headline, ceiling=known["ceiling"] or None)
+    recomputed = replace(recomputed, result=numbers)
+    sides = (counts, {scene: one for scene, one in truths.items() if one is not None})
+    bare = [pack_scores({key: replace(one, warnings=()) for key, one in side.items()}) for side in sides]
+    if is_elsewhere and bare[0] == bare[1]:
+        recomputed = replace(recomputed, caveat=f"{record.caveat}; {TRUTH_CAVEAT}")
+    if not is_elsewhere or record.labels is None:
+        labels = labels_counted(rules, by_features=record.encoder is not None)
+        recomputed = replace(recomputed, confidences=confidences_of(rules, numbers), labels=labels)
     return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
-
-
-def _is_same(score: SceneScore, truth: SceneScore | None) -> bool:
-    """Whether two scores have the same counts, whatever their warnings."""
-    same = [None if one is None else pack_scores({one.protocol: replace(one, warnings=())}) for one in (score, truth)]
-    return same[0] == same[1]
 
 
 def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> dict[str, float | None]:
@@ -297,18 +238,14 @@ def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> d
     return dict(plain_json(combined_metrics(rules, whole))) if len(whole) == len(scores) else {}
 
 
-def contradiction(written: Mapping[str, Any], known: Mapping[str, Any], headline: Sequence[str]) -> str | None:
-    """The first value of ``written`` that differs from ``known``, or a headline value that it lacks; None if none."""
+def contradiction(written: Mapping[str, Any], known: Mapping[str, Any]) -> str | None:
+    """The first value of ``written`` that differs from ``known``; None if none."""
     for table in (*CHECKED_FIELDS, "ceiling", "anytime"):
         values = dict(flatten(known[table]))
         for where, value in flatten(written[table]):
             if where not in values or not _agree(value, values[where]):
                 shown = _shown(values[where]) if where in values else "nothing"
                 return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
-    for name in headline:
-        rows = {"metrics": written["metrics"], **{f"per_scene.{key}": row for key, row in written["per_scene"].items()}}
-        if lacking := next((where for where, row in rows.items() if name not in row), None):
-            return f"{lacking} has no {name}"
     return None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, StoreError, printable
 from su3d_bench.core.files.atomic import read_json
@@ -30,27 +30,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would pass every co
 Amount = Annotated[float, Field(ge=0, le=MAX_VALUE, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=int(MAX_VALUE))]
 Share = Annotated[float, Field(ge=0, le=1 + ROUNDING, allow_inf_nan=False)]
-
-
-def impossible_value(name: str, value: float) -> str | None:
-    """A message if ``value`` is impossible for ``name`` in a result: ``n_...`` are counts, all others fractions.
-
-    >>> impossible_value("mAcc", 7e300), impossible_value("n_classes", 7)
-    ("'mAcc' is 7e+300; a fraction must be from 0 to 1", None)
-    """
-    if name.startswith("n_"):
-        return None if 0 <= value <= MAX_VALUE else f"'{name}' is {value:g}; a count must be from 0 to {MAX_VALUE:g}"
-    return None if 0 <= value <= 1 + ROUNDING else f"'{name}' is {value:g}; a fraction must be from 0 to 1"
-
-
-def _possible(values: Mapping[str, float | None]) -> Mapping[str, float | None]:
-    for name, value in values.items():
-        if value is not None and (fault := impossible_value(name, value)) is not None:
-            raise ValueError(fault)
-    return values
-
-
-Values = Annotated[Mapping[str, Number | None], AfterValidator(_possible)]
+Values = Mapping[str, Number | None]
 
 
 @dataclass(frozen=True)

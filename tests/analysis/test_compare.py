@@ -183,7 +183,7 @@ REFUSED = [
         ("a", "other-data"),
         "a:collector and other-data:collector cannot be compared: data digest of painted/a is ",
     ),
-    (("a", "other-rules"), "other-rules: collector / rooms-instance: metrics.json: the rules of rooms-"),
+    (("a", "other-rules"), "other-rules: collector / scene painted/a: the rules of rooms-instance in run.json are"),
     (("a", "old-rules"), "was scored under rooms-semantic version 92, now it is version 2"),
     (("a", "other-encoder"), "cannot be compared: encoder is words (words-1) and words (words-2)"),
     (("a", "a"), "a: both sides are the same; name two runs, or two methods of one run as a:METHOD"),

@@ -83,7 +83,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "a key twice": (
         lambda place: written(place, {"runs/a/run.json": b'{"seed": 1, "seed": 2}'}, runs=["runs/a"]),
-        "runs/a/run.json is invalid",
+        "damaged: has the key 'seed' twice",
     ),
     "before": (before, "has data outside its files"),
     "link": (linked, "is a link"),

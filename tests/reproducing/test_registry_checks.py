@@ -85,7 +85,7 @@ def negative_times(files: Files) -> None:
     ("tamper", "says"),
     [
         (not_a_ceiling, "caveat is None, but the method used ground truth"),
-        (maps_of_the_oracle, "opensu3d: its maps are the ground truth"),
+        (maps_of_the_oracle, "its maps are the ground truth"),
         (negative_times, "updates.csv: has -"),
         (lambda files: flip_labels(files, JOB), "by opensu3d: its counts do not match its map"),
         (other_rules, "are not those that scored it"),

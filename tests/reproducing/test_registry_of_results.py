@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from registry_bundles import Files, edit_record, painted_bundle, read_bundle, rewrite_bundle
+from painted_runs import consistent
+from registry_bundles import edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
+from su3d_bench.reproducing.bundle import bundle_runs
 from su3d_bench.reproducing.registry import ModelWeights, conflict_with, read_registry, rows_of_bundle
 
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
@@ -49,7 +50,7 @@ def test_rows_of_several_bundles_share_one_ranking_per_protocol_best_first(regis
     ("old", "new", "says"),
     [
         ('"version": 2', '"version": 3', "was scored under rooms-semantic version 3, now it is version 2"),
-        ('"is_partial": false', '"is_partial": true', "is partial"),
+        ('"is_partial": false', '"is_partial": true', "is_partial is True and False"),
     ],
 )
 def test_run_that_cannot_be_ranked_is_excluded_with_a_reason(registry: Path, old: str, new: str, says: str) -> None:
@@ -61,28 +62,22 @@ def test_run_that_cannot_be_ranked_is_excluded_with_a_reason(registry: Path, old
     assert main(["dev", "registry", "build", str(registry), "--out", str(registry.parent / "site")]) == 1
 
 
-def other_data(files: Files) -> None:
-    record = json.loads(files["runs/ann/run.json"])
-    record["data_digests"]["painted/a"] = "0" * 64
-    files["runs/ann/run.json"] = json.dumps(record).encode()
-
-
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("digest", "says"),
     [
-        (other_data, "its data of painted/a have the digest 000000000000, those of collector@drop=1 in ann.zip "),
-        (
-            lambda files: None,
-            "the name is taken by collector@drop=1 in ann.zip on the same scenes; give the variant",
-        ),
+        ("0" * 64, "its data of painted/a have the digest 000000000000, those of collector@drop=1 in ann.zip "),
+        (None, "the name is taken by collector@drop=1 in ann.zip on the same scenes; give the variant"),
     ],
 )
 def test_rows_with_other_data_or_duplicate_methods_are_rejected(
-    registry: Path, tmp_path: Path, change: Callable[[Files], None], says: str, capsys: pytest.CaptureFixture[str]
+    made: Path, registry: Path, tmp_path: Path, digest: str | None, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files, manifest = read_bundle(registry / "bundles" / "ann.zip")
-    change(files)
-    bundle = rewrite_bundle(tmp_path / "dan.zip", files, {**manifest, "program": "another"})
+    run = Path(shutil.copytree(made / "runs" / "ann", tmp_path / "dan"))
+    record = json.loads((run / "run.json").read_text())
+    record["data_digests"]["painted/a"] = digest or record["data_digests"]["painted/a"]
+    (run / "run.json").write_text(json.dumps(record))
+    bundle = tmp_path / "dan.zip"
+    bundle_runs(bundle, [consistent(run)])
     assert main(["dev", "registry", "add", str(bundle), "--to", str(registry)]) == 1
     assert "dan.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]

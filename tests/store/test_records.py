@@ -67,11 +67,7 @@ def test_damaged_record_is_a_one_line_error_that_names_the_field(tmp_path: Path,
 @pytest.mark.parametrize(
     ("changed", "printed"),
     [
-        (
-            {"metrics": {"mAcc": 7e300}},
-            "result.metrics is invalid ('mAcc' is 7e+300; a fraction",
-        ),
-        ({"per_scene": {"d/a": {"mAcc": -0.5}}}, "'mAcc' is -0.5; a fraction must be from 0 to 1"),
+        ({"n_scenes": -1}, "result.n_scenes is invalid ("),
         ({"intervals": {"mAcc": (0.5, 100.0)}}, "result.intervals.mAcc.1 is invalid ("),
         ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a is invalid ("),
     ],

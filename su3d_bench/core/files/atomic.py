@@ -224,7 +224,7 @@ def read_json(path: Path) -> Any:
     """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
     try:
         with reading(str(path), StoreError):
-            return json_value(file_text(path))
+            return json.loads(file_text(path), object_pairs_hook=unique_keys)
     except (ValueError, RecursionError) as error:
         what = str(error) if isinstance(error, _DuplicateKeyError) else "not readable as JSON"
         raise StoreError(f"{path}: {what}; run the same command again to repair it") from error
@@ -234,12 +234,8 @@ class _DuplicateKeyError(ValueError):
     """An object has a key twice: one program would read the first value, another the last."""
 
 
-def json_value(text: str) -> Any:
-    """The value of a JSON text; a ``ValueError`` if it is not one, or an object in it has a key twice."""
-    return json.loads(text, object_pairs_hook=_unique)
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object of a JSON text, for ``json.loads``; a ``ValueError`` if it has a key twice."""
     value = dict(pairs)
     if len(value) < len(pairs):
         twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]

@@ -90,13 +90,13 @@ PLANTED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
     "other weights": (
         in_record(lambda r: r["models"].update(sam={"w.pt": "0" * 64})),
-        "weights: sam/w.pt was not set, now 000000000000...",
+        "run: sam/w.pt was not set, now 000000000000...",
     ),
     "more scenes claimed": (
         in_metrics(lambda m: m["results"][0]["result"].update(n_scenes=9)),
         "it has 9 scenes of version 2, the counts 2",
     ),
-    "a partial run": (in_record(lambda r: r.update(is_partial=True)), "run.json: is_partial is True"),
+    "a partial run": (in_record(lambda r: r.update(is_partial=True)), "run.json: is_partial is True and False"),
     "an additional scene": (
         in_record(lambda r: r["scenes"].append("painted/c")),
         "run / scene painted/c: the reference does not have this scene",
