@@ -64,7 +64,7 @@ def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace
                 fault = "is an input of this command"
             elif found is not None and not is_searched and (real.is_file() or not here.is_relative_to(place)):
                 fault = f"lies in {shown(found)}, which is an input"
-            elif identity == data is not None and real.is_file():
+            elif identity == data is not None and real.is_file() and not here.is_relative_to(place):
                 fault = f"is a file of the data root {shown(data_root())}"
             elif is_run(place) and (place / JOBS).is_dir() and (place != real or arguments.verb not in RUN_VERBS):
                 fault = f"{'is' if place == real else 'lies in'} the run folder {shown(place)}"

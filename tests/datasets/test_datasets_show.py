@@ -88,7 +88,7 @@ def test_command_writes_the_picture_and_prints_counts(capsys: pytest.CaptureFixt
     [
         (["replica/*"], "datasets show replica/*: 2 scenes match (replica/room0, replica/room1, ...); name one"),
         (["replica/rom0"], "no scene matches 'replica/rom0'; did you mean 'replica/room0'?"),
-        (["replica/room0", "--out", "x.jpg"], "--out x.jpg: expected a file name that ends in"),
+        (["replica/room0", "--out", "x.jpg"], "--out x.jpg: unknown format of a figure; use a suffix of pdf"),
     ],
 )
 def test_each_wrong_request_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

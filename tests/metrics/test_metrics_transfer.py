@@ -196,5 +196,5 @@ def test_points_at_one_place_are_searched_once(n: int, apart_m: float) -> None:
     _, index = nearest(points, queries)
     assert index.tolist() == brute_force(points, queries).tolist()
     assert Candidates(points)._tree.n == 3
-    assert votes._Search(points, 5).tree.n == 15
+    assert votes._Search(points, 5).tree.n == 18  # one more than 5 of each place, to notice ties
     assert graphs.Cloud(points)._tree.n == 3

@@ -131,8 +131,9 @@ def test_reports_of_edited_runs_are_refused(
     shutil.copytree(sweep, tmp_path / "run")
     change, message = EDITS[edit]
     change(tmp_path / "run")
-    assert main(["report", *verb.split(), str(tmp_path / "run"), "--out", str(tmp_path / "out.zip")]) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "out.zip").exists()
+    out = tmp_path / ("out.pdf" if "attribution" in verb else "out.zip")
+    assert main(["report", *verb.split(), str(tmp_path / "run"), "--out", str(out)]) == 2
+    assert message in capsys.readouterr().err and not out.exists()
 
 
 def test_runs_on_different_data_are_not_combined(sweep: Path, tmp_path: Path) -> None:

@@ -49,8 +49,9 @@ def scores_of_office(out: Path) -> dict[str, float]:
 
 
 def remarks_of(err: str) -> list[str]:
-    """The lines on stderr, except that the poses could not be checked because the four frames are far apart."""
-    return [line for line in err.splitlines() if ": poses and depth could not be checked: " not in line]
+    """The lines on stderr, without finished scenes, and that four frames far apart could not be checked."""
+    others = (": poses and depth could not be checked: ", " finished, ")
+    return [line for line in err.splitlines() if not any(text in line for text in others)]
 
 
 def remove(name: str) -> Damage:
