@@ -1,4 +1,9 @@
-"""Real recordings, if available: how the datasets read sensor data not written by this project."""
+"""Real recordings, if available: how the datasets read sensor data not written by this project.
+
+``$SU3D_RECORDINGS`` has the folders ``label_fusion`` (frames of wkentaro/label-fusion), ``open3d_rgbd`` (Open3D's
+example RGB-D frames), ``tum_fr1desk_9`` (nine frames of TUM's fr1/desk with its complete lists) and ``hololens_94``
+(every fourth frame of a sequence of ardaduz/deep-video-mvs).
+"""
 
 from __future__ import annotations
 
@@ -55,7 +60,7 @@ SCENES = {
 @pytest.fixture(autouse=True)
 def _recordings() -> None:
     if not REAL_RECORDINGS.is_dir():
-        pytest.fail("SU3D_RECORDINGS is not a folder of real recordings (see CONTRIBUTING.md)", pytrace=False)
+        pytest.fail("SU3D_RECORDINGS is not a folder of real recordings (see the docstring)", pytrace=False)
 
 
 @pytest.fixture
