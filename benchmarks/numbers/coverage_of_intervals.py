@@ -71,7 +71,7 @@ class Simulated:
 
 
 JACKKNIFE, PSEUDO, LOGIT = "jackknife t (used)", "bias-corrected jackknife t", "jackknife t of the logit"
-PERCENTILE, BCA, BY_CLASS = "percentile bootstrap", "BCa bootstrap", "by class and scene"
+PERCENTILE, BCA, BY_CLASS = "percentile bootstrap", "BCa bootstrap", "variance by class, scene"
 KINDS = (JACKKNIFE, PSEUDO, LOGIT, PERCENTILE, BCA, BY_CLASS)
 
 
@@ -198,10 +198,10 @@ def rare_classes(rare: Mapping[str, Study], sizes: Sequence[int]) -> Iterator[st
     for name, one in rare.items():
         many, found = one.truth[AP], {n: one.of_size[n][AP] for n in sizes}
         own = {n: float(np.mean(found[n].values)) for n in sizes}
-        rows.append([f"{name}, as many scenes", *(_marked(found[n].coverage(JACKKNIFE, own[n])) for n in sizes)])
-        rows.append([f"{name}, very many", *(_marked(found[n].coverage(JACKKNIFE, many)) for n in sizes)])
+        rows.append([f"{name}, S scenes", *(_marked(found[n].coverage(JACKKNIFE, own[n])) for n in sizes)])
+        rows.append([f"{name}, very many scenes", *(_marked(found[n].coverage(JACKKNIFE, many)) for n in sizes)])
         rows.append([f"{name}, bias in points", *(f"{100 * (own[n] - many):+.1f}" for n in sizes)])
-    yield "AP of 48 classes at Replica's rates; true value: over as many, or very many, scenes:\n"
+    yield "AP of 48 classes, as frequent as in Replica; true value: AP of S or of very many scenes:\n"
     yield from aligned([["coverage, %", *(f"{n} scenes" for n in sizes)], *rows])
     yield f"\n{_error(len(found[sizes[0]].values))}"
 
@@ -219,8 +219,8 @@ def alternatives(studies: Sequence[Study], rare: Mapping[str, Study]) -> Iterato
         own = [found.coverage(kind, float(np.mean(found.values))) for found, _ in of_rare]
         many = [found.coverage(kind, true_value) for found, true_value in of_rare]
         rows.append([kind, *map(_cell, (float(np.nanmin(of_worlds)), *own, *many))])
-    header = [f"{name.removeprefix('rooms ')}, {which}" for which in ("as many", "very many") for name in rare]
-    yield f"\nOther intervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (first table: the lowest):\n"
+    header = [f"{name.removeprefix('rooms ')}, {which}" for which in ("S scenes", "very many") for name in rare]
+    yield f"\nOther intervals, {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (first table: lowest value):\n"
     yield from aligned([["coverage, %", "first table", *header], *rows])
     yield ""
 

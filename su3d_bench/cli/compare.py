@@ -28,7 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--cost-limit TIMES", "maximum slowdown factor of a method (with --build-from)", type=float)
     parser.option(
         "--machine-tolerance POINTS",
-        "tolerance in points across machines (with --build-from; default: 2)",
+        "percentage points of tolerance across machines (with --build-from; default: 2)",
         type=float,
     )
     parser.option("--markdown FILE", "write the table as Markdown, for a pull request", type=output_path)

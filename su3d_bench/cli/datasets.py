@@ -40,11 +40,11 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'DATASET/*')")
     parser.option(
         "--layout",
-        "file layout: native (no frames written), replica or scannet (default: native)",
+        "file layout: native (ground truth only), replica or scannet (default: native)",
         choices=LAYOUTS,
         default="native",
     )
-    parser.option("--out DIR", "data root (required; for native: default $SU3D_DATA)", type=output_path)
+    parser.option("--out DIR", "data root (default: $SU3D_DATA if native, else none)", type=output_path)
     parser.shared("--set", "--jobs")
     fetch.add_data(actions)
     add_new(actions, "dataset")

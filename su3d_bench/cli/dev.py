@@ -45,7 +45,7 @@ def _add_cache(verbs: Verbs) -> None:
     parser = add_verb(actions, "clear", call_cache_clear)
     parser.option(
         "kinds KIND...",
-        "perception, model-digests, runs (local copies), replies, or all (except replies)",
+        "perception, model-digests, runs (copies from URLs), replies, or all (but replies)",
         choices=(*KIND_NAMES, "all"),
     )
     parser.option("--older-than DAYS", "remove only older files (default: 0)", type=float, default=0.0)

@@ -29,7 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",
-        "name of the method (default: name of --out); as METHOD=PREDICTIONS, score several",
+        "method's name (default: name of --out), or METHOD=PREDICTIONS to score several",
         action="extend",
         default=[],
     )
@@ -49,7 +49,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--text-features")
     parser.option(
         "--confidences",
-        "by the protocol's rule or from the file (default: file for ScanNet, MaskClustering)",
+        "confidences by protocol (default) or file (default for ScanNet, MaskClustering)",
         choices=("protocol", "file"),
     )
     parser.shared("--queries")

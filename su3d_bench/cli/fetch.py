@@ -170,7 +170,7 @@ def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
 def add_models(verbs: Verbs) -> None:
     parser = add_verb(verbs, "fetch", call_models, resumes=True)
     parser.option("names [MODEL...]", "names from models list")
-    parser.option("--for PROFILE", "all models of PROFILE: paper", dest="profile")
+    parser.option("--for PROFILE", "all models of profile paper", dest="profile")
     _add_fetch_options(parser)
     parser.shared("--set")
 

@@ -201,7 +201,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("run RUN", "run folder"),
         option("runs RUN...", "folders of finished runs"),
         option("--jobs N", "number of parallel jobs (default: number of CPU cores)", type=count),
-        option("--device DEVICE", "device for models and labels: cpu, cuda or cuda:N (default: cpu)"),
+        option("--device DEVICE", "computing device: cpu, cuda or cuda:N (default: cpu)"),
         option("--methods METHOD...", "methods to use (default: all)", default=[]),
         option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
         option("--protocols PROTOCOL...", "protocols to use (default: all that fit)", action="extend", default=[]),

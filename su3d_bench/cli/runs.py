@@ -57,7 +57,7 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.option(
         "--max-map-fraction SHARE",
-        "maximum share of the map's area that an instance may cover (default: 0.95)",
+        "maximum share of the map that a box may cover from above (default: 0.95)",
         type=float,
     )
     options.add_language_options(parser)

@@ -33,9 +33,9 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: score with the ground truth only)")
+    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: answers from the ground truth)")
     parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
-    parser.option("--sheet FILE", "sheet.json, or its folder (default: searched near the key and answers)")
+    parser.option("--sheet FILE", "sheet.json, or its folder (default: found near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
     parser.option("--disputed FILE", "write disputed questions to this CSV file, for --exclude-ids", type=output_path)
     parser.shared("--format")

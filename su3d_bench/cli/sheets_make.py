@@ -36,7 +36,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
     parser.option(
         "--kind ...",
-        "what annotators rate (annotation: labels and masks); a folder per kind if several",
+        "objects found, labels and masks, answers, questions; a folder per kind if several",
         choices=KINDS,
         required=True,
     )
