@@ -1,8 +1,8 @@
 """Coverage of 95 % intervals, over benchmarks drawn from worlds with known true values, and errors of the paired test.
 
-``python benchmarks coverage_of_intervals [--simulations 2000] [--write docs/numbers/statistics.md]`` prints the tables
-of docs/numbers/statistics.md and, with ``--write``, updates them; four minutes on one idle core. Exit code 1: a cell
-of the first table is below 90.
+``python benchmarks coverage_of_intervals [--simulations 2000] [--write docs/numbers/interval-coverage.md]`` prints the
+tables of that page and, with ``--write``, updates them; four minutes on one idle core. Exit code 1: a cell of the first
+table is below 90.
 
 The true value is that of the metric over very many scenes and, for AP of rare classes, also its expectation over as
 many scenes as were measured. ``coverage_worlds`` has the worlds.
@@ -186,7 +186,7 @@ def over_scenes(sizes: Sequence[int], n_simulations: int, seed: int) -> Iterator
             yield f"\n- {name} at {', '.join(map(str, of_sizes))} scenes: {REASONS[name]}."
     refused = [(name, n) for name, row in table.items() for n in sizes if row[n] < MIN_COVERAGE]
     where = ", ".join(f"{name} at {n} scenes" for name, n in refused)
-    yield (f"\nBelow 90: {where}.\n" if refused else "\nNone is below 90, so intervals are shown from 2 scenes on.\n")
+    yield (f"\nBelow 90: {where}.\n" if refused else "\nAll of these are at least 90.\n")
     yield from rare_classes(rare, sizes)
     if N_ALTERNATIVES in sizes:
         yield from alternatives(studies, rare)

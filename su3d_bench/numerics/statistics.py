@@ -14,7 +14,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Interval
 
 LEVEL = 0.95
 ALPHA = 0.05  # a difference is significant if its two-sided p is below this
-FEW_SCENES = 10  # with fewer, an interval is reported as rough: docs/numbers/statistics.md shows its coverage
+FEW_SCENES = 10  # with fewer, an interval is reported as rough: docs/numbers/interval-coverage.md shows its coverage
 MAX_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
 MIN_ITEMS = 10  # with fewer, a t interval of a change or an agreement has a coverage below 90 %
 NO_SPREAD = 1e-12  # smaller differences between pseudo-values of fractions are rounding
@@ -213,7 +213,7 @@ def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
     """The sign-flip test of the mean of ``differences`` against 0; ``None`` without pairs.
 
     It assumes that the differences of two equally good methods are symmetric around 0: at 5 %, skewed differences
-    with mean 0 are rejected more often (docs/numbers/statistics.md has how often). NaN are ignored. Up to
+    with mean 0 are rejected more often (docs/numbers/interval-coverage.md has how often). NaN are ignored. Up to
     ``MAX_EXACT_PAIRS`` pairs all 2^n patterns of signs are counted; otherwise random ones.
 
     >>> sign_flip_test(np.array([0.1, 0.2, 0.3]))
