@@ -71,7 +71,7 @@ class Simulated:
 
 
 JACKKNIFE, PSEUDO, LOGIT = "jackknife t (used)", "bias-corrected jackknife t", "jackknife t of the logit"
-PERCENTILE, BCA, BY_CLASS = "percentile bootstrap", "BCa bootstrap", "variance by class, scene"
+PERCENTILE, BCA, BY_CLASS = "percentile bootstrap", "BCa bootstrap", "jackknife per class"
 KINDS = (JACKKNIFE, PSEUDO, LOGIT, PERCENTILE, BCA, BY_CLASS)
 
 
@@ -220,7 +220,7 @@ def alternatives(studies: Sequence[Study], rare: Mapping[str, Study]) -> Iterato
         many = [found.coverage(kind, true_value) for found, true_value in of_rare]
         rows.append([kind, *map(_cell, (float(np.nanmin(of_worlds)), *own, *many))])
     header = [f"{name.removeprefix('rooms ')}, {which}" for which in ("S scenes", "very many") for name in rare]
-    yield f"\nOther intervals, {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (first table: lowest value):\n"
+    yield f"\nIntervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (`first table`: its lowest value):\n"
     yield from aligned([["coverage, %", "first table", *header], *rows])
     yield ""
 
