@@ -201,7 +201,7 @@ def rare_classes(rare: Mapping[str, Study], sizes: Sequence[int]) -> Iterator[st
         rows.append([f"{name}, S scenes", *(_marked(found[n].coverage(JACKKNIFE, own[n])) for n in sizes)])
         rows.append([f"{name}, very many scenes", *(_marked(found[n].coverage(JACKKNIFE, many)) for n in sizes)])
         rows.append([f"{name}, bias in points", *(f"{100 * (own[n] - many):+.1f}" for n in sizes)])
-    yield "AP of 48 classes, as frequent as in Replica; true value: AP of S or of very many scenes:\n"
+    yield "AP of 48 classes (see Rare classes); true value: AP of S or of very many scenes:\n"
     yield from aligned([["coverage, %", *(f"{n} scenes" for n in sizes)], *rows])
     yield f"\n{_error(len(found[sizes[0]].values))}"
 
@@ -220,7 +220,7 @@ def alternatives(studies: Sequence[Study], rare: Mapping[str, Study]) -> Iterato
         many = [found.coverage(kind, true_value) for found, true_value in of_rare]
         rows.append([kind, *map(_cell, (float(np.nanmin(of_worlds)), *own, *many))])
     header = [f"{name.removeprefix('rooms ')}, {which}" for which in ("S scenes", "very many") for name in rare]
-    yield f"\nIntervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (`first table`: its lowest value):\n"
+    yield f"\nIntervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (`first table`: its lowest value at 8 scenes):\n"
     yield from aligned([["coverage, %", "first table", *header], *rows])
     yield ""
 
@@ -240,7 +240,7 @@ def of_test(n_simulations: int, seed: int) -> Iterator[str]:
     for name, drawn in DIFFERENCES.items():
         tests = [[sign_flip_test(row) for row in drawn(rng, (n_simulations, n))] for n in PAIRS]
         rows.append([name, *(_cell(100 * float(np.mean([t is not None and t.p < ALPHA for t in of]))) for of in tests)])
-    yield "Differences with mean 0 that the sign-flip test rejects at 5 %:\n"
+    yield "How often the sign-flip test rejects at 5 % if the mean difference is 0:\n"
     yield from aligned([["rejected, %", *(f"{n} scenes" for n in PAIRS)], *rows])
     yield ""
 
