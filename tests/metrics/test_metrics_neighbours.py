@@ -25,7 +25,7 @@ def plain_votes(indices: np.ndarray, squared: np.ndarray, values: np.ndarray, ca
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
-    n=st.integers(1, 120),
+    n=st.sampled_from([*range(1, 120), 600]),
     k=st.integers(2, 7),
     on_a_grid=st.booleans(),
     cap_m=st.sampled_from([np.inf, 0.5]),
@@ -36,7 +36,8 @@ def test_votes_equal_brute_force_with_ties_broken_by_the_original_search(
 ) -> None:
     rng = np.random.default_rng(seed)
     if on_a_grid:  # few positions, many points at each, so that there are ties beyond the last neighbour
-        points, targets = rng.integers(0, 3, (n, 3)).astype(np.float64), rng.integers(0, 5, (30, 3)) / 2
+        side = rng.integers(1, 4)
+        points, targets = rng.integers(0, side, (n, 3)).astype(np.float64), rng.integers(0, 5, (30, 3)) / 2
     else:
         points, targets = rng.random((n, 3)), rng.random((30, 3))
     values = rng.integers(0, 4, n)

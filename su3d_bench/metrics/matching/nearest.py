@@ -110,9 +110,9 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates in memory at once while ties are broken
-MAX_COINCIDENT = (
-    16  # points at one place, up to rounding, beyond which only the first is searched: as exact, and bounded
-)
+# Points at one place, up to rounding, beyond which only the first is searched: as exact, and bounded.
+MAX_COINCIDENT = 16
+MAX_TIED = 1000  # the same where the search of an original chooses among them: as the original up to this number
 COINCIDENT_DECIMALS = 12  # a picometre
 MIN_SORTED_CANDIDATES = 50_000  # candidates, below which sorting costs more time than it saves
 
@@ -256,7 +256,8 @@ def nearest_as_found(
     of_row = np.append(values[kept], -1)[rows]
     tied = tied[((of_row != of_row[:, :1]) & (equal <= equal[:, :1] + ROUNDING_M)).any(axis=1)]
     if len(tied):
-        index[tied] = search(points)(queries[tied], 1)[:, 0]
+        rows = without_crowds(points, MAX_TIED)
+        index[tied] = rows[search(points[rows])(queries[tied], 1)[:, 0]]
     return distances[:, 0], index, len(tied)
 
 

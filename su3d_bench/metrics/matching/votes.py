@@ -15,6 +15,7 @@ import numpy as np
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
 from su3d_bench.metrics.matching.nearest import (
+    MAX_TIED,
     ROUNDING_M,
     Points,
     Search,
@@ -111,7 +112,7 @@ def _most_votes(votes: Int64Array) -> Int64Array:
 class _Search:
     """The ``k`` nearest of a list of points, exact in float64; those that ``search`` finds on ties.
 
-    Of more points at one place than ``MAX_COINCIDENT``, the first k + 1 are searched.
+    Of more points at one place than ``MAX_TIED``, only so many take part in ties.
     """
 
     def __init__(self, points: Points, k: int, search: Search = ball_tree) -> None:
@@ -119,25 +120,27 @@ class _Search:
 
         self.k = min(k, len(points))
         self.rows = without_crowds(points, self.k + 1)
-        self.points = np.asarray(points, np.float64)[self.rows]
-        self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+        self.points = np.asarray(points, np.float64)
+        self.tree: Any = cKDTree(self.points[self.rows], balanced_tree=False, compact_nodes=False)
         self.search = search
 
     @cached_property
     def found(self) -> Callable[[Points, int], IntArray]:
-        return self.search(self.points)
+        rows = without_crowds(self.points, MAX_TIED)
+        find = self.search(self.points[rows])
+        return lambda queries, k: rows[find(queries, k)]
 
     def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
         """Distances in metres and indices (Q, k), in no particular order."""
-        k, n = self.k, len(self.points)
+        k, n = self.k, len(self.rows)
         distances, indices = self.tree.query(queries, k=min(k + 1, n), workers=1)
-        distances, indices = distances.reshape(len(queries), -1), indices.reshape(len(queries), -1).astype(np.int64)
+        distances, indices = distances.reshape(len(queries), -1), self.rows[indices.reshape(len(queries), -1)]
         if k < n:
             tied = np.flatnonzero(distances[:, k] <= distances[:, k - 1] + ROUNDING_M)
             indices = indices[:, :k]
             if len(tied):
                 indices[tied] = self.found(queries[tied], k)
-        return distances[:, :k], self.rows[indices]
+        return distances[:, :k], indices
 
 
 def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: float) -> Masks:
