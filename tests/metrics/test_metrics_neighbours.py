@@ -36,8 +36,7 @@ def test_votes_equal_brute_force_with_ties_broken_by_the_original_search(
 ) -> None:
     rng = np.random.default_rng(seed)
     if on_a_grid:  # few positions, many points at each, so that there are ties beyond the last neighbour
-        side = rng.integers(1, 4)
-        points, targets = rng.integers(0, side, (n, 3)).astype(np.float64), rng.integers(0, 5, (30, 3)) / 2
+        points, targets = rng.integers(0, rng.integers(1, 4), (n, 3)) / 1.0, rng.integers(0, 5, (30, 3)) / 2
     else:
         points, targets = rng.random((n, 3)), rng.random((30, 3))
     values = rng.integers(0, 4, n)
