@@ -220,7 +220,7 @@ def alternatives(studies: Sequence[Study], rare: Mapping[str, Study]) -> Iterato
         many = [found.coverage(kind, true_value) for found, true_value in of_rare]
         rows.append([kind, *map(_cell, (float(np.nanmin(of_worlds)), *own, *many))])
     header = [f"{name.removeprefix('rooms ')}, {which}" for which in ("S scenes", "very many") for name in rare]
-    yield f"\nIntervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (`first table`: its lowest value at 8 scenes):\n"
+    yield f"\nIntervals at {N_ALTERNATIVES} scenes, {N_RESAMPLES} resamples (`first table`: its lowest at 8):\n"
     yield from aligned([["coverage, %", "first table", *header], *rows])
     yield ""
 
