@@ -76,7 +76,7 @@ def opensu3d(n_points: int) -> tuple[Method, Callable[[], None]]:
 
 
 def sam3d(n_points: int) -> tuple[Method, Callable[[], None]]:
-    method = SAM3D(SAM3DConfig(schedule="incremental"))
+    method = SAM3D(SAM3DConfig(merge_schedule="incremental"))
     method.start(SCENE)
     points, tile = wall(n_points, 0.05)
     no_views = np.zeros(0, np.int64)

@@ -58,6 +58,8 @@ def files(tmp_path_factory: pytest.TempPathFactory, frames: list[Frame]) -> Repl
 
 
 def note_rate(benchmark: BenchmarkFixture) -> None:
+    if not benchmark.stats:  # with --benchmark-disable
+        return
     benchmark.extra_info["frames_per_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
     benchmark.extra_info["at_best"] = round(N_FRAMES / benchmark.stats["min"], 2)
 

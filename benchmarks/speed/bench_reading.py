@@ -95,6 +95,8 @@ def test_replica_frames(benchmark: BenchmarkFixture, folder: Path, replica: Repl
         "ours, 2 threads ahead": lambda: read_ahead(replica, 2),
     }
     benchmark.pedantic(work[how], rounds=7, warmup_rounds=1)
+    if not benchmark.stats:  # with --benchmark-disable
+        return
     benchmark.extra_info["ms_per_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
     benchmark.extra_info["best_ms"] = round(benchmark.stats["min"] / N_REPLICA * 1e3, 2)
 

@@ -168,12 +168,13 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
     rows_of: dict[str, list[Mapping[str, Any]]] = {}
     for result in metrics["results"]:
         rows_of.setdefault(str(result["protocol"]), []).append(result)
-    with_results = [
-        rows for rows in rows_of.values() if any(row["result"] is not None or row["failed"] for row in rows)
-    ]
-    parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in with_results]
-    if not parts:
-        parts = [Prose(("no protocol applies to these scenes",))]
+    results = metrics["results"]
+    with_results = [rows for rows in rows_of.values() if any(row["result"] or row["failed"] for row in rows)]
+    if any(row["result"] for row in results):
+        parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in with_results]
+    else:  # one list instead of empty tables
+        failed = {f"{row['method']} failed on {', '.join(row['failed'])}" for row in results if row["failed"]}
+        parts = [Prose(tuple(sorted(failed)) or ("no protocol applies to these scenes",), is_list=bool(failed))]
     return [*parts, *([found_table(found)] if found else [])]
 
 

@@ -215,7 +215,7 @@ class Reference(_Model):
     processor: str
     n_runs: int = Field(ge=1)
     machine_tolerance: float = Field(ge=0, le=1)
-    cost_limit: float = Field(gt=1, le=MAX_COST_LIMIT)
+    cost_limit: float | None = Field(gt=1, le=MAX_COST_LIMIT)  # None: above COST_LIMIT there is a remark
     limit: int = Field(ge=0)
     settings: dict[str, str]
     weights: dict[str, str] | None = None
@@ -250,7 +250,7 @@ def _fault(error: ValidationError) -> str:
 
 
 def learn(
-    runs: Sequence[FinishedRun], machine_tolerance: float = ACROSS_MACHINES, cost_limit: float = COST_LIMIT
+    runs: Sequence[FinishedRun], machine_tolerance: float = ACROSS_MACHINES, cost_limit: float | None = None
 ) -> Reference:
     """A reference from complete repeats of one run, which must agree in everything that is not a measurement."""
     first = runs[0]
@@ -397,11 +397,16 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
             Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
             for name, value in expected.metrics.items()
         ]
-    costs, limit = reference.costs, reference.cost_limit
+    costs, limit = reference.costs, reference.cost_limit or COST_LIMIT
     dearer, of_costs = compare_costs(run, costs, reference.calibration_ms, limit)
-    findings += [one for one in dearer if is_same_machine or one.kind != "cost"]
-    methods = {result.method for result in reference.results}
     remarks = [*_remarks(run, reference)]
+    if is_same_machine and reference.cost_limit is None:
+        remarks += [
+            f"{one.where}: {one.text}; a remark only, without --cost-limit" for one in dearer if one.kind == "cost"
+        ]
+    fails = is_same_machine and reference.cost_limit is not None
+    findings += [one for one in dearer if fails or one.kind != "cost"]
+    methods = {result.method for result in reference.results}
     for method in run.methods:
         if method in methods and method not in costs:
             if (reason := no_cost_reason(run, method)) is not None:

@@ -89,13 +89,15 @@ def complete(parser: Parser) -> None:
 def _exit_code(words: Sequence[str]) -> int:
     """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
+    if not words or words[0] == "help":
+        words = [*words[1:], "--help"]
     try:
         parser = build_parser(words[0] if words else None)
         if "_ARGCOMPLETE" in os.environ:  # shell completion; see su3d-bench dev completion
             complete(parser)
         arguments = parser.parse_args(words)
         if "call" not in arguments:  # a group of commands without a command
-            arguments = parser.parse_args([*words, "list"])
+            arguments = parser.parse_args([*words, arguments.without_command])
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
         check_outputs(arguments.parser, arguments)

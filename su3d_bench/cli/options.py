@@ -124,9 +124,11 @@ def add_verb(
 def add_group(verbs: Verbs, name: str, add: Callable[[Verbs], None], *, lists: bool = False) -> Verbs:
     """Add a group of commands such as ``datasets``, whose help is the docstring of ``add``.
 
-    Without a command it runs ``list`` if it ``lists``.
+    Without a command it runs ``list`` if it ``lists``, otherwise it shows its help.
     """
-    return _parser(verbs, name, add.__doc__).add_subparsers(dest="action", metavar="COMMAND", required=not lists)
+    parser = _parser(verbs, name, add.__doc__)
+    parser.set_defaults(without_command="list" if lists else "--help")
+    return parser.add_subparsers(dest="action", metavar="COMMAND", required=False)
 
 
 def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:

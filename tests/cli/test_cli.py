@@ -69,11 +69,16 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
     assert rules.digest in text
 
 
+@pytest.mark.parametrize(("words", "prog"), [("", ""), ("help", ""), ("report", " report"), ("help run", " run")])
+def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.split()) == 0
+    assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
         ("rum", "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
-        ("", "the following arguments are required: COMMAND; see su3d-bench --help"),
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),

@@ -10,12 +10,13 @@ import pytest
 from measured_rows import SCENES, measured, measured_instances
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.formats.tables.table import Table
+from su3d_bench.formats.tables.table import Prose, Table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
+from su3d_bench.reports.tables.run import run_tables
 
 SEMANTIC = "replica-openmask3d-semantic"
 
@@ -133,3 +134,9 @@ def test_table_i_compares_each_row_with_the_default_with_holms_correction() -> N
         "Ablation of single parameters on replica, replica-openmask3d-semantic and replica-openmask3d; not the "
         "paper's set-up: other perception."
     )
+
+
+def test_run_without_scores_has_one_list_instead_of_empty_tables() -> None:
+    results = [{"protocol": name, "method": "m", "result": None, "failed": ["a/b"]} for name in ("x", "y")]
+    (part,) = run_tables({"results": results})
+    assert part == Prose(("m failed on a/b",), is_list=True)

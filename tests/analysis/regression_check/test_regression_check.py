@@ -39,14 +39,14 @@ def gated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def reference(gated: Path) -> Reference:
-    return learn([read_run(gated)])
+    return learn([read_run(gated)], cost_limit=1.3)
 
 
 @pytest.fixture(scope="module")
 def reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The reference as written by the command."""
     path = tmp_path_factory.mktemp("gate") / "reference.json"
-    assert main(["check", "--build-from", str(gated), "--out", str(path)]) == 0
+    assert main(["check", "--build-from", str(gated), "--cost-limit", "1.3", "--out", str(path)]) == 0
     return path
 
 
@@ -159,6 +159,13 @@ def test_busy_machine_allows_up_to_twice_the_cost_with_a_remark(
     assert "the calibration workload took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
     timed(run, [106.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(run), "--against", str(reference_file)]) == 1
+
+
+def test_without_a_limit_a_slower_run_passes_with_a_remark(run: Path, reference: Reference) -> None:
+    timed(run, [106.0] * 6, 150.0)
+    assert not check(read_run(run), reference).is_passed
+    verdict = check(read_run(run), reference.model_copy(update={"cost_limit": None}))
+    assert verdict.is_passed and any("a remark only, without --cost-limit" in line for line in verdict.remarks)
 
 
 def test_command_exits_with_1_and_writes_reports_for_pull_requests(
