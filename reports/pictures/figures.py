@@ -18,7 +18,7 @@ from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned
 
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
-LEGEND_WIDTH_IN = 2.6
+LEGEND_WIDTH_IN = CELL_WIDTH_IN  # that of a figure of one column
 DPI = 200  # of pictures within the figure
 CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 47, 3  # line height, characters per line, number of lines
 MAX_ROW_TITLE, MAX_TAGS = 110, 40
