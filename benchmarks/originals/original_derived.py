@@ -45,11 +45,11 @@ def openyolo3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     module = load(checkout / "evaluate/replica/eval_semantic_instance.py", [checkout], absent=["plyfile", "imageio"])
     known = module.VALID_CLASS_IDS.tolist()
 
-    def called(ids: Int64Array) -> Int64Array:
+    def convert(ids: Int64Array) -> Int64Array:
         return np.array([known.index(one) if one in known else len(known) for one in ids.tolist()], np.int64)
 
     rows = [known.index(classes_of(rules)[0][one]) for one in range(4)]
-    return of_arrays(module, folder, rules, rows, called, output_file=str(folder / "answer.txt"))
+    return of_arrays(module, folder, rules, rows, convert, output_file=str(folder / "answer.txt"))
 
 
 def opensun3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
@@ -79,7 +79,7 @@ def scannetpp(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
             np.savetxt(left_out / f"{s}.txt", masked_of(scene), fmt="%d")
             for k, mask in enumerate(one.masks):
                 (pred / f"{s}_{k}.json").write_text(json.dumps(encode(mask.astype(np.uint8))))
-                lines.append(f"{s}_{k}.json {one.called[k] - 1} {float(one.scores[k])!r}\n")
+                lines.append(f"{s}_{k}.json {one.class_ids[k] - 1} {float(one.scores[k])!r}\n")
             (pred / f"{s}.txt").write_text("".join(lines))
         files = [[where / f"{s}.txt" for s in range(len(problem))] for where in (pred, truth)]
         module.evaluate(*files, pred, folder, info, module.instance_utils.Instance_Eval_Opts())

@@ -108,7 +108,7 @@ class Given:
 
     values: Int64Array
     masks: BoolArray
-    called: Int64Array
+    class_ids: Int64Array
     scores: Float64Array
 
     @classmethod
@@ -117,8 +117,8 @@ class Given:
         masks = np.zeros((len(scene["masks"]), len(values)), bool)
         for row, members in zip(masks, members_of(scene), strict=True):
             row[members] = True
-        called = np.array([ids[mask["slot"]] for mask in scene["masks"]], np.int64)
-        return cls(values, masks, called, np.array([mask["score"] for mask in scene["masks"]], float))
+        class_ids = np.array([ids[mask["slot"]] for mask in scene["masks"]], np.int64)
+        return cls(values, masks, class_ids, np.array([mask["score"] for mask in scene["masks"]], float))
 
     def write_truth(self, file: Path) -> None:
         np.savetxt(file, self.values, fmt="%d")
@@ -155,7 +155,7 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
             one.write_truth(truth / f"{s}.txt")
             for k, mask in enumerate(one.masks):
                 np.savetxt(pred / f"masks/{s}_{k:03d}.txt", mask, fmt="%d")
-                lines.append(f"masks/{s}_{k:03d}.txt {one.called[k]} {float(one.scores[k])!r}\n")
+                lines.append(f"masks/{s}_{k:03d}.txt {one.class_ids[k]} {float(one.scores[k])!r}\n")
             (pred / f"{s}.txt").write_text("".join(lines))
         files = [[str(where / f"{s}.txt") for s in range(len(problem))] for where in (pred, truth)]
         module.evaluate(*files, str(pred), str(folder / "answer.txt"))
@@ -165,9 +165,9 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def of_arrays(
-    module: types.ModuleType, folder: Path, rules: ProtocolRules, classes: list[int], called: Any = None, **named: Any
+    module: types.ModuleType, folder: Path, rules: ProtocolRules, classes: list[int], convert: Any = None, **named: Any
 ) -> Ask:
-    """Scripts that take masks, scores and classes as arrays; ``called(class ids)`` converts these to theirs."""
+    """Scripts that take masks, scores and classes as arrays; ``convert(class ids)`` returns theirs."""
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
     ids, _ = classes_of(rules)
 
@@ -179,7 +179,7 @@ def of_arrays(
             predicted[str(s)] = {
                 "pred_masks": one.masks.T,
                 "pred_scores": np.ones(len(one.scores)) if are_ones else one.scores,
-                "pred_classes": one.called if called is None else called(one.called),
+                "pred_classes": one.class_ids if convert is None else convert(one.class_ids),
             }
         module.evaluate(predicted, str(truth), **named)
         table = tables[-1][0] if isinstance(tables[-1], tuple) else tables[-1]
@@ -217,10 +217,10 @@ def rows_of(rules: ProtocolRules) -> list[int]:
 def maskclustering(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     """MaskClustering's script, with --no_class if the protocol has no classes; by both rankings."""
     without_gpu()
-    is_plain = rules.class_agnostic is None
+    has_classes = rules.class_agnostic is None
     of_data = "scannetpp" if "scannetpp" in rules.datasets else "scannet"
     words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt"), "--dataset", of_data]
-    words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if is_plain else ["--no_class"])]
+    words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if has_classes else ["--no_class"])]
     module = load(checkout / "evaluation/evaluate.py", [checkout], words)
     # for ScanNet++ it is quadratic in 1,554 classes, seconds per problem; classes in no problem are undefined
     module.CLASS_LABELS, module.VALID_CLASS_IDS = (
@@ -236,8 +236,8 @@ def of_archives(
     module: types.ModuleType, folder: Path, rules: ProtocolRules, ids: dict[int, int], known: list[int]
 ) -> Ask:
     """MaskClustering's script and its copies, over archives."""
-    is_plain = rules.class_agnostic is None
-    rows = [known.index(ids[one]) for one in SCORED] if is_plain else [0]
+    has_classes = rules.class_agnostic is None
+    rows = [known.index(ids[one]) for one in SCORED] if has_classes else [0]
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
 
     def answer(problem: Problem, *, are_ones: bool) -> Answer:
@@ -245,7 +245,7 @@ def of_archives(
         for s, scene in enumerate(problem):
             one = Given.of(scene, ids)
             one.write_truth(truth / f"{s}.txt")
-            arrays = {"pred_masks": one.masks.T, "pred_classes": one.called}
+            arrays = {"pred_masks": one.masks.T, "pred_classes": one.class_ids}
             scores = np.ones(len(one.scores)) if are_ones else one.scores
             np.savez(pred / f"{s}.npz", pred_score=scores, **arrays)
         files = [
@@ -272,11 +272,11 @@ def open3dis(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
         numbers = {LEFT_OUT: 0, **{one: labels.index(names[one]) + 2 for one in SCORED}}  # 0 and 1: wall and floor
     numbers[BEYOND] = 5000
     first = 16 if is_scannetpp else 2  # classes before those of instances
-    is_plain = rules.class_agnostic is None
+    has_classes = rules.class_agnostic is None
     kind = "scannetpp_benchmark" if is_scannetpp else "scannet200"
-    judge = module.ScanNetEval(class_labels=labels, use_label=is_plain, dataset_name=kind)
+    judge = module.ScanNetEval(class_labels=labels, use_label=has_classes, dataset_name=kind)
     tables = recorded(judge, "evaluate_matches")
-    rows = [numbers[one] - first for one in SCORED] if is_plain else [0]
+    rows = [numbers[one] - first for one in SCORED] if has_classes else [0]
 
     def answer(problem: Problem, *, are_ones: bool) -> Answer:
         semantic, instance, predicted = [], [], []

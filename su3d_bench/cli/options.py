@@ -110,7 +110,7 @@ def add_verb(
 ) -> Parser:
     """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
-    Numerical libraries use one thread unless it ``uses_all_cores``. A command that ``resumes`` resumes after an
+    Numerical libraries use one thread unless it ``uses_all_cores``. ``resumes``: the command continues after an
     interruption; others start again.
     """
     parser = _parser(verbs, name, about or call.__doc__)
