@@ -40,7 +40,7 @@ from su3d_bench.store.run_folder import JobFolder
 # the protocol: those of the counts are shown.
 CHECKED_FIELDS = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
 MAX_FAULTS = 50  # of a run; records can name millions of scenes and methods without files
-TRUTH_CAVEAT = "its counts are those of the ground truth: a ceiling, not a result"
+SAME_COUNTS_CAVEAT = "its counts are those of the ground truth: a ceiling, not a result"
 Fault = tuple[str, str]  # where (``METHOD / PROTOCOL``, ``METHOD / scene SCENE`` or a file) and what is wrong
 Jobs = dict[tuple[str, str], Mapping[str, CompletionRecord]]  # (scene, method) -> completion records
 Scores = Mapping[str, Mapping[str, SceneScore]]  # protocol -> scene -> counts
@@ -225,7 +225,7 @@ def _recomputed(
     sides = (counts, {scene: one for scene, one in truths.items() if one is not None})
     bare = [pack_scores({key: replace(one, warnings=()) for key, one in side.items()}) for side in sides]
     if is_elsewhere and bare[0] == bare[1]:
-        recomputed = replace(recomputed, caveat=f"{record.caveat}; {TRUTH_CAVEAT}")
+        recomputed = replace(recomputed, caveat=f"{record.caveat}; {SAME_COUNTS_CAVEAT}")
     if not is_elsewhere or record.labels is None:
         labels = labels_counted(rules, by_features=record.encoder is not None)
         recomputed = replace(recomputed, confidences=confidences_of(rules, numbers), labels=labels)
