@@ -75,6 +75,7 @@ class Relations:
         self._is_fixture = np.array([name in FIXTURES for name in names], bool)
         self._is_thing = np.array([name not in SURFACES for name in names], bool)
         self._is_floor = np.array([name in FLOORS for name in names], bool)
+        self._is_built_in = np.array([name in BUILT_IN for name in names], bool)
         self._slack = slack
 
     def __len__(self) -> int:
@@ -83,6 +84,24 @@ class Relations:
     def of(self, relation: Relation) -> BoolArray:
         """Which pairs (K, K) are in ``relation``."""
         return np.asarray(getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation)))
+
+    def usual(self, relation: Relation) -> BoolArray:
+        """The pairs (K, K) for which people say so: not a window above a bed, nor a sink on a countertop."""
+        is_usual = np.ones((len(self), len(self)), bool)
+        if relation in ("above", "under"):
+            is_usual &= ~(self._is_fixture[:, None] | self._is_fixture[None])
+        if relation == "above":  # a picture is above the cabinet, not above the candle on it
+            is_usual &= ~(self.holders.any(axis=1) & ~self._is_built_in)[None]
+        is_built_in = {"on": self._is_built_in[:, None], "under": self._is_built_in[None]}.get(relation, np.False_)
+        return np.asarray(is_usual & ~is_built_in)
+
+    def facts(self, relation: Relation) -> BoolArray:
+        """The usual pairs (K, K) in ``relation`` that do not repeat another relation.
+
+        "Under" is not the reverse of "on" or "above": the first is beneath the second and does not carry it.
+        """
+        holds = self.of(relation) & self.usual(relation)
+        return np.asarray(holds & ~(self.on | self.above).T if relation == "under" else holds)
 
     def doubtful(self, relation: Relation) -> BoolArray:
         """The pairs (K, K) that a slightly different threshold, or another reading of the word, would change."""

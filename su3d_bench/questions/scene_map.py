@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -16,10 +17,11 @@ from su3d_bench.core.english import last_word, words
 from su3d_bench.core.errors import PredictionError, nearest, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
-from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, RELATIONS, SURFACES, Relation, Relations
+from su3d_bench.numerics.relations import RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
 
@@ -112,14 +114,27 @@ class SceneMap:
         pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
         return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
-    @staticmethod
-    def is_usual(relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether the relation is natural for such objects: windows, blinds and vents are above everything."""
-        if relation not in ("above", "under"):
-            return True
-        if relation == "under" and last_word(other.name) in BUILT_IN:
-            return False
-        return {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
+    def is_usual(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether the relation is natural for such objects."""
+        return bool(self.relations.usual(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def is_fact(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether the relation holds, is natural, and does not repeat another one ("under" for "on")."""
+        return bool(self.relations.facts(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    @cached_property
+    def _face_of(self) -> dict[str, float]:
+        """The mean product of the two longest sides of the objects of each name."""
+        names = {thing.name for thing in self.objects}
+        return {name: float(np.mean([np.prod(np.sort(thing.size)[1:]) for thing in self.objects if thing.name == name]))
+                for name in names}  # fmt: skip
+
+    def is_located_by(self, name: str, other: str) -> bool:
+        """Whether a ``name`` is said to be next to an ``other``, which is the larger of the two, and not the reverse.
+
+        Source: Talmy 1983, How language structures space: a reference object is larger and easier to see.
+        """
+        return (self._face_of[name], name) < (self._face_of[other], other)
 
     def are_in_one_place(self, *things: MapObject) -> bool:
         """Whether objects are on one support, all on the floor, or all hang."""
@@ -392,6 +407,27 @@ def is_called(label: str, class_name: str) -> bool:
     if " ".join(label_words) in GROUPS:
         return False
     return bool(noun_objects(class_name, _only(label)).objects) or bool(noun_objects(label, _only(class_name)).objects)
+
+
+@lru_cache(maxsize=65_536)
+def may_be_confused(one: str, other: str) -> bool:
+    """Whether people may use one of two names for an object of the other.
+
+    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
+
+    >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
+    (True, True, False)
+    """
+    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
+
+
+@cache
+def _heads(name: str) -> frozenset[str]:
+    """The head noun of a name, the name, its synonyms, and the groups of these."""
+    synonyms = SYNONYMS.get(_class_of_words().get(words(name), ""), ())
+    heads = {last_word(name), *(" ".join(words(one)) for one in (name, *synonyms))}
+    groups_of = parse_toml(file_text(Path(__file__).with_name("words.toml")))["confused"]
+    return frozenset(heads | {group for group, nouns in groups_of.items() if not heads.isdisjoint(nouns)})
 
 
 def _only(name: str) -> SceneMap:
