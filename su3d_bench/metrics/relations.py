@@ -139,7 +139,7 @@ def geometric_edges(
     """The first relation of each ordered pair of named boxes (K, 2, 3), if it is a predicate.
 
     In the order of ``RELATIONS``. ``sure`` excludes those of ``Relations.doubtful``, and has every fact once: neither
-    "under" as the reverse of "on" or "above" nor "next to" in both directions.
+    "under" as the reverse of "on" or "above", nor "next to" from the larger object.
     """
     relations = Relations(boxes, [last_word(name) for name in names])
     asked: list[Relation] = [name for name in RELATIONS if name in predicates]
@@ -148,7 +148,8 @@ def geometric_edges(
         holds: BoolArray = relations.of(name)
         kept = relations.facts(name) & ~relations.doubtful(name) if sure else holds
         if sure and name == "next to":
-            kept = np.triu(kept)
+            faces = relations.faces
+            kept &= (faces[:, None] < faces[None]) | np.triu(faces[:, None] == faces[None])
         for pair in np.argwhere(holds).tolist():
             edges.setdefault((pair[0], pair[1]), list(predicates).index(name) if kept[tuple(pair)] else -1)
     return {pair: place for pair, place in edges.items() if place >= 0}

@@ -45,7 +45,8 @@ CONTAINERS = frozenset(
 SHELVES = frozenset({"shelf", "bookshelf", "bookcase", "rack"})
 SEATS = frozenset({"sofa", "couch", "loveseat", "chair", "armchair", "recliner", "bench", "stool", "bed", "futon"})
 FIXTURES = frozenset({"window", "door", "vent", "switch", "plug", "outlet", "socket", "blinds", "blind", "radiator"})
-BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove"})  # "under the sink" is in its cabinet
+# "Under the sink" is in its cabinet.
+BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove", "countertop", "worktop"})
 FLOORS = frozenset({"floor", "ground"})
 SURFACES = FLOORS | {"wall", "ceiling", "roof"}  # of the room itself
 BAND = 1.25  # a relation is doubtful if a threshold lower or higher by this factor changes it
@@ -94,6 +95,11 @@ class Relations:
             is_usual &= ~(self.holders.any(axis=1) & ~self._is_built_in)[None]
         is_built_in = {"on": self._is_built_in[:, None], "under": self._is_built_in[None]}.get(relation, np.False_)
         return np.asarray(is_usual & ~is_built_in)
+
+    @cached_property
+    def faces(self) -> Float64Array:
+        """Square metres (K,): the product of the two longest sides."""
+        return np.asarray(np.prod(np.sort(self._boxes[:, 1] - self._boxes[:, 0], axis=1)[:, 1:], axis=1))
 
     def facts(self, relation: Relation) -> BoolArray:
         """The usual pairs (K, K) in ``relation`` that do not repeat another relation.

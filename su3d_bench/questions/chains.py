@@ -26,7 +26,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
-from su3d_bench.numerics.relations import FLAT_M, gap_m
+from su3d_bench.numerics.relations import BUILT_IN, FLAT_M, gap_m
 from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT
 from su3d_bench.questions.generator import TWICE, generate, is_flat
 from su3d_bench.questions.model import KINDS, Question
@@ -40,7 +40,7 @@ def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, max_objects: 
     """The text chains of at most ``max_objects`` objects of a scene, over its ground-truth instances."""
     owner = truth.instance.astype(np.int64)
     owner[owner <= 0] = -1
-    cases = chains_of(generate(scene, objects, both_ways=True), objects, max_objects)
+    cases = chains_of(generate(scene, objects, both=True), objects, max_objects)
     source = f"chains made from {truth.source}"
     return QueryTruth(truth.points, owner, cases, truth.variant, source, truth.labels.space)
 
@@ -122,7 +122,7 @@ def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -
     """
     grounding: dict[str, Any] = {}
     asked: dict[str, Any] = {}
-    questions = generate(scene, objects, both_ways=True)
+    questions = generate(scene, objects, both=True)
     cases = {case.text: case for case in chains_of(questions, objects)}
     for thing, chains in _chains(questions, objects):
         texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
@@ -161,10 +161,12 @@ def _entry(case: ChainedText) -> dict[str, Any]:
 def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[ChainQuestion]:
     """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
     # a text with the words that determine an answer reveals it
-    asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
-    every = [
-        one for one, text in asked if not set(words(one.hint)) & set(words(text)) and one.text.count("next to") < 2
-    ]
+    hints = (
+        (one, set(words(one.hint)) & set(words(text)))
+        for text in texts
+        for one in questions_about(thing, text, objects)
+    )
+    every = [one for one, shared in hints if not shared and one.text.count("next to") < 2]
     turn = Counter[str]()
     ranked = []
     unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
@@ -230,7 +232,9 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Sc
             return
         high, low = float(thing.size[2]), float(other.size[2])
         volumes = float(np.prod(thing.size)), float(np.prod(other.size))
-        if objects.are_in_one_place(thing, other) and max(high, low) >= MIN_HEIGHT_RATIO * min(high, low) > FLAT_M:
+        built_in = {last_word(thing.name), last_word(other.name)} & BUILT_IN
+        is_level = not built_in and objects.are_in_one_place(thing, other)
+        if is_level and max(high, low) >= MIN_HEIGHT_RATIO * min(high, low) > FLAT_M:
             answer = "Taller" if high > low else "Shorter"
             text = f"Is {it} taller or shorter than the {other.name}?"
         elif max(volumes) >= TWICE * min(volumes) and _has_volume(thing) and _has_volume(other):
@@ -275,7 +279,7 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQue
         if any(objects.is_doubtful("next to", other, thing) for other in others):
             continue
         plain = [other.is_query_target for other, holds in zip(others, is_next, strict=True) if holds]
-        alike = [other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name)]
+        alike = (other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name))
         is_far = all(gap_m(thing.box, other.box) > FAR_M for other in alike)
         answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:

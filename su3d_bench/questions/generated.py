@@ -45,7 +45,7 @@ FAR_M = 1.5  # minimum distance of objects in questions with the answer no
 MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
-DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
+DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct; a smaller share is no visible lead
 PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated per row or pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 Random = np.random.Generator
@@ -155,7 +155,8 @@ class _Drafts:
         for reference in self._single:
             others = [thing for thing in self._all if thing is not reference]
             ranked = sorted(others, key=partial(_away_m, reference))
-            if len(ranked) > 1 and _leads(ranked[:2], reference, 1) and _leads_by_gap(ranked, reference, 1):
+            is_clear = len(ranked) > 1 and not self._scene.is_of(ranked[0], reference)
+            if is_clear and _leads(ranked[:2], reference, 1) and _leads_by_gap(ranked, reference, 1):
                 share = 1 / len(others)
                 yield _Draft(f"Which object is closest to the {reference.name}?", share, share)
 
@@ -169,11 +170,8 @@ class _Drafts:
     def _counts(self) -> Iterator[_Draft]:
         """Counts for every name, and for some absent names, unless other objects might be called so."""
         absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
-        n_of = {
-            name: len(noun_objects(name, self._scene).objects)
-            for name in (*self._n_of, *absent)
-            if _is_counted(name) and self._is_distinct(name)
-        }
+        names = [name for name in (*self._n_of, *absent) if _is_counted(name) and self._is_distinct(name)]
+        n_of = {name: len(noun_objects(name, self._scene).objects) for name in names}
         counted = {name: n for name, n in n_of.items() if name in self._n_of}
         absent = [name for name, n in n_of.items() if not n]
         counted |= {absent[k]: 0 for k in self._random.permutation(len(absent))[: max(1, len(counted) // 4)]}
@@ -238,7 +236,9 @@ class _Drafts:
                 alike = [thing for thing in self._all if may_be_confused(name, thing.name)]
                 is_far = all(gap_m(thing.box, reference.box) > FAR_M for thing in alike)
                 is_sure = not any(self._scene.is_doubtful(relation, *pair) for pair in pairs)
-                is_sure &= all(self._scene.is_usual(relation, *pair) for pair in pairs)
+                is_sure &= all(
+                    self._scene.is_fact(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)
+                )
                 if is_sure and (is_locked[name] or (is_far and name in subjects and any(is_locked.values()))):
                     verb, noun = ("Are", name) if is_plural(name) else ("Is", with_article(name))
                     text = f"{verb} there {noun} {relation} the {reference.name}?"
@@ -272,8 +272,9 @@ def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool
         return False
     ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))
     sides = [float(thing.size.max()) for thing in (*ranked[:2], reference)]
-    lead_m = abs(_away_m(ranked[1], reference) - _away_m(ranked[0], reference))
-    return lead_m >= max(MARGIN_M, MARGIN_SHARE * max(sides)) and _leads_by_gap(ranked, reference, sign)
+    first_m, second_m = (_away_m(thing, reference) for thing in ranked[:2])
+    margin_m = max(MARGIN_M, MARGIN_SHARE * max(sides), DISTANCE_SHARE * min(first_m, second_m))
+    return abs(second_m - first_m) >= margin_m and _leads_by_gap(ranked, reference, sign)
 
 
 def _leads_by_gap(ranked: Sequence[MapObject], reference: MapObject, sign: int) -> bool:

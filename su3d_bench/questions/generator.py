@@ -43,16 +43,14 @@ class _Asked:
     name: str = ""
 
 
-def generate(
-    scene: str, objects: SceneMap, per_kind: int | None = None, *, both_ways: bool = False
-) -> tuple[Question, ...]:
+def generate(scene: str, objects: SceneMap, per_kind: int | None = None, *, both: bool = False) -> tuple[Question, ...]:
     """The questions of all kinds, at most ``per_kind`` of each, drawn deterministically by a digest of the text.
 
-    ``both_ways``: a relation describes each of its two objects, not only one ("table with a cup on it").
+    ``both``: a relation describes each of its two objects, not only one ("table with a cup on it").
     """
     right: dict[tuple[str, str, str], set[int]] = {}
     doubtful: set[str] = set()
-    for asked in (*_texts(objects), *_relations(objects, both_ways=both_ways)):
+    for asked in (*_texts(objects), *_relations(objects, both=both)):
         if asked.answers:
             right.setdefault((asked.kind, asked.text, asked.name), set()).update(asked.answers)
         else:
@@ -144,13 +142,14 @@ def is_flat(thing: MapObject) -> bool:
 
 
 def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
-    """The largest (``sign`` 1) or smallest (-1), if it leads twofold in volume and visibly in length, else None."""
+    """The largest (``sign`` 1) or smallest (-1) in every side, if it leads twofold in volume and visibly in length."""
     ranked = sorted(things, key=lambda thing: -sign * float(np.prod(thing.size)))
-    volumes, sides = ([measure(thing.size) for thing in ranked] for measure in (np.prod, np.max))
+    volumes = [np.prod(thing.size) for thing in ranked]
     if len(ranked) < 2 or max(volumes[:2]) < TWICE * min(volumes[:2]):
         return None
-    lead = LEAD**sign
-    return ranked[0] if all(sign * (sides[0] - lead * side) >= 0 for side in sides[1:]) else None
+    first, *others = [np.sort(thing.size) for thing in ranked]  # a floor lamp is not larger than a wide one
+    lead = np.array([1.0, 1.0, LEAD**sign])
+    return ranked[0] if all((sign * (first - lead * other) >= 0).all() for other in others) else None
 
 
 def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
@@ -219,23 +218,24 @@ def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Itera
             yield _Asked("property", f"{less} {name}", (ids[0],), name)
 
 
-def _relations(objects: SceneMap, *, both_ways: bool) -> Iterator[_Asked]:
+def _relations(objects: SceneMap, *, both: bool) -> Iterator[_Asked]:
     """Relations that hold with certainty, each once; if a pair of these names is doubtful, the text is not asked."""
     things = objects.objects
     for relation in RELATIONS:
         if relation == "near":
             continue
         related, doubtful = objects.relations.facts(relation), objects.doubtful[relation]
+        is_usual = objects.relations.usual(relation)
         if relation == "in":
             related = related & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
         for a, b in np.argwhere(related | doubtful).tolist():
             subject, other = things[a], things[b]
             text = f"{subject.name} {relation} {with_article(other.name)}"
-            is_asked = subject.name != other.name and objects.is_usual(relation, subject, other)
+            is_asked = subject.name != other.name and is_usual[a, b]
             is_sure = not doubtful[a, b] and other.is_query_target
-            if is_asked and (both_ways or relation != "next to" or objects.is_located_by(subject.name, other.name)):
+            if is_asked and (both or relation != "next to" or objects.is_located_by(subject.name, other.name)):
                 yield _Asked("relative", text, (subject.id,) if is_sure else (), subject.name)
-            if is_asked and both_ways and relation == "on":
+            if is_asked and both and relation == "on":
                 text = f"{other.name} with {with_article(subject.name)} on it"
                 is_sure &= subject.is_query_target
                 yield _Asked("relative", text, (other.id,) if is_sure else (), other.name)

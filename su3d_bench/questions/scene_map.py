@@ -103,38 +103,29 @@ class SceneMap:
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object is between two others; objects on or in one of them, or under it, are not."""
-        return geometry.is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.is_between(thing.box, first.box, second.box) and not self.is_of(thing, first, second)
 
     def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object could be called between two others."""
-        return geometry.may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.may_be_between(thing.box, first.box, second.box) and not self.is_of(thing, first, second)
 
-    def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
+    def is_of(self, thing: MapObject, *ends: MapObject) -> bool:
         """Whether an object is one of ``ends``, or on or in one, or the reverse."""
         pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
         return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
-    def is_usual(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether the relation is natural for such objects."""
-        return bool(self.relations.usual(relation)[self._row_of[subject.id], self._row_of[other.id]])
-
     def is_fact(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
         """Whether the relation holds, is natural, and does not repeat another one ("under" for "on")."""
         return bool(self.relations.facts(relation)[self._row_of[subject.id], self._row_of[other.id]])
-
-    @cached_property
-    def _face_of(self) -> dict[str, float]:
-        """The mean product of the two longest sides of the objects of each name."""
-        names = {thing.name for thing in self.objects}
-        return {name: float(np.mean([np.prod(np.sort(thing.size)[1:]) for thing in self.objects if thing.name == name]))
-                for name in names}  # fmt: skip
 
     def is_located_by(self, name: str, other: str) -> bool:
         """Whether a ``name`` is said to be next to an ``other``, which is the larger of the two, and not the reverse.
 
         Source: Talmy 1983, How language structures space: a reference object is larger and easier to see.
         """
-        return (self._face_of[name], name) < (self._face_of[other], other)
+        faces = [(self.objects[row].name, face) for row, face in enumerate(self.relations.faces.tolist())]
+        own, others = (max(face for called, face in faces if called == one) for one in (name, other))
+        return (own, name) < (others, other)
 
     def are_in_one_place(self, *things: MapObject) -> bool:
         """Whether objects are on one support, all on the floor, or all hang."""
@@ -426,8 +417,8 @@ def _heads(name: str) -> frozenset[str]:
     """The head noun of a name, the name, its synonyms, and the groups of these."""
     synonyms = SYNONYMS.get(_class_of_words().get(words(name), ""), ())
     heads = {last_word(name), *(" ".join(words(one)) for one in (name, *synonyms))}
-    groups_of = parse_toml(file_text(Path(__file__).with_name("words.toml")))["confused"]
-    return frozenset(heads | {group for group, nouns in groups_of.items() if not heads.isdisjoint(nouns)})
+    groups = parse_toml(file_text(Path(__file__).with_name("words.toml")))["confused"]["nouns"]
+    return frozenset(heads | {str(k) for k, group in enumerate(groups) if not heads.isdisjoint(group)})
 
 
 def _only(name: str) -> SceneMap:

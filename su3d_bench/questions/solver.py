@@ -313,8 +313,8 @@ class Solver:
         elif abs(ranked[1][0] - distance_m) < CLOSE_CALL_M:
             self._note(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away, between centres")
         rest = "".join(f"; {thing.shown} {away_m:.2f} m" for away_m, thing, _ in ranked[1:4])
-        end = ("farther from" if len(ranked) == 2 else "farthest from") if question.farthest else "closest to"
-        end = "closer to" if len(ranked) == 2 and not question.farthest else end
+        degree = "er" if len(ranked) == 2 else "est"
+        end = f"farth{degree} from" if question.farthest else f"clos{degree} to"
         text = f"{best.shown} is {end} {reference.shown}: {distance_m:.2f} m between centres{rest}"
         return text, (best,), (reference,), None
 

@@ -52,7 +52,7 @@ def test_relations_come_from_boxes() -> None:
 def test_each_relation_is_asked_once_and_both_ways_for_chains() -> None:
     doubled = {"table under a vase", "rug under a table", "table next to a chair", "table with a vase on it"}
     assert doubled.isdisjoint(text for _, text in ASKED)
-    both = {one.text: one.answers for one in generate("a/b", THINGS, both_ways=True)}
+    both = {one.text: one.answers for one in generate("a/b", THINGS, both=True)}
     assert both["table with a vase on it"] == both["table next to a chair"] == (2,)
     tucked = placed(11, "box", (0.7, 0.7, 0.0), (0.3, 0.3, 0.3))
     beneath = SceneMap((*(thing for thing in THINGS.objects if thing.name not in ("rug", "chair")), tucked))
