@@ -21,16 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.english import is_plural, last_word, with_article, words
+from su3d_bench.core.english import is_countable, is_plural, last_word, with_article, words
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import BUILT_IN, FLAT_M, gap_m
 from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT
-from su3d_bench.questions.generator import TWICE, generate, is_flat
+from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, is_flat, may_be_confused
 from su3d_bench.questions.model import KINDS, Question
-from su3d_bench.questions.scene_map import MapObject, SceneMap, may_be_confused
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 
 INSTANCE, _, PROPERTY, RELATIVE = KINDS
 FORMS = SHAPES | {word for more, less, _ in SIZES for word in (more, less) if word}
@@ -161,12 +161,8 @@ def _entry(case: ChainedText) -> dict[str, Any]:
 def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[ChainQuestion]:
     """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
     # a text with the words that determine an answer reveals it
-    hints = (
-        (one, set(words(one.hint)) & set(words(text)))
-        for text in texts
-        for one in questions_about(thing, text, objects)
-    )
-    every = [one for one, shared in hints if not shared and one.text.count("next to") < 2]
+    asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
+    every = [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
     turn = Counter[str]()
     ranked = []
     unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
@@ -201,7 +197,8 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
         yield from _support_question(thing, it, objects)
     yield from _measured(thing, it, alone, objects)
     yield from _beside(thing, it, alone, objects)
-    yield from _existing(thing, it, objects)
+    if "next to" not in text:
+        yield from _existing(thing, it, objects)
 
 
 def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
@@ -248,13 +245,13 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Sc
 
 def _has_volume(thing: MapObject) -> bool:
     """Whether its volume is a meaningful size."""
-    return not is_flat(thing) and last_word(thing.name) not in SOFT
+    return not is_flat(thing) and is_countable(thing.name) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object is next to another, and which of two is closer by a clear margin."""
     for other in alone:
-        if objects.is_doubtful("next to", thing, other):
+        if objects.is_doubtful("next to", thing, other) or "next to" in it:
             continue
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:

@@ -26,17 +26,9 @@ from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
-from su3d_bench.questions.generator import extreme_of, is_flat
+from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
 from su3d_bench.questions.model import Answer
-from su3d_bench.questions.scene_map import (
-    MapObject,
-    SceneMap,
-    is_called,
-    is_room_surface,
-    may_be_confused,
-    noun_objects,
-    plain_name,
-)
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
 MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of the longest side compared
@@ -46,7 +38,7 @@ MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct; a smaller share is no visible lead
-PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated per row or pile
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",)})  # annotated per pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 Random = np.random.Generator
 
@@ -146,7 +138,7 @@ class _Drafts:
         for reference in self._single:
             for name, n in self._n_of.items():
                 several = [thing for thing in self._things if thing.name == name]
-                if n > 1 and _leads(several, reference, sign):
+                if n > 1 and is_countable(name) and _leads(several, reference, sign):
                     verb = "are" if is_plural(name) else "is"
                     words = of_two if n == 2 else of_more
                     yield _Draft(f"Which {name} {verb} {words} the {reference.name}?", 1 / n, 1 / n)
@@ -213,7 +205,7 @@ class _Drafts:
     def _what(self, relation: Relation) -> Iterator[_Draft]:
         for reference in self._single:
             pairs = [(thing, reference) for thing in self._all if thing is not reference]
-            if not all(self._scene.is_fact(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
+            if not self._are_facts(relation, pairs):
                 continue
             related = [pair for pair in pairs if self._holds(relation, *pair)]
             if related and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
@@ -236,13 +228,15 @@ class _Drafts:
                 alike = [thing for thing in self._all if may_be_confused(name, thing.name)]
                 is_far = all(gap_m(thing.box, reference.box) > FAR_M for thing in alike)
                 is_sure = not any(self._scene.is_doubtful(relation, *pair) for pair in pairs)
-                is_sure &= all(
-                    self._scene.is_fact(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)
-                )
+                is_sure &= self._are_facts(relation, pairs)
                 if is_sure and (is_locked[name] or (is_far and name in subjects and any(is_locked.values()))):
                     verb, noun = ("Are", name) if is_plural(name) else ("Is", with_article(name))
                     text = f"{verb} there {noun} {relation} the {reference.name}?"
                     yield _Draft(text, 0.5, 0.5, "yes" if is_locked[name] else "no")
+
+    def _are_facts(self, relation: Relation, pairs: Iterable[tuple[MapObject, MapObject]]) -> bool:
+        """Whether every pair in the relation is natural and repeats no other relation."""
+        return all(self._scene.is_fact(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair))
 
     def _holds(self, relation: Relation, a: MapObject, b: MapObject) -> bool:
         """Whether the relation holds in common usage: a cushion within the box of a sofa is on it, not in it."""

@@ -12,7 +12,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations
 from pathlib import Path
 
@@ -21,6 +21,7 @@ import numpy as np
 from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
+from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
 from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
@@ -92,9 +93,29 @@ def accuracy_by_name(question: Question, objects: SceneMap) -> float:
 
 @cache
 def _table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it."""
+    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it; ``confused``: groups."""
     table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
     return {phrase: tuple(entries) for phrase, entries in table[section].items()}
+
+
+@lru_cache(maxsize=65_536)
+def may_be_confused(one: str, other: str) -> bool:
+    """Whether people may use one of two names for an object of the other.
+
+    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
+
+    >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
+    (True, True, False)
+    """
+    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
+
+
+@cache
+def _heads(name: str) -> frozenset[str]:
+    """The head noun of a name, the name, its synonyms, and the groups of these."""
+    names = (last_word(name), name, *SYNONYMS.get(name.replace(" ", "-"), ()))
+    heads = {" ".join(words(one)) for one in names}
+    return frozenset(heads | {group for group, nouns in _table("confused").items() if not heads.isdisjoint(nouns)})
 
 
 def _texts(objects: SceneMap) -> Iterator[_Asked]:

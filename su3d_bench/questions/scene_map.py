@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
-from pathlib import Path
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from su3d_bench.core.english import last_word, words
 from su3d_bench.core.errors import PredictionError, nearest, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
@@ -398,27 +396,6 @@ def is_called(label: str, class_name: str) -> bool:
     if " ".join(label_words) in GROUPS:
         return False
     return bool(noun_objects(class_name, _only(label)).objects) or bool(noun_objects(label, _only(class_name)).objects)
-
-
-@lru_cache(maxsize=65_536)
-def may_be_confused(one: str, other: str) -> bool:
-    """Whether people may use one of two names for an object of the other.
-
-    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
-
-    >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
-    (True, True, False)
-    """
-    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
-
-
-@cache
-def _heads(name: str) -> frozenset[str]:
-    """The head noun of a name, the name, its synonyms, and the groups of these."""
-    synonyms = SYNONYMS.get(_class_of_words().get(words(name), ""), ())
-    heads = {last_word(name), *(" ".join(words(one)) for one in (name, *synonyms))}
-    groups = parse_toml(file_text(Path(__file__).with_name("words.toml")))["confused"]["nouns"]
-    return frozenset(heads | {str(k) for k, group in enumerate(groups) if not heads.isdisjoint(group)})
 
 
 def _only(name: str) -> SceneMap:
