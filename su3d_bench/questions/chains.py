@@ -65,7 +65,7 @@ def _chains(questions: Sequence[Question], objects: SceneMap) -> Iterator[tuple[
     """Each object with three chains, and the chains with the most specific text first."""
     name_of = {question.text: question for question in questions if question.kind == INSTANCE}
     for thing in objects.objects:
-        coarse = name_of.get(thing.name)
+        coarse = name_of.get(thing.name) if is_countable(thing.name) else None
         fine = [] if coarse is None else _meaning(thing.id, questions)
         if coarse is not None and len(fine) >= CHAINS_EACH:
             yield thing, [[one, coarse] for one in fine[:CHAINS_EACH]]
@@ -203,7 +203,8 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
 
 def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
     """Whether an object is the only one of its name and clearly visible."""
-    return thing.is_query_target and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
+    is_one = is_countable(thing.name) and not is_plural(thing.name)
+    return thing.is_query_target and is_one and len(_called(thing.name, objects)) == 1
 
 
 def _called(name: str, objects: SceneMap) -> list[MapObject]:
@@ -245,7 +246,7 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Sc
 
 def _has_volume(thing: MapObject) -> bool:
     """Whether its volume is a meaningful size."""
-    return not is_flat(thing) and is_countable(thing.name) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
+    return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:

@@ -24,20 +24,20 @@ from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
-from su3d_bench.numerics.relations import Relation, gap_m
+from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
 from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
 from su3d_bench.questions.model import Answer
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
-MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of the longest side compared
+MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of its distance and the longest side
 LEVEL_M = 0.75  # objects whose centres differ more in height are not compared by distance
 FAR_M = 1.5  # minimum distance of objects in questions with the answer no
 MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
-DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct; a smaller share is no visible lead
+DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
 PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",)})  # annotated per pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 Random = np.random.Generator
@@ -111,7 +111,7 @@ class _Drafts:
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
         single = [one for one in self._things if self._n_of[one.name] == 1]
-        single = [one for one in single if not is_plural(one.name) and not one.is_cut]
+        single = [one for one in single if is_countable(one.name) and not is_plural(one.name) and not one.is_cut]
         self._single = [single[k] for k in sorted(random.permutation(len(single))[:MAX_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
@@ -214,9 +214,9 @@ class _Drafts:
 
     def _is(self, relation: Relation) -> Iterator[_Draft]:
         """Whether an object of a name is in a relation; negative examples are far away."""
-        subjects = {
-            a.name for a in self._things if any(self._holds(relation, a, b) for b in self._single if a is not b)
-        }
+        # a table is on a rug, but on nothing else
+        holders = [thing for thing in self._single if thing.size[2] > FLAT_M]
+        subjects = {a.name for a in self._things if any(self._holds(relation, a, b) for b in holders if a is not b)}
         for reference in self._single:
             pairs_of = {
                 name: [(a, reference) for a in self._things if a.name == name]
@@ -266,9 +266,9 @@ def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool
         return False
     ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))
     sides = [float(thing.size.max()) for thing in (*ranked[:2], reference)]
-    first_m, second_m = (_away_m(thing, reference) for thing in ranked[:2])
-    margin_m = max(MARGIN_M, MARGIN_SHARE * max(sides), DISTANCE_SHARE * min(first_m, second_m))
-    return abs(second_m - first_m) >= margin_m and _leads_by_gap(ranked, reference, sign)
+    first_m, second_m = sorted(_away_m(thing, reference) for thing in ranked[:2])
+    margin_m = max(MARGIN_M, MARGIN_SHARE * max(first_m, *sides))
+    return second_m - first_m >= margin_m and _leads_by_gap(ranked, reference, sign)
 
 
 def _leads_by_gap(ranked: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
