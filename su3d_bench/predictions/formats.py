@@ -88,9 +88,9 @@ def recognise(path: Path, format: str | None = None) -> Reader:
     if not fitting:
         file, line = text.first_line(path) or (path, "")
         why = f"; {shown(file)}:1: '{printable(line, 80)}' is neither {text.LIST_FORM} nor a class id" if line else ""
-        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}){why}; name it with --format")
+        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}){why}; name it with --input-format")
     reasons = "; ".join(f"{name}: {why}" for name, why in fitting.items())
-    raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --format")
+    raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --input-format")
 
 
 @dataclass(frozen=True)

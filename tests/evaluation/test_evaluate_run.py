@@ -50,7 +50,7 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_scannet_text(Path("predB"), text)
 
 
-BOTH = ["evaluate", "--name", "mine=predA", "theirs=predB", "--dataset", PAINTED, "--scenes", "[abc]"]
+BOTH = ["evaluate", "--predictions", "mine=predA", "theirs=predB", "--dataset", PAINTED, "--scenes", "[abc]"]
 PROTOCOLS = ["--protocol", "rooms-instance", "rooms-semantic"]
 RUN = "runs/both"
 
@@ -115,7 +115,7 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
     answered(capsys, "check", "--build-from", RUN, "--out", "reference.json")
     assert answered(capsys, "check", RUN, "--against", "reference.json").startswith("passed")
     assert "imported predictions have no timings" in answered(capsys, "report", "timing", RUN, code=2)
-    words = ("sheets", "make", RUN, "--kind", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
+    words = ("sheets", "make", RUN, "--kinds", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
     answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
     assert Path("sheets").is_dir()
     ranking = json.loads(
@@ -202,7 +202,7 @@ def test_run_from_text_ground_truth_has_attribution_and_states_gaps(
         capsys, "query", "text", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2
     )
     assert "uses the points of ground-truth files, which have no coordinates" in query
-    sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
+    sheets = answered(capsys, "sheets", "make", "runs/mine", "--kinds", "annotation", "--out", "sheets", code=2)
     assert sheets.count("\n") == 1 and "uses the points of ground-truth files" in sheets
     answered(capsys, "runs", "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
