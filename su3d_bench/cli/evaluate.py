@@ -70,7 +70,7 @@ def call(arguments: argparse.Namespace) -> None:
         "protocols": tuple(arguments.protocols),
         "scenes": tuple(arguments.scenes),
     }
-    requests = {method: Request(tuple(paths), **chosen) for method, paths in _named(arguments).items()}
+    requests = {method: Request(tuple(paths), method=method, **chosen) for method, paths in _named(arguments).items()}
     run = evaluate_methods(requests, arguments.out)
     results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
@@ -92,12 +92,15 @@ def call(arguments: argparse.Namespace) -> None:
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by method name."""
     from su3d_bench.evaluation.result import default_name
+    from su3d_bench.predictions.run_predictions import methods_of
 
     if not arguments.paths and not arguments.predictions:
         raise ConfigError("evaluate: no predictions given; name a folder or files, or --predictions METHOD=PREDICTIONS")
     if arguments.predictions and (arguments.paths or arguments.name is not None):
         raise ConfigError("evaluate: --predictions names methods and predictions; leave out PREDICTIONS and --name")
     named: dict[str, list[Path]] = {}
+    if len(arguments.paths) == 1 and arguments.name is None and (methods := methods_of(arguments.paths[0])):
+        return dict.fromkeys(methods, arguments.paths)
     for text in arguments.predictions:
         method, _, path = text.partition("=")
         if not method or not path:
