@@ -34,7 +34,7 @@ CASES: dict[str, list[list[str]]] = {
             ["--config", "hostile.toml"], ["--scenes", HOSTILE], ["--set", f"{HOSTILE}=1"]],
     "evaluate": [["predictions", "--ground-truth", "truth", "--out", f"out/made{IN_A_PATH}"],
                  ["--predictions", "a=predictions", "b=predictions", "--ground-truth", "truth", "--per-class",
-                  "--protocol", "scannet-instance", "--out", "out/both"],
+                  "--protocols", "scannet-instance", "--out", "out/both"],
                  ["--predictions", f"{HOSTILE}=predictions", "b=predictions", "--ground-truth", "truth"]],
     "check": [["RUN", "--against", "reference.json", "--github", "--markdown", "out/c.md", "--junit", "out/c.xml"],
               ["RUN", "--against", "reference.json", "--json"], ["--build-from", "RUN", "--out", "out/reference.json"]],

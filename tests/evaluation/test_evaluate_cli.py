@@ -22,7 +22,7 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_scannet_text(Path("pred"), scene([CHAIR, TABLE][:n], [5, 7][:n], [0.9, 0.8][:n], name=name))
 
 
-WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocol", "scannet-instance"]
+WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocols", "scannet-instance"]
 
 
 def test_table_has_values_with_interval_ceiling_and_warnings(capsys: pytest.CaptureFixture[str]) -> None:
