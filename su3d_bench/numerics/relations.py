@@ -191,9 +191,10 @@ class Relations:
     @cached_property
     def _is_over(self) -> BoolArray:
         """Half of the first, or its centre, is over the footprint of the second."""
-        share = self._shared(OVER_PAD_M) / self._area[:, None]
+        pad_m = OVER_PAD_M * self._slack
+        share = self._shared(pad_m) / self._area[:, None]
         centre = self._boxes.mean(axis=1)[:, None, :2]
-        low, high = self._boxes[:, 0, :2] - OVER_PAD_M, self._boxes[:, 1, :2] + OVER_PAD_M
+        low, high = self._boxes[:, 0, :2] - pad_m, self._boxes[:, 1, :2] + pad_m
         has_centre = ((centre >= low[None]) & (centre <= high[None])).all(axis=2)
         return np.asarray((share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack)))
 
