@@ -172,7 +172,7 @@ def test_facts_are_usual_and_stated_once() -> None:
     counter, sink, vase = (
         box(0, 0, 0, 2, 0.6, 0.9),
         box(0.2, 0.1, 0.9, 0.5, 0.4, 0.2),
-        box(1.2, 0.3, 0.9, 0.1, 0.1, 0.3),
+        box(1.2, 0.42, 0.9, 0.1, 0.1, 0.3),
     )
     names = ["countertop", "sink", "vase", "picture", "floor"]
     relations = Relations(np.array([counter, sink, vase, box(1, 0.55, 1.3, 0.5, 0.03, 0.5), FLOOR]), names)
