@@ -104,7 +104,18 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
     assert rules.digest in text
 
 
-@pytest.mark.parametrize(("words", "prog"), [("", ""), ("help", ""), ("report", " report"), ("help run", " run")])
+@pytest.mark.parametrize(
+    ("words", "prog"),
+    [
+        ("", ""),
+        ("help", ""),
+        ("report", " report"),
+        ("help run", " run"),
+        ("help report tables", " report tables"),
+        ("report help", " report"),
+        ("dev cache help", " dev cache"),
+    ],
+)
 def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 0
     assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")
