@@ -49,17 +49,9 @@ def add_parser(verbs: Verbs) -> None:
         type=str,
     )
     parser.shared("--methods")
-    parser.option(
-        "--scenes SCENE...",
-        "scenes or patterns to use (default: all of RUN)",
-        default=[],
-    )
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: all of RUN)", default=[])
     parser.shared("--exclude-ids")
-    parser.option(
-        "--per-kind N",
-        "maximum number per kind and scene (default: depends on the kind)",
-        type=count,
-    )
+    parser.option("--per-kind N", "maximum number per kind and scene (default: depends on the kind)", type=count)
     parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
     parser.option(
         "--overlap SHARE", "share of items that all annotators rate (default: 0.25)", type=float, default=0.25
