@@ -53,6 +53,9 @@ class Parser(argparse.ArgumentParser):
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             if isinstance(action, argparse._SubParsersAction):
                 name = action.dest
+                if value == "help":
+                    self.print_help()
+                    self.exit()
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
     def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:

@@ -49,9 +49,7 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option(
-        "--out DIR",
-        "run folder or URL, such as s3://bucket/run (default: a folder in runs/)",
-        type=run_place,
+        "--out DIR", "run folder or URL, such as s3://bucket/run (default: a folder in runs/)", type=run_place
     )
     into = parser.add_mutually_exclusive_group()
     what = "add scenes, methods and protocols to the run in --out"

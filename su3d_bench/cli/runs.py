@@ -49,10 +49,7 @@ def add_parser(verbs: Verbs) -> None:
         default="vote",
     )
     parser.option("--top-m N", "number of views used (default: 5)", type=count, default=5)
-    parser.option(
-        "--background-names [NAME...]",
-        "names of background to exclude (default: those of the paper)",
-    )
+    parser.option("--background-names [NAME...]", "names of background to exclude (default: those of the paper)")
     parser.option(
         "--max-map-fraction SHARE",
         "maximum share of the map that a box may cover from above (default: 0.95)",

@@ -49,17 +49,9 @@ def add_parser(verbs: Verbs) -> None:
         type=str,
     )
     parser.shared("--methods")
-    parser.option(
-        "--scenes SCENE...",
-        "scenes or patterns to use (default: all of RUN)",
-        default=[],
-    )
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: all of RUN)", default=[])
     parser.shared("--exclude-ids")
-    parser.option(
-        "--per-kind N",
-        "maximum number per kind and scene (default: depends on the kind)",
-        type=count,
-    )
+    parser.option("--per-kind N", "maximum number per kind and scene (default: depends on the kind)", type=count)
     parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
     parser.option(
         "--overlap SHARE", "share of items that all annotators rate (default: 0.25)", type=float, default=0.25
@@ -198,7 +190,8 @@ def _drafts(
         client, config = options.chat_client(arguments, source.run.folder)
         ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}
-    for scene in source.scenes:  # all kinds of one scene together: they share its ground truth
+    # All kinds of one scene together: they share its ground truth.
+    for scene in output.stepped(source.scenes, "items", is_quiet=arguments.quiet):
         for kind, mine in sources.items():
             n_most = arguments.per_kind or PER_KIND[kind]
             if kind == "annotation":
@@ -252,16 +245,11 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.human_eval.drawing import draw_all
-    from su3d_bench.runs.executors import Event
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
-    with output.progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
-        pictures = draw_all(
-            source,
-            flat,
-            arguments.jobs or os.cpu_count() or 1,
-            lambda n_done, n: report(Event(name, "pictures", n_done, n)),
-        )
+    jobs = arguments.jobs or os.cpu_count() or 1
+    with output.steps("pictures", is_quiet=arguments.quiet) as step:
+        pictures = draw_all(source, flat, jobs, lambda n_done, n: step(name, n_done, n))
     remaining = iter(pictures)
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 
