@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.english import words
 from su3d_bench.core.errors import PredictionError, Su3dError, some
 from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
@@ -18,10 +19,8 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, text_table
 from su3d_bench.human_eval.sources import RunSource
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.matching.labelling import similarities
-from su3d_bench.metrics.matching.nearest import masks_of
-from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.score import REFINED_BY, RetrievalTruth, labels_n
+from su3d_bench.metrics.matching import labelling, nearest
+from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.numerics.statistics import ratio
 from su3d_bench.questions.ground_truths import question_truth
 from su3d_bench.questions.model import BLOCK_ROWS
@@ -29,19 +28,16 @@ from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import prediction_arrays
 
-MIN_SCENES = 3  # for a correlation: any two scenes lie on a line
-OF_POINTS = ("points", "indices", "instance")  # fields of a map whose size grows with its points
 OF_SPREAD = ("similarity SD", "similarity range")
 OF_RANKING = ("relevant - others", "largest first", "largest first, wrong", "largest first by chance")
 RELATED = "reasoning and merging"
 # Measure: its unit, the section of the paper that makes the claim, and its format.
 MEASURES = {
-    **dict.fromkeys(OF_SPREAD, ("cosine", "IV-C1, C3", ".3f")),
-    OF_RANKING[0]: ("cosine", "IV-C3", ".3f"),
-    **dict.fromkeys(OF_RANKING[1:], ("fraction of queries", "IV-C4", ".3f")),
-    **dict.fromkeys(("length of n", "length of n'"), ("words", "IV-C5", ".2f")),
-    **dict.fromkeys(("characters of n", "characters of n'"), ("characters", "IV-C5", ".1f")),
-    RELATED: ("correlation", "IV-C6", ".2f"),
+    **dict.fromkeys(OF_SPREAD, ("cosine", "III-C1, C3", ".3f")),
+    OF_RANKING[0]: ("cosine", "III-C3", ".3f"),
+    **dict.fromkeys(OF_RANKING[1:], ("fraction of queries", "III-C4", ".3f")),
+    **dict.fromkeys(("length of n", "length of n'"), ("words", "III-C5", ".2f")),
+    RELATED: ("correlation", "III-C6", ".2f"),
     **dict.fromkeys(("size per instance", "size per point"), ("bytes", "I", ".0f")),
     "size of map": ("MB per scene", "I", ".2f"),
 }
@@ -51,13 +47,13 @@ def spread(blocks: Iterable[Float64Array]) -> tuple[Float64Array, Float64Array]:
     """Standard deviation (Q,) and range (Q,), maximum minus minimum, of the cosine similarities of Q queries.
 
     ``blocks``: similarities (R, Q) of R of the instances or points, at least one in all. The paper's "saturated"
-    similarities (section IV-C1) differ little, so that both are small.
+    similarities (section III-C1) differ little, so that both are small.
 
     >>> deviation, extent = spread([np.array([[0.1, 0.5]]), np.array([[0.3, 0.5]])])
     >>> deviation.round(3).tolist(), extent.round(3).tolist()
     ([0.1, 0.0], [0.2, 0.0])
     """
-    n, low, high, sums, squares = 0, np.inf, -np.inf, 0.0, 0.0
+    n, low, high, sums, squares = 0, np.array(np.inf), np.array(-np.inf), np.zeros(()), np.zeros(())
     for block in blocks:
         n, sums, squares = n + len(block), sums + block.sum(axis=0), squares + (block**2).sum(axis=0)
         low, high = np.minimum(low, block.min(axis=0)), np.maximum(high, block.max(axis=0))
@@ -70,7 +66,7 @@ def relevance(similarity: Float64Array, is_right: BoolArray) -> Float64Array:
     """Mean cosine of the instances that answer a query minus that of the others (Q,); NaN if all or none answer.
 
     ``similarity``, ``is_right`` (K, Q). The paper: "assigning high similarity scores to relevant objects and lower
-    scores to irrelevant ones" (section IV-C3).
+    scores to irrelevant ones" (section III-C3).
 
     >>> relevance(np.array([[0.9, 0.2], [0.3, 0.2], [0.5, 0.2]]), np.array([[1, 0], [0, 0], [0, 0]], bool)).tolist()
     [0.5, nan]
@@ -83,7 +79,7 @@ def largest_first(similarity: Float64Array, n_points: Int64Array, is_right: Bool
     """Whether (Q,) the instance with most points is ranked first, and whether (Q,) it then does not answer the query.
 
     ``similarity``, ``is_right`` (K, Q); ``n_points`` (K,); the first instance on ties. The paper: scheme 1 "often
-    wrongly assigned the highest score to the largest instance" (section IV-C4).
+    wrongly assigned the highest score to the largest instance" (section III-C4).
 
     >>> similarity = np.array([[0.9, 0.1, 0.7], [0.3, 0.4, 0.2]])
     >>> first, wrong = largest_first(similarity, np.array([50, 9]), np.array([[1, 1, 0], [0, 0, 1]], bool))
@@ -98,14 +94,14 @@ def largest_first(similarity: Float64Array, n_points: Int64Array, is_right: Bool
 def correlation(pairs: Sequence[tuple[float, float]]) -> float:
     """Pearson's correlation of two values per scene, from -1 to 1; ``PredictionError`` if it is undefined.
 
-    The paper explains lower reasoning accuracy by more flaws in merging (section IV-C6).
+    The paper explains lower reasoning accuracy by more flaws in merging (section III-C6).
 
     >>> round(correlation([(0.5, 0.6), (0.7, 0.8), (0.9, 1.0)]), 3)
     1.0
     """
-    if len(pairs) < MIN_SCENES or not np.ptp(pairs, axis=0).all():
-        raise PredictionError(f"no correlation: needs {MIN_SCENES} scenes with both values, which must differ")
-    return float(np.corrcoef(np.array(pairs, np.float64).T)[0, 1])
+    if len(pairs) < 3 or not np.ptp(pairs, axis=0).all():
+        raise PredictionError("no correlation: needs 3 scenes with both values, which must differ")
+    return float(np.asarray(np.corrcoef(np.array(pairs, np.float64).T))[0, 1])
 
 
 def map_bytes(prediction: Prediction) -> tuple[int, int]:
@@ -119,7 +115,7 @@ def map_bytes(prediction: Prediction) -> tuple[int, int]:
     >>> map_bytes(a_map)  # 16 feature + 8 score + 1 name + 24 box + 12 centroid + 2 x 16 starts; 36 points + 8 mask
     (93, 44)
     """
-    of_points = OF_POINTS + (("features",) if isinstance(prediction, DenseFeatures) else ())
+    of_points = ("points", "indices", "instance", *(["features"] if isinstance(prediction, DenseFeatures) else []))
     n = {True: 0, False: 0}
     for name, array in prediction_arrays(prediction).items():  # texts there are padded to the longest
         n[name in of_points] += int(np.char.str_len(array).sum() if array.dtype.kind == "U" else array.nbytes)
@@ -161,9 +157,8 @@ def claims_of(
     source, encoder = RunSource(run, methods), cache(partial(run.encoder, device))
     found = [Claims(run.name, method) for method in source.methods]
     for n, scene in enumerate(source.scenes, start=1):
-        asked = cache(partial(_asked, source, scene, kinds))
         for one in found:
-            for add in (partial(_add_queries, asked=asked, encoder=encoder), _add_labels, _add_sizes):
+            for add in (partial(_add_queries, kinds=kinds, encoder=encoder), _add_labels, _add_sizes):
                 try:
                     add(one, source, scene)
                 except Su3dError as error:
@@ -178,36 +173,29 @@ def claims_of(
     return found
 
 
-def _asked(source: RunSource, scene: str, kinds: Sequence[str]) -> tuple[ProtocolRules, RetrievalTruth]:
-    rules = source.rules(scene, "retrieval")
-    truth = source.truth(scene, rules)
-    if rules is None or truth is None:
-        raise PredictionError("no queries: no ground truth that a retrieval protocol fits")
-    found: Any = question_truth(rules, source.run.dataset(scene), scene.partition("/")[2], truth)
-    asked = tuple(query for query in found.asked if query.kind in kinds)
-    if not asked:
-        raise PredictionError("no queries of these kinds")
-    return rules, RetrievalTruth(truth, asked)
-
-
 def _add_queries(
-    one: Claims, source: RunSource, scene: str, asked: Callable[[], Any], encoder: Callable[[], Encoder]
+    one: Claims, source: RunSource, scene: str, kinds: Sequence[str], encoder: Callable[[], Encoder]
 ) -> None:
-    prediction = source.prediction(scene, one.method)
+    prediction, rules = source.prediction(scene, one.method), source.rules(scene, "retrieval")
+    truth = source.truth(scene, rules)
     if prediction.features is None:
         raise PredictionError("no similarities: the map has no features to compare with text")
-    rules, truth = asked()
-    compare = partial(similarities, rules, [query.text for query in truth.asked], prediction, encoder())
+    if rules is None or truth is None:
+        raise PredictionError("no queries: no ground truth that a retrieval protocol fits")
+    asked: Any = question_truth(rules, source.run.dataset(scene), scene.partition("/")[2], truth)
+    if not (queries := [query for query in asked.asked if query.kind in kinds]):
+        raise PredictionError("no queries of these kinds")
+    compare = partial(labelling.similarities, rules, [query.text for query in queries], prediction, encoder())
     blocks = row_blocks(prediction.features, BLOCK_ROWS)
     with_feature = (rows.start + np.flatnonzero(block.any(axis=1)) for rows, block in blocks)
     for measure, values in zip(OF_SPREAD, spread(compare(rows) for rows in with_feature if len(rows)), strict=True):
         one.add(measure, values)
     if isinstance(prediction, DenseFeatures):
         raise PredictionError("no largest instance: the map has a feature per point and no instances")
-    similarity, n_points = compare(), masks_of(prediction).sizes
-    main = covered_objects(rules.transfer, truth.scene, prediction).main_object
-    is_right = np.stack([np.isin(main, query.answers) for query in truth.asked], axis=1)
-    by_chance = np.full(len(truth.asked), 1 / len(n_points))
+    similarity, n_points = compare(), nearest.masks_of(prediction).sizes
+    main = covered_objects(rules.transfer, truth, prediction).main_object
+    is_right = np.stack([np.isin(main, query.answers) for query in queries], axis=1)
+    by_chance = np.full(len(queries), 1 / len(n_points))
     ranked = relevance(similarity, is_right), *largest_first(similarity, n_points, is_right), by_chance
     for measure, values in zip(OF_RANKING, ranked, strict=True):
         one.add(measure, values)
@@ -220,28 +208,27 @@ def _add_labels(one: Claims, source: RunSource, scene: str) -> None:
     one.refined_by = refined.source
     for own, other, is_kept in zip(labels_n(instances), refined.names, refined.is_kept, strict=True):
         for mark, label in (("n", own), ("n'", other)) if own and other and is_kept else ():
-            one.add(f"length of {mark}", len(label.split()))
-            one.add(f"characters of {mark}", len(label.strip()))
+            one.add(f"length of {mark}", len(words(label)))
 
 
 def _add_sizes(one: Claims, source: RunSource, scene: str) -> None:
     prediction = source.prediction(scene, one.method)
     of_instances, of_points = map_bytes(prediction)
     if not isinstance(prediction, DenseFeatures):
-        one.add("size per instance", of_instances, len(masks_of(prediction)))
+        one.add("size per instance", of_instances, len(nearest.masks_of(prediction)))
     one.add("size per point", of_points, len(prediction.points))
     one.add("size of map", (of_instances + of_points) / 1e6)
 
 
 def _pairs_of(run: FinishedRun, method: str) -> list[tuple[float, float]]:
     """For each scene the share of right answers under a protocol of kind reasoning, and of well-merged instances."""
-    values: dict[str, dict[str, float]] = {"answer": {}, "well-merged": {}}
+    values: dict[str, dict[str, float | None]] = {}
     for (name, _), record in run.results.items():
-        for scene, metrics in record.result.per_scene.items() if name == method and record.result is not None else ():
-            for metric in values.keys() & metrics.keys():
-                values[metric] |= {} if (value := metrics[metric]) is None else {scene: value}
-    answers, merges = values.values()
-    return [(answers[scene], merges[scene]) for scene in sorted(answers.keys() & merges.keys())]
+        if name == method and record.result is not None and record.kind in ("reasoning", "annotation"):
+            for scene, metrics in record.result.per_scene.items():
+                values[scene] = values.get(scene, {}) | {**metrics}
+    pairs = [(metrics.get("answer"), metrics.get("well-merged")) for metrics in values.values()]
+    return [(answer, merge) for answer, merge in pairs if answer is not None and merge is not None]
 
 
 def claims_table(found: Sequence[Claims]) -> Table:
@@ -254,7 +241,7 @@ def claims_table(found: Sequence[Claims]) -> Table:
     notes = ["means over all queries, instances, points or scenes; section: of the paper that makes the claim"]
     for label, one in zip(labels, found, strict=True):
         n_asked, n_named, n_scenes = (one.counts[name] for name in (OF_SPREAD[0], "length of n", RELATED))
-        notes.append(f"{label}: {n_asked} queries, {n_named} labels, correlation of {n_scenes} scenes")
-        notes += [f"{label}: {REFINED_BY}{one.refined_by}"] if one.refined_by else []
+        by = f" (n': {one.refined_by})" if one.refined_by else ""
+        notes.append(f"{label}: {n_asked} queries, {n_named} labels{by}, correlation of {n_scenes} scenes")
         notes += [f"{label}: {reason} ({some(scenes, 3)})" for reason, scenes in one.reasons.items()]
     return text_table("claims", rows, caption="Measures of what the OpenSU3D paper claims in words.", notes=notes)

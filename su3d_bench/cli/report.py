@@ -218,8 +218,7 @@ def call_claims(arguments: argparse.Namespace) -> None:
     with output.progress(sum(len(run.scenes) for run in runs), is_quiet=arguments.quiet) as report:
         chosen = arguments.methods, arguments.kinds, arguments.device or "cpu"
         found = [claims for run in runs for claims in claims_of(run, *chosen, report)]
-    value = [{**vars(claims), "means": claims.means} for claims in found]
-    output.answer_or_write(arguments, value, [claims_table(found)])
+    output.answer_or_write(arguments, [{**vars(one), "means": one.means} for one in found], [claims_table(found)])
 
 
 def _add_leaderboard(verbs: Verbs) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,20 +28,27 @@ from su3d_bench.questions.model import KINDS
 
 TRUTH = room()
 CHAIRS = TextTarget("instance", "chair", (2, 3))  # of eight objects
-RULES = load_protocol("rooms-retrieval")
+OTHER = TextTarget("relative", "lamp on table", (5,))  # of a kind that is not asked for
 
 
 def measured(prediction: Prediction, refined: RefinedNames | None = None) -> Claims:
     """The measures of one map with the query "chair"."""
-    source: Any = SimpleNamespace(prediction=lambda *_: prediction, refined=lambda *_: refined)
+    source: Any = SimpleNamespace(
+        prediction=lambda *_: prediction,
+        refined=lambda *_: refined,
+        rules=lambda *_: load_protocol("rooms-retrieval"),
+        truth=lambda *_: TRUTH,
+        run=SimpleNamespace(dataset=lambda scene: None),
+    )
     one = Claims("run", "method")
-    asked = RULES, RetrievalTruth(TRUTH, (CHAIRS,))
-    for add in (claims._add_labels, claims._add_sizes, claims._add_queries):
-        more = {"asked": lambda: asked, "encoder": lambda: ENCODER} if add is claims._add_queries else {}
-        try:
-            add(one, source, "a/b", **more)
-        except PredictionError as error:
-            one.reasons[str(error)] = ["a/b"]
+    queries = partial(claims._add_queries, kinds=["instance"], encoder=lambda: ENCODER)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(claims, "question_truth", lambda *_: RetrievalTruth(TRUTH, (CHAIRS, OTHER)))
+        for add in (claims._add_labels, claims._add_sizes, queries):
+            try:
+                add(one, source, "a/b")
+            except PredictionError as error:
+                one.reasons[str(error)] = ["a/b"]
     return one
 
 
@@ -98,11 +106,10 @@ def test_partition_has_instances_and_empty_maps_have_reasons() -> None:
 
 
 def test_lengths_compare_instances_that_have_both_labels() -> None:
-    names = ["a red office chair", "lamp", "", "wall"]
+    names = ["a red office chair", "table-lamp", "", "wall"]  # articles do not count
     a_map = Instances.of(TRUTH.points, [[k] for k in range(4)], names=names)
-    found = measured(a_map, RefinedNames(("office chair", "desk lamp", "box", "wall"), "the vote", ("", "", "", "big")))
-    assert (found.means["length of n"], found.means["length of n'"]) == (2.5, 2.0)
-    assert (found.means["characters of n"], found.means["characters of n'"]) == (11.0, 10.5)
+    found = measured(a_map, RefinedNames(("office chair", "lamp", "box", "wall"), "the vote", ("", "", "", "big")))
+    assert (found.means["length of n"], found.means["length of n'"]) == (2.5, 1.5)
     assert measured(a_map).means["length of n"] is None
 
 
@@ -132,16 +139,17 @@ def test_size_counts_captions_as_long_as_they_are() -> None:
 
 
 def test_pairs_of_scenes_join_protocols_of_both_datasets() -> None:
-    def result(**scenes: dict[str, float | None]) -> Any:
-        return SimpleNamespace(result=SimpleNamespace(per_scene=scenes))
+    def result(kind: str, **scenes: dict[str, float | None]) -> Any:
+        return SimpleNamespace(kind=kind, result=SimpleNamespace(per_scene=scenes))
 
     results = {
-        ("m", "x-reasoning"): result(a={"answer": 0.5}, b={"answer": None}, c={"answer": 1.0}),
-        ("m", "y-reasoning"): result(d={"answer": 0.0}),
-        ("m", "x-annotation"): result(a={"well-merged": 0.8, "label n": 0.1}, b={"well-merged": 0.9}),
-        ("m", "y-annotation"): result(d={"well-merged": 0.6}),
-        ("other", "x-annotation"): result(c={"well-merged": 0.6}),
-        ("m", "unscored"): SimpleNamespace(result=None),
+        ("m", "x-reasoning"): result("reasoning", a={"answer": 0.5}, b={"answer": None}, c={"answer": 1.0}),
+        ("m", "y-reasoning"): result("reasoning", d={"answer": 0.0}),
+        ("m", "x-annotation"): result("annotation", a={"well-merged": 0.8, "label n": 0.1}, b={"well-merged": 0.9}),
+        ("m", "y-annotation"): result("annotation", d={"well-merged": 0.6}),
+        ("other", "x-annotation"): result("annotation", c={"well-merged": 0.6}),
+        ("m", "unscored"): SimpleNamespace(kind="reasoning", result=None),
+        ("m", "chains"): result("object-chains", b={"answer": 0.3}),
     }
     run: Any = SimpleNamespace(results=results)
     assert claims._pairs_of(run, "m") == [(0.5, 0.8), (0.0, 0.6)]
