@@ -19,7 +19,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, text_table
 from su3d_bench.human_eval.sources import RunSource
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.matching import labelling, nearest
+from su3d_bench.metrics.matching import labelling, transfer
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.numerics.statistics import ratio
 from su3d_bench.questions.ground_truths import question_truth
@@ -192,7 +192,7 @@ def _add_queries(
         one.add(measure, values)
     if isinstance(prediction, DenseFeatures):
         raise PredictionError("no largest instance: the map has a feature per point and no instances")
-    similarity, n_points = compare(), nearest.masks_of(prediction).sizes
+    similarity, n_points = compare(), transfer.masks_of(prediction).sizes
     main = covered_objects(rules.transfer, truth, prediction).main_object
     is_right = np.stack([np.isin(main, query.answers) for query in queries], axis=1)
     by_chance = np.full(len(queries), 1 / len(n_points))
@@ -215,7 +215,7 @@ def _add_sizes(one: Claims, source: RunSource, scene: str) -> None:
     prediction = source.prediction(scene, one.method)
     of_instances, of_points = map_bytes(prediction)
     if not isinstance(prediction, DenseFeatures):
-        one.add("size per instance", of_instances, len(nearest.masks_of(prediction)))
+        one.add("size per instance", of_instances, len(transfer.masks_of(prediction)))
     one.add("size per point", of_points, len(prediction.points))
     one.add("size of map", (of_instances + of_points) / 1e6)
 
