@@ -134,7 +134,7 @@ class Claims:
     totals: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
     reasons: dict[str, list[str]] = field(default_factory=dict)
-    refined_by: str = ""
+    refined_by: str = "none"
 
     def add(self, measure: str, values: Any, n: int | None = None) -> None:
         """Add ``values`` that are not NaN, ``n`` if their number is another."""
@@ -195,8 +195,8 @@ def _add_queries(
     similarity, n_points = compare(), transfer.masks_of(prediction).sizes
     main = covered_objects(rules.transfer, truth, prediction).main_object
     is_right = np.stack([np.isin(main, query.answers) for query in queries], axis=1)
-    by_chance = np.full(len(queries), 1 / len(n_points))
-    ranked = relevance(similarity, is_right), *largest_first(similarity, n_points, is_right), by_chance
+    wins = largest_first(similarity, n_points, is_right)
+    ranked = relevance(similarity, is_right), *wins, np.full(len(queries), 1 / len(n_points))
     for measure, values in zip(OF_RANKING, ranked, strict=True):
         one.add(measure, values)
 
@@ -241,7 +241,7 @@ def claims_table(found: Sequence[Claims]) -> Table:
     notes = ["means over all queries, instances, points or scenes; section: of the paper that makes the claim"]
     for label, one in zip(labels, found, strict=True):
         n_asked, n_named, n_scenes = (one.counts[name] for name in (OF_SPREAD[0], "length of n", RELATED))
-        by = f" (n': {one.refined_by})" if one.refined_by else ""
-        notes.append(f"{label}: {n_asked} queries, {n_named} labels{by}, correlation of {n_scenes} scenes")
+        n = f"{n_asked} queries, {n_named} labels, correlation of {n_scenes} scenes"
+        notes.append(f"{label}: {n}; n': {one.refined_by}")
         notes += [f"{label}: {reason} ({some(scenes, 3)})" for reason, scenes in one.reasons.items()]
     return text_table("claims", rows, caption="Measures of what the OpenSU3D paper claims in words.", notes=notes)
