@@ -240,8 +240,7 @@ def claims_table(found: Sequence[Claims]) -> Table:
         rows.append([name, unit, section, *(NOT_MEASURED if v is None else f"{v:{form}}" for v in values)])
     notes = ["means over all queries, instances, points or scenes; section: of the paper that makes the claim"]
     for label, one in zip(labels, found, strict=True):
-        n_asked, n_named, n_scenes = (one.counts[name] for name in (OF_SPREAD[0], "length of n", RELATED))
-        n = f"{n_asked} queries, {n_named} labels, correlation of {n_scenes} scenes"
-        notes.append(f"{label}: {n}; n': {one.refined_by}")
+        n = [one.counts[name] for name in (OF_SPREAD[0], "length of n", RELATED)]
+        notes.append(f"{label}: {n[0]} queries, {n[1]} labels (n': {one.refined_by}), correlation of {n[2]} scenes")
         notes += [f"{label}: {reason} ({some(scenes, 3)})" for reason, scenes in one.reasons.items()]
     return text_table("claims", rows, caption="Measures of what the OpenSU3D paper claims in words.", notes=notes)

@@ -191,7 +191,7 @@ def test_every_option_of_the_statements_is_accepted_and_not_the_default(option: 
         words = shlex.split(option.removeprefix("su3d-bench "))
         words += ["--out", "sheets"] if words[0] == "sheets" else []
         given = parser.parse_args(words)
-        for experiment in getattr(given, "table", None) or []:
+        for experiment in getattr(given, "tables", None) or []:
             assert experiment in [one.name for one in load_recipe(given.recipe).experiments]
         assert set(getattr(given, "protocols", None) or []) <= set(protocol_names())
 
