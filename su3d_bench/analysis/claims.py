@@ -35,7 +35,7 @@ RELATED = "reasoning and merging"
 MEASURES = {
     **dict.fromkeys(OF_SPREAD, ("cosine", "III-C1, C3", ".3f")),
     OF_RANKING[0]: ("cosine", "III-C3", ".3f"),
-    **dict.fromkeys(OF_RANKING[1:], ("fraction of queries", "III-C4", ".3f")),
+    **dict.fromkeys(OF_RANKING[1:], ("fraction", "III-C4", ".3f")),
     **dict.fromkeys(("length of n", "length of n'"), ("words", "III-C5", ".2f")),
     RELATED: ("correlation", "III-C6", ".2f"),
     **dict.fromkeys(("size per instance", "size per point"), ("bytes", "I", ".0f")),
