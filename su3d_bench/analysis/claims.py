@@ -165,9 +165,8 @@ def claims_of(
                     one.reasons.setdefault(str(error), []).append(scene)
         report(Event(f"{run.name} {scene}", SCENE_DONE, n, len(source.scenes)))
     for one in found:
-        pairs = _pairs_of(run, one.method)
         try:
-            one.add(RELATED, correlation(pairs) * len(pairs), len(pairs))
+            one.add(RELATED, correlation(pairs := _pairs_of(run, one.method)) * len(pairs), len(pairs))
         except PredictionError as error:
             one.reasons[str(error)] = list(source.scenes)
     return found
