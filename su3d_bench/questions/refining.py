@@ -2,8 +2,8 @@
 
 The file of labels n' is stored next to a map, which itself stays unchanged. The paper's filter of large background
 objects is applied again under labels n': "Large background objects (walls, ground, roof, ceiling) and objects with
-bounding boxes > 95 % of image area are excluded" (section IV, Filtering and Post-Processing); labels n' "help to filter
-out undesired large instances" (the text beside Table V).
+bounding boxes > 95 % of image area are excluded" (section III-A, Filtering and Post-Processing); labels n' "help to
+filter out undesired large instances" (the text beside Table V).
 """
 
 from __future__ import annotations

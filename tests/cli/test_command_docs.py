@@ -18,6 +18,13 @@ from places import ROOT
 
 from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
 from su3d_bench.cli.main import build_parser
+from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.metrics.instance.average_precision import ap_columns
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.perception.profiles import PerceptionConfig
+from su3d_bench.reproducing.recipe import load_recipe
 
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
 VARIABLE = re.compile(r"SU3D_[A-Z]+(?:_[A-Z]+)*")
@@ -160,3 +167,44 @@ def test_parser_accepts_every_command_of_the_action(action: Any) -> None:
     assert len(commands) == 4
     for command in commands:
         build_parser().parse_args(shlex.split(command))
+
+
+# the page of the paper's statements
+
+STATEMENTS = (ROOT / "docs" / "methods" / "paper-statements.md").read_text(encoding="utf-8")
+OPTIONS = re.findall(r"`([^`]+)`", "\n".join(re.findall(r"^\| I.*\|([^|]+)\|$", STATEMENTS, re.MULTILINE)))
+IN_TEXT = re.findall(r"`((?:su3d-bench )?(?:sheets|report|runs) [^`]+)`", STATEMENTS)
+
+
+@pytest.mark.parametrize("option", sorted({*OPTIONS, *IN_TEXT}))
+def test_every_option_of_the_statements_is_accepted_and_not_the_default(option: str, parser: ArgumentParser) -> None:
+    name, _, preset = option.partition("@")
+    if preset:
+        option = ".".join((name, "=".join(*OpenSU3D.presets[preset].items())))
+    if "=" in option:
+        settings = read_assignments([option], ["opensu3d"], ())
+        if option.startswith("perception."):
+            assert resolve(settings, ("perception",), PerceptionConfig) != PerceptionConfig()
+        else:
+            assert resolve(settings, ("method", "opensu3d"), OpenSU3DConfig) != OpenSU3DConfig()
+    else:
+        words = shlex.split(option.removeprefix("su3d-bench "))
+        words += ["--out", "sheets"] if words[0] == "sheets" else []
+        given = parser.parse_args(words)
+        for experiment in getattr(given, "tables", None) or []:
+            assert experiment in [one.name for one in load_recipe(given.recipe).experiments]
+        assert set(getattr(given, "protocols", None) or []) <= set(protocol_names())
+
+
+def test_statements_name_some_options_of_each_form() -> None:
+    assert len(OPTIONS) >= 20
+    assert {"run", "report", "reproduce", "runs", "sheets"} <= {option.split(" ")[0] for option in OPTIONS}
+
+
+def test_protocol_with_the_printed_values_is_scored_over_ten_thresholds(tmp_path: Path) -> None:
+    (block,) = re.findall(r"```toml\n(.*?)```", STATEMENTS, re.DOTALL)
+    (tmp_path / "printed.toml").write_text(block)
+    printed, original = load_protocol(str(tmp_path / "printed.toml")), load_protocol("replica-openmask3d")
+    assert printed.texts_of("chair") == ("an chair in a scene",) != original.texts_of("chair")
+    assert len(ap_columns(printed.thresholds)) == 10 == len(ap_columns(original.thresholds)) + 1
+    assert (printed.transfer.evaluation_voxel_m, original.transfer.evaluation_voxel_m) == (0.0025, 0.025)
