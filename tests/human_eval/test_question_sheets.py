@@ -139,8 +139,10 @@ def scored() -> tuple[Sheet, Key, Scores]:
 
 def test_question_score_is_the_worst_of_its_parts() -> None:
     sheet, _ = question_set(KINDS_ASKED)
-    whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB))]
+    whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB), 3)]
     assert whole == [RIGHT, ARGUABLE, WRONG, WRONG]
+    unfinished = judgements(sheet, ann=BOB)[:-1]
+    assert len(list(whole_verdicts(unfinished, 3))) == 3
 
 
 def test_shares_of_right_are_counted_per_kind_of_question() -> None:
