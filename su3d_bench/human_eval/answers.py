@@ -339,7 +339,7 @@ def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array
 
 
 def ordinal_alpha(counts: Int64Array) -> float | None:
-    """Krippendorff's alpha for ordinal data [Krippendorff 2011, section D] of items (rows) by answers in order (columns).
+    """Krippendorff's alpha for ordinal data [Krippendorff 2011, section D] of items (rows) by ordered answers.
 
     The distance of two answers is the squared difference of their mean ranks among all answers. Items and None as in
     ``krippendorff_alpha``.
