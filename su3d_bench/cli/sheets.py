@@ -95,7 +95,7 @@ def call_score(arguments: argparse.Namespace) -> None:
         looks = [one for one in scores.review_items if one.reason != "comment"]
         disputed = [one for one in looks if not (arguments.majority and is_right_by_majority(one))]
         path = output.written(arguments.disputed, disputed_csv(key, disputed))
-        settled = f"; {len(looks) - len(disputed)} ratings settled by majority" if arguments.majority else ""
+        settled = f"; {counted(len(looks) - len(disputed), 'rating')} settled by majority" if arguments.majority else ""
         remark(f"written: {path}{settled}", quiet=arguments.quiet)
     output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
