@@ -107,7 +107,7 @@ def test_workbooks_are_left_out_with_a_remark_without_openpyxl(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "openpyxl", None)
-    words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
+    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--out", "out"]) == 0
     assert capsys.readouterr().err.startswith("without workbooks")
     assert sorted(path.name for path in Path("out/annotator-1").iterdir()) == ["sheet.csv", "sheet.html"]
@@ -185,7 +185,7 @@ def test_shares_of_right_are_counted_per_kind_of_question() -> None:
 def test_majority_settles_questions_that_most_find_right(
     answers: tuple[str, ...], is_settled: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1", "--quiet"]
+    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1", "--quiet"]
     assert main([*words, "--annotators", str(len(answers)), "--overlap", "1", "--out", "out"]) == 0
     sheet = read_sheet(Path("out/sheet.json"))
     rows = [",".join(ANSWER_COLUMNS)]
