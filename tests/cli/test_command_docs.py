@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import runpy
 import shlex
@@ -164,7 +165,7 @@ def test_every_input_is_used_and_new_ones_are_documented(action: Any) -> None:
 def test_parser_accepts_every_command_of_the_action(action: Any) -> None:
     text = "\n".join(step.get("run", "") for step in action["runs"]["steps"]).replace("\\\n", " ")
     commands = re.findall(r"su3d-bench (.*?)(?: \|\| .*)?$", text, re.MULTILINE)
-    assert len(commands) == 4
+    assert len(commands) == 5
     for command in commands:
         build_parser().parse_args(shlex.split(command))
 
@@ -208,3 +209,64 @@ def test_protocol_with_the_printed_values_is_scored_over_ten_thresholds(tmp_path
     assert printed.texts_of("chair") == ("an chair in a scene",) != original.texts_of("chair")
     assert len(ap_columns(printed.thresholds)) == 10 == len(ap_columns(original.thresholds)) + 1
     assert (printed.transfer.evaluation_voxel_m, original.transfer.evaluation_voxel_m) == (0.0025, 0.025)
+
+
+RECORDER = '#!/bin/sh\nprintf "%s\\n" "$(basename "$0") $*" >> "$LOG"\n'
+NEVER = 'a b/$(touch never) `touch never`; touch never " touch never'
+
+
+def commands_of_the_action(action: Any, folder: Path, inputs: dict[str, str]) -> tuple[list[str], list[int]]:
+    """The commands that the action's scripts start with these inputs, by programs that only record them; exit codes."""
+    (folder / "bin").mkdir()
+    for name in ("su3d-bench", "python"):
+        (folder / "bin" / name).write_text(RECORDER)
+        (folder / "bin" / name).chmod(0o755)
+    values = {name: str(one.get("default", "")) for name, one in action["inputs"].items()} | inputs
+    of_runner = {
+        "GITHUB_ACTION_PATH": str(ROOT),
+        "RUNNER_TEMP": str(folder),
+        "RUNNER_OS": "Linux",
+        "RUNNER_ARCH": "X64",
+    }
+    outputs = {name: str(folder / name) for name in ("LOG", "GITHUB_OUTPUT", "GITHUB_STEP_SUMMARY")}
+    path = {"PATH": f"{folder / 'bin'}:{os.environ['PATH']}"}
+    codes = []
+    for step in action["runs"]["steps"]:
+        if "run" in step:
+            given = {
+                name: re.sub(r"\$\{\{ inputs\.([\w-]+) \}\}", lambda found: values[found[1]], text)
+                for name, text in step.get("env", {}).items()
+            }
+            env = {**of_runner, **outputs, **path, **given}
+            command = ["bash", "-eo", "pipefail", "-c", step["run"]]
+            codes.append(subprocess.run(command, env=env, cwd=folder, check=False).returncode)
+    return (folder / "LOG").read_text().replace(str(folder), "TMP").replace(str(ROOT), "/action").splitlines(), codes
+
+
+@pytest.mark.parametrize(
+    ("inputs", "scored", "checked"),
+    [
+        ({"scenes": "rooms/*", "arguments": "--stride 9"}, "run --scenes rooms/* --methods opensu3d --stride 9", ""),
+        ({"predictions": "pred", "arguments": "--dataset replica"}, "evaluate pred --dataset replica", ""),
+        ({"run": NEVER}, None, NEVER),
+        ({"package": NEVER, "reference": NEVER}, "run --scenes rooms/living0 rooms/bedroom0 --methods opensu3d", ""),
+    ],
+)
+def test_action_checks_new_and_finished_runs_and_predictions(
+    action: Any, tmp_path: Path, inputs: dict[str, str], scored: str | None, checked: str
+) -> None:
+    commands, codes = commands_of_the_action(action, tmp_path, {"reference": "ref.json", **inputs})
+    run = checked or "TMP/su3d-run"
+    made = [f"su3d-bench {scored} --quiet --out TMP/su3d-run"] if scored else []
+    package = inputs.get("package", "/action")  # its own checkout, nothing from a registry
+    assert f"python -m pip install --quiet --constraint /action/constraints.txt {package}" in commands
+    of_program = [" ".join(line.split()) for line in commands if line.startswith("su3d-bench")]
+    assert [line for line in of_program if line.startswith(("su3d-bench run", "su3d-bench evaluate"))] == made
+    check = f"su3d-bench check {run} --against {inputs.get('reference', 'ref.json')} "
+    assert any(line.startswith(check) for line in of_program)
+    assert set(codes) == {0} and not (tmp_path / "never").exists()
+
+
+def test_action_with_both_run_and_predictions_fails(action: Any, tmp_path: Path) -> None:
+    commands, codes = commands_of_the_action(action, tmp_path, {"run": "a", "predictions": "b", "reference": "c"})
+    assert 2 in codes and not [line for line in commands if "su3d-bench evaluate" in line or "su3d-bench run" in line]
