@@ -10,9 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb, output_path
+from su3d_bench.cli.options import EXECUTOR, JOBS, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
+from su3d_bench.core.errors import (
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    ConfigError,
+    ModelMissing,
+    RunIncomplete,
+    counted,
+    printable,
+)
 
 if TYPE_CHECKING:
     from su3d_bench.reproducing.recipe import Experiment, Recipe, RecipeRequest, RecipeRun
@@ -21,6 +29,7 @@ RUN_OPTIONS = (
     "jobs",
     "limit",
     "question_solver",
+    "refiner",
     "offline",
     "executor",
     "ray_address",
@@ -47,7 +56,9 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.shared("--profile")
     parser.option("--encoder ENCODER", "encoder of all runs (default: set by the recipe)")
-    parser.shared("--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR, "--set")
+    parser.shared("--device")
+    parser.shared("--jobs", help=JOBS)
+    parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR, "--set")
     parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)", type=output_path)
     parser.shared("--format")
 
@@ -69,6 +80,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: needs --rehearse")
     _check_device(arguments)
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
+    _check_key(recipe, experiments, arguments, out)
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
     from su3d_bench.cli.rehearsal import places, rehearsed
@@ -77,6 +89,17 @@ def call(arguments: argparse.Namespace) -> int:
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
     with environment(**places(out)):
         return _reproduce(recipe, experiments, asked, out, arguments)
+
+
+def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: argparse.Namespace, out: Path) -> None:
+    """Raise early, before rooms are generated, if a language model is requested without a key or server."""
+    from su3d_bench.reproducing.preflight import language_needs
+    from su3d_bench.reproducing.recipe import asked_runs
+
+    needs = (need for run in asked_runs(recipe, experiments, _asked(arguments)) for need in language_needs(run, out))
+    missing = next((need for need in needs if not need.is_available), None)
+    if missing is not None and not arguments.dry_run:
+        raise ModelMissing(missing.remark)
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
@@ -118,7 +141,7 @@ def _reproduce(
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
-    known = preflight(runs)
+    known = preflight(runs, out)
     if arguments.dry_run:
         output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE

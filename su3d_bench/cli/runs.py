@@ -44,12 +44,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("run")
     parser.shared("--method")
     parser.option("--scenes SCENE...", "scenes to refine (default: all)", default=[])
-    parser.option(
-        "--refiner",
-        "vote (sum of scores) or model (language model, as in the paper)",
-        choices=("vote", "model"),
-        default="vote",
-    )
+    parser.shared("--refiner", default="vote")
     parser.option("--top-m N", "number of views used (default: 5)", type=count, default=5)
     parser.option(
         "--background-names [NAME...]",

@@ -11,6 +11,7 @@ from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 from su3d_bench.perception.cache import FrameCache, cached_regions, content_key, crop_images
 from su3d_bench.perception.detections import Assembler, captioned
 from su3d_bench.perception.language.captioner import Captioner
+from su3d_bench.perception.language.chat import PRESETS
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS
@@ -24,7 +25,8 @@ from su3d_bench.perception.models.masks.grounded_sam import (
 )
 
 # opensu3d.tex, section IV-A.
-PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h", "gpt-4-vision-preview"
+PAPER_ENCODER, PAPER_SEGMENTER = "clip-vit-h-14", "sam-vit-h"
+PAPER_VISION_MODEL = PRESETS["paper"]["vision_model"]
 
 
 def paper_deviations(

@@ -17,7 +17,7 @@ ROOM = ["--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 def missing_meshes(methods: tuple[str, ...]) -> list[Need]:
     asked = RecipeRequest("embedded", "embedded", scenes={"replica": ("replica/bedroom0",)}, values={})
     (run,) = asked_runs(load_recipe("openmask3d"), load_recipe("openmask3d").chosen(["replica"]), asked)
-    return [need for need in preflight([replace(run, methods=methods)]).needs if need.kind == "mesh"]
+    return [need for need in preflight([replace(run, methods=methods)], Path("none")).needs if need.kind == "mesh"]
 
 
 def test_size_of_missing_data_includes_files_of_all_scenes(
