@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -136,6 +137,7 @@ def _asked(arguments: argparse.Namespace) -> RecipeRequest:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
+    from su3d_bench.reproducing.estimate import estimate, estimate_json, estimate_tables
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
@@ -143,7 +145,9 @@ def _reproduce(
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs, out)
     if arguments.dry_run:
-        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
+        costs = estimate(runs, known)
+        value = known.to_json() | {"estimate": estimate_json(costs)}
+        output.answer_tables(arguments, value, [*preflight_tables(known), *estimate_tables(costs)])
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
     remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
@@ -181,13 +185,15 @@ def _answer(
     """Write tables to stdout and ``tables.md``, cells to ``compared.json``, pictures and the archive."""
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
+    from su3d_bench.reproducing.deviations import deviation_table, run_deviations
     from su3d_bench.reproducing.differences import Results, compared_all, compared_json, draw_queries, result_tables
     from su3d_bench.reproducing.recipe import recipe_file
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)
-    tables = result_tables(experiments, cells, results)
-    value = compared_json(recipe, cells)
+    found = run_deviations(results.runs.values())
+    tables = [*result_tables(experiments, cells, results), *([deviation_table(found)] if found else [])]
+    value = compared_json(recipe, cells) | {"deviations": [asdict(one) for one in found]}
     output.written(
         out / "tables.md", output.formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True)
     )

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
 from su3d_bench.core.errors import ModelMissing, Su3dError, counted
 from su3d_bench.core.system.devices import require_installed
 from su3d_bench.fetching.sources import built_in
@@ -22,7 +22,7 @@ from su3d_bench.perception.profiles import PerceptionConfig, models_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
 from su3d_bench.runs.executors import ELSEWHERE
 from su3d_bench.runs.frame_loop import surface_of
-from su3d_bench.runs.job import build_method
+from su3d_bench.runs.job import Part, build_method
 from su3d_bench.runs.plan import asks_language_model, method_part, named_method
 from su3d_bench.runs.scenes import data_root
 
@@ -106,12 +106,22 @@ def _data(run: RecipeRun) -> Iterator[Need]:
             yield Need("data", source.name, is_available=False, n_bytes=source.n_bytes, how=how)
 
 
+def _settings(run: RecipeRun) -> Settings:
+    bases = {named_method(text).base for text in run.methods}
+    device = Setting(("perception", "models", "device"), run.device, "--device")
+    return Settings((device,) if run.device else ()) + read_assignments(
+        run.settings, tuple({*run.methods, *bases}), (run.dataset,)
+    )
+
+
+def parts_of(run: RecipeRun) -> list[Part]:
+    """The methods of a run with their settings."""
+    return [method_part(named_method(text), _settings(run)) for text in run.methods]
+
+
 def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
     """The scan's mesh, if it is missing and a method requires it."""
-    named = [named_method(text) for text in run.methods]
-    settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
-    methods = {one.name: build_method(method_part(one, settings)) for one in named}
-    asking = [name for name, method in methods.items() if getattr(method, "needs_surface", False)]
+    asking = [part.name for part in parts_of(run) if getattr(build_method(part), "needs_surface", False)]
     if not asking:
         return
     try:
@@ -142,12 +152,8 @@ def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need
 
 def perception_of(run: RecipeRun) -> PerceptionConfig:
     """The perception settings of a run."""
-    methods = {named_method(method).base for method in run.methods}
-    settings = read_assignments(run.settings, tuple({*methods, *run.methods}), (run.dataset,))
-    config = resolve(settings, ("perception",), PerceptionConfig)
-    return config.model_copy(
-        update={"models": config.models.model_copy(update={"device": run.device or config.models.device})}
-    )
+    config: PerceptionConfig = resolve(_settings(run), ("perception",), PerceptionConfig)
+    return config
 
 
 def asks(run: RecipeRun) -> list[str]:
