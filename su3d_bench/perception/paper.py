@@ -88,7 +88,8 @@ class PaperPerception:
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         assert needs.masks != "none", "the runner asks nothing for a method that needs no masks"
         regions = cached_regions(self._segmenter(needs), frame, self._cache, False, timer)
-        describe = captioned if self._captioner is None else self._described
+        # A region without a name is not an object that the paper's model was asked for.
+        describe = captioned if self._captioner is None or needs.masks != "grounded" else self._described
         return self._assembler.assemble(frame, regions, needs, timer, describe=describe)
 
     def regions(self) -> RegionPerception:

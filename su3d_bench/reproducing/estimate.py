@@ -6,14 +6,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
-from su3d_bench.core.errors import Su3dError
+from su3d_bench.core.errors import Su3dError, counted
 from su3d_bench.core.system.devices import CPU
 from su3d_bench.formats.tables.table import Table, text_table
+from su3d_bench.perception.language.client import cost_usd
 from su3d_bench.perception.profiles import MAX_PROCESSES_PER_GPU, default_jobs, models_of, resolve_profile
-from su3d_bench.perception.unit_costs import PRICES, UNIT_COSTS, UnitCost, gpu_memory_gb, weights_gb
+from su3d_bench.perception.unit_costs import UNIT_COSTS, UnitCost, gpu_memory_gb, weights_gb
 from su3d_bench.reproducing.preflight import Preflight, asks, parts_of, perception_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, scene_names
 from su3d_bench.runs.job import build_method
@@ -28,9 +28,10 @@ STAGES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass
 class Estimate:
-    """``seconds`` of all runs, with ``jobs`` in parallel; the memory of all processes; ``tokens`` in and out by model.
+    """``seconds`` of all runs, with ``jobs`` in parallel; the memory of all processes.
 
-    ``used``: the unit costs behind them; ``unknown``: what is not counted.
+    ``models``: the price of each language model, ``usd`` None if one has none; ``used``: the unit costs behind these
+    numbers; ``unknown``: what is not counted.
     """
 
     seconds: float = 0.0
@@ -39,7 +40,10 @@ class Estimate:
     gpu_memory_gb: float = 0.0
     disk_gb: float = 0.0
     n_requests: int = 0
-    tokens: dict[str, tuple[float, float]] = field(default_factory=dict)
+    input_tokens: float = 0.0
+    output_tokens: float = 0.0
+    usd: float | None = 0.0
+    models: dict[str, str] = field(default_factory=dict)
     used: dict[str, UnitCost] = field(default_factory=dict)
     unknown: list[str] = field(default_factory=list)
 
@@ -49,15 +53,6 @@ class Estimate:
         if key:
             self.used[key] = UNIT_COSTS[key]
         return self.used[key].value if key else 0.0
-
-    @property
-    def usd(self) -> float | None:
-        """US dollars; None if a model has no known price."""
-        if not self.tokens.keys() <= PRICES.keys():
-            return None
-        prices = ((PRICES[model]["input_usd"], PRICES[model]["output_usd"]) for model in self.tokens)
-        pairs = zip(self.tokens.values(), prices, strict=True)
-        return sum(number * price for both in pairs for number, price in zip(*both, strict=True)) / 1e6
 
 
 def estimate(runs: Sequence[RecipeRun], known: Preflight) -> Estimate:
@@ -90,21 +85,23 @@ def _add(total: Estimate, run: RecipeRun) -> None:
         total.disk_gb += n * total.cost("cache")
         n_regions = n * total.cost("boxes" if masks == "grounded" else "regions")
         if profile == "paper":
-            n_captions += n_regions
+            n_captions += n_regions if masks == "grounded" else 0.0
             seconds += n * sum(total.cost(f"{stage} {device}") for stage in STAGES[masks])
             seconds += (n + n_regions * len(ratios)) * total.cost(f"crop {device}")
         else:
             seconds += n * total.cost("embedded image")
-    asked = {"captions": n_captions, "refiner": n_maps * UNIT_COSTS["instances"].value}
-    asked["question_solver"] = n_maps * UNIT_COSTS["questions"].value
+    n_requests = {"captions": n_captions, "refiner": n_maps * UNIT_COSTS["instances"].value}
+    n_requests["question_solver"] = n_maps * UNIT_COSTS["questions"].value
     for what in asks(run):
         total.cost({"refiner": "instances", "question_solver": "questions"}.get(what, "boxes"))
-        language = config.language
-        model = language.vision_model if what == "captions" else language.text_model
-        before = total.tokens.get(model, (0.0, 0.0))
-        more = (asked[what] * total.cost(f"{what} tokens {way}") for way in ("in", "out"))
-        total.tokens[model] = tuple(map(sum, zip(before, more, strict=True)))  # type: ignore[assignment]
-        total.n_requests += round(asked[what])
+        model = config.language.vision_model if what == "captions" else config.language.text_model
+        n_in, n_out = (n_requests[what] * total.cost(f"{what} tokens {way}") for way in ("in", "out"))
+        usd, price = cost_usd(config.language, model, round(n_in), round(n_out)), config.language.prices.get(model)
+        total.usd = None if usd is None or total.usd is None else total.usd + usd
+        total.models[model] = f"{price.input_usd:g} in, {price.output_usd:g} out, {price.date}" if price else "no price"
+        total.n_requests += round(n_requests[what])
+        total.input_tokens += n_in
+        total.output_tokens += n_out
     models, jobs = models_of(profile, config), MAX_PROCESSES_PER_GPU
     with suppress(Su3dError):  # the GPU is on another machine
         jobs = default_jobs(profile, config)
@@ -121,44 +118,28 @@ def _n_frames(total: Estimate, run: RecipeRun, scene: str) -> float:
     with suppress(Su3dError):
         return len(dataset_named(run.dataset).frames(scene, 1))
     if f"frames {run.dataset}" not in UNIT_COSTS:
-        total.unknown.append(f"{run.dataset}/{scene}: number of images")
+        total.unknown.append(f"images of {run.dataset}/{scene}, whose number is not known")
     return total.cost(f"frames {run.dataset}")
-
-
-def estimate_json(found: Estimate) -> dict[str, Any]:
-    """The estimate as stored, with its unit costs."""
-    return asdict(found) | {"usd": found.usd}
 
 
 def estimate_tables(found: Estimate) -> list[Table]:
     """The estimate, and the unit costs that it is computed from."""
-    n_in, n_out = (sum(each) for each in zip(*found.tokens.values(), strict=True)) if found.tokens else (0.0, 0.0)
-    prices = "; ".join(
-        f"{model}: {price['input_usd']:g} and {price['output_usd']:g} per million tokens, {price['date']}, {price['source']}"
-        if (price := PRICES.get(model))
-        else f"{model}: no price known"
-        for model in found.tokens
-    )
+    models = "; ".join(f"{model}: USD per million tokens: {price}" for model, price in found.models.items())
     rows = [
         ["what", "estimate", "of"],
-        ["time", f"{found.seconds / 3600:.1f} h", f"{found.jobs} scenes in parallel"],
+        ["time", f"{found.seconds / 3600:.1f} h", f"all runs, {counted(found.jobs, 'job')} in parallel"],
         ["memory", f"{found.memory_gb:.0f} GB", "all processes"],
         ["GPU memory", f"{found.gpu_memory_gb:.0f} GB", "all processes"],
         ["disk", f"{found.disk_gb:.0f} GB", "downloads, perception cache, results"],
-        ["requests", f"{found.n_requests:,}", ", ".join(found.tokens) or "no language model"],
-        ["tokens", f"{n_in:,.0f} in, {n_out:,.0f} out", "all requests"],
-        ["dollars", "unknown" if found.usd is None else f"{found.usd:.2f}", prices or "-"],
+        ["requests", f"{found.n_requests:,}", ", ".join(found.models) or "no language model"],
+        ["tokens", f"{found.input_tokens:,.0f} in, {found.output_tokens:,.0f} out", "all requests"],
+        ["US dollars", "unknown" if found.usd is None else f"{found.usd:.2f}", models or "-"],
     ]
     costs = [["unit cost", "value", "unit", "basis", "source"]]
     costs += [[one.name, f"{one.value:g}", one.unit, one.basis, one.source] for one in found.used.values()]
-    caption = ": computed from the unit costs below; only the order of magnitude is reliable."
+    caption = ": from the unit costs below; reliable to an order of magnitude."
+    notes = [f"not counted: {one}" for one in dict.fromkeys(found.unknown)]
     return [
-        text_table(
-            "estimate",
-            rows,
-            heading="Estimate",
-            caption=caption,
-            notes=[f"not counted: {one}" for one in found.unknown],
-        ),
+        text_table("estimate", rows, heading="Estimate", caption=caption, notes=notes),
         text_table("unit-costs", costs, heading="Unit costs", caption=" of the estimate."),
     ]

@@ -163,12 +163,14 @@ Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 class Price(BaseModel):
-    """US dollars per million tokens."""
+    """US dollars per million tokens; ``date`` and ``source`` of the price."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     input_usd: float = Field(ge=0, allow_inf_nan=False)
     output_usd: float = Field(ge=0, allow_inf_nan=False)
+    date: str = ""
+    source: str = ""
 
 
 # "current": OpenAI's replacement for its GPT-4 models, which reads images; without reasoning it takes a temperature.
@@ -215,9 +217,7 @@ class LanguageConfig(BaseModel):
     max_failures_in_a_row: int = Field(default=5, ge=1)
     budget_tokens: int = Field(default=0, ge=0)
     budget_usd: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    prices: dict[str, Price] = {
-        name: Price(input_usd=one["input_usd"], output_usd=one["output_usd"]) for name, one in PRICES.items()
-    }
+    prices: dict[str, Price] = {name: Price(**one) for name, one in PRICES.items()}
 
     @model_validator(mode="before")
     @classmethod
