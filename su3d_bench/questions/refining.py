@@ -305,8 +305,8 @@ def refine_by_model(job: JobFolder, model: LanguageModel, config: LanguageConfig
     if isinstance(instances, Instances) and instances.view_names is not None:
         tops = top_names(instances, MAX_NAMES)
         refined = ModelRefiner(model, config).refine(tops)
-        chosen = job, instances, tops, refined, "model", config.text_model, MAX_NAMES, FilterConfig()
-        write_records(job, records_of(*chosen))
+        by = config.text_model, MAX_NAMES, FilterConfig()
+        write_records(job, records_of(job, instances, tops, refined, "model", *by))
 
 
 def refined_digest(job: JobFolder) -> dict[str, str]:

@@ -229,14 +229,14 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
             tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
-            provider, index = _provider_for(models, device)
+            provider, index = provider_for(models, device)
             key = [] if provider == "cpu" else [provider]
             load = partial(open_session, files.weights, provider, index)
             return grounded_sam.OnnxRamTagger(load, tags, content_key(*key, *files.digests().values()))
     return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
-def _provider_for(models: ModelsConfig, device: str) -> tuple[Provider, int]:
+def provider_for(models: ModelsConfig, device: str) -> tuple[Provider, int]:
     """The configured provider and GPU of exported models, otherwise that of ``device`` if onnxruntime has it."""
     provider = models.provider or ("cpu" if device == CPU else "cuda")
     if models.provider is None and not has_provider(provider):

@@ -136,7 +136,10 @@ def test_each_crop_is_sent_with_the_paper_prompt() -> None:
     assert [(one.name, one.caption, one.source) for one in captions] == [("lamp", "A lit lamp.", "model")] * 2
     request = model.requests[0]
     assert request.text == "Give name and description to the object. Output e.g. `name':`description'"
-    assert (request.model, request.temperature) == ("gpt-4-vision-preview", 0.0)
+    assert (request.model, request.temperature, request.reasoning_effort) == ("gpt-6-luna", 0.0, "none")
+    papers = Captioner(model, LanguageConfig(preset="paper")).requests(crops)[0]
+    assert (papers.model, papers.reasoning_effort) == ("gpt-4-vision-preview", "")
+    assert "reasoning_effort" not in papers.body() and papers.key != request.key
     assert captions[0].key != captions[1].key
 
 
