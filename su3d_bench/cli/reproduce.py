@@ -97,10 +97,9 @@ def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: arg
     from su3d_bench.reproducing.preflight import language_needs
     from su3d_bench.reproducing.recipe import asked_runs
 
-    needs = (need for run in asked_runs(recipe, experiments, _asked(arguments)) for need in language_needs(run, out))
-    missing = next((need for need in needs if not need.is_available), None)
-    if missing is not None and not arguments.dry_run:
-        raise ModelMissing(missing.remark)
+    for run in asked_runs(recipe, experiments, _asked(arguments)):
+        for need in () if arguments.dry_run else language_needs(run, out):
+            raise ModelMissing(need.remark)
 
 
 def _check_device(arguments: argparse.Namespace) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from su3d_bench.core.system.files import file_text, parse_toml
@@ -13,7 +12,7 @@ from su3d_bench.perception.models.catalogue import MODELS
 
 _TABLE = parse_toml(file_text(Path(__file__).with_name("unit_costs.toml")))
 # US dollars per million tokens of named models, with date and source.
-PRICES: Mapping[str, Mapping[str, Any]] = MappingProxyType(_TABLE["prices"])
+PRICES: Mapping[str, Mapping[str, Any]] = _TABLE["prices"]
 
 
 @dataclass(frozen=True)
@@ -27,19 +26,13 @@ class UnitCost:
     source: str
 
 
-UNIT_COSTS: Mapping[str, UnitCost] = MappingProxyType(
-    {
-        key: UnitCost(**{**row, "source": _TABLE["sources"].get(row["source"], row["source"])})
-        for key, row in _TABLE["costs"].items()
-    }
-)
+UNIT_COSTS: Mapping[str, UnitCost] = {key: UnitCost(**row) for key, row in _TABLE["costs"].items()}
 
 
 def weights_gb(models: Sequence[str], bytes_per_weight: int) -> float:
     """The memory of the weights of ``models``, in GB; RAM++ always runs in float32."""
-    return (
-        sum(MODELS[name].memory_mb(4 if MODELS[name].kind == "tagger" else bytes_per_weight) for name in models) / 1e3
-    )
+    entries = [MODELS[name] for name in models]
+    return sum(one.memory_mb(4 if one.kind == "tagger" else bytes_per_weight) for one in entries) / 1e3
 
 
 def gpu_memory_gb(models: Sequence[str]) -> float:

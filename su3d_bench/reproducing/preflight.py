@@ -163,23 +163,15 @@ def asks(run: RecipeRun) -> list[str]:
 
 
 def language_needs(run: RecipeRun, out: Path) -> Iterator[Need]:
-    """The key of the language model, if requests are sent."""
+    """The missing key of the language model, if requests would be sent."""
     has_replies = run.values.get("offline") or (run.folder(out) / "language").is_dir()
     if not asks(run) or has_replies or run.values.get("executor") in ELSEWHERE:
         return
-    language = perception_of(run).language
+    key = perception_of(run).language.key_variable
     try:
-        check_key(language)
+        check_key(perception_of(run).language)
     except ModelMissing as error:
-        yield Need(
-            "key",
-            language.key_variable,
-            is_available=False,
-            how=f"export {language.key_variable}=...",
-            remark=str(error),
-        )
-    else:
-        yield Need("key", language.key_variable, is_available=True, remark="or an own server")
+        yield Need("key", key, is_available=False, how=f"export {key}=...", remark=str(error))
 
 
 def _models(run: RecipeRun) -> Iterator[Need]:

@@ -37,6 +37,7 @@ from su3d_bench.runs.plan import (
     Plan,
     asked_settings,
     asks_language_model,
+    flag_of,
     make_plan,
     named_method,
 )
@@ -301,8 +302,7 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
         runs += [run] if run.methods else []
     for name in asks_language_model(dict(asked.values)):
         if not any(name in run.values for run in runs):
-            what = "reasoning questions" if name == "question_solver" else "labels n' or reasoning questions"
-            raise ConfigError(f"--{name.replace('_', '-')} {ASKS[name]}: no requested table has {what}")
+            raise ConfigError(f"{flag_of(name)}: no requested table uses it; add --table reasoning")
     return tuple(runs)
 
 

@@ -238,10 +238,10 @@ def make_plan(
     datasets = {target: part_of("dataset", target, settings) for target in targets.values()}
     protocols = protocols_of_run(config.protocols, list(datasets))
     asked = asks_language_model(config.model_dump())
+    rules = [load_protocol(name) for names in protocols.values() for name in names]
     for name in asked:
-        if not any(USES_LANGUAGE[name](one) for names in protocols.values() for one in map(load_protocol, names)):
-            flag = f"--{name.replace('_', '-')} {getattr(config, name)}"
-            raise ConfigError(f"{flag}: needs a reasoning protocol{LABELS[name]}, such as --protocols rooms-reasoning")
+        if not any(map(USES_LANGUAGE[name], rules)):
+            raise ConfigError(f"{flag_of(name)}: needs a reasoning protocol, such as --protocols rooms-reasoning")
     if place is None:
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
         existing = existing_run(place.folder.path)
@@ -416,7 +416,11 @@ USES_LANGUAGE: Mapping[str, Callable[[ProtocolRules], bool]] = {
     "question_solver": lambda rules: rules.answers is not None,
     "refiner": lambda rules: rules.uses_names,
 }
-LABELS = {"question_solver": "", "refiner": " or one of labels"}
+
+
+def flag_of(name: str) -> str:
+    """The option that asks a language model."""
+    return f"--{name.replace('_', '-')} {ASKS[name]}"
 
 
 def asks_language_model(values: Mapping[str, Any]) -> list[str]:

@@ -46,7 +46,7 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def test_labels_by_the_language_model_reach_the_table_and_the_differences(rehearsed: Path) -> None:
     text = (rehearsed / "tables.md").read_text()
-    assert "refined label (n', by the model gpt-6-luna)" in text
+    assert "refined label (n' by the model gpt-6-luna)" in text
     record = json.loads((rehearsed / "compared.json").read_text())
     here = {one["name"]: one["here"] for one in record["deviations"]}
     assert here["label n'"] == "the model gpt-6-luna of the refiner, names of 5 views"
