@@ -41,9 +41,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("runs RUN...", "run folders")
     parser.option("--yes", "do not ask for confirmation")
     parser = add_verb(actions, "refine", call_refine)
-    parser.shared("run")
-    parser.shared("--method")
-    parser.option("--scenes SCENE...", "scenes to refine (default: all)", default=[])
+    parser.shared("run", "--method", "--scenes")
     parser.shared("--refiner", default="vote")
     parser.option("--top-m N", "number of views used (default: 5)", type=count, default=5)
     parser.option(

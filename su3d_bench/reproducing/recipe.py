@@ -302,7 +302,7 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
         runs += [run] if run.methods else []
     for name in asks_language_model(dict(asked.values)):
         if not any(name in run.values for run in runs):
-            raise ConfigError(f"{flag_of(name)}: no requested table uses it; add --table reasoning")
+            raise ConfigError(f"{flag_of(name)}: no requested table uses it; add --tables reasoning")
     return tuple(runs)
 
 
@@ -405,12 +405,12 @@ class GivenPredictions:
 def named_predictions(
     experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
 ) -> dict[str, GivenPredictions]:
-    """The predictions given by ``METHOD=DIR`` and ``METHOD=FILE``, by printed method.
+    """The predictions given by ``METHOD=PREDICTIONS`` and ``METHOD=FILE``, by printed method.
 
     Raises ``ConfigError`` if no experiment accepts predictions of a method, it is named twice, or a path is missing.
     """
     places = _named(
-        "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
+        "--predictions", "PREDICTIONS", dict.fromkeys(name for one in experiments for name in one.predictions), texts
     )
     features = _named("--text-features", "FILE", places, text_features)
     return {method: GivenPredictions(place, features.get(method)) for method, place in places.items()}

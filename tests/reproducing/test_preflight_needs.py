@@ -93,7 +93,7 @@ def test_missing_ram_plus_states_its_replacement(tmp_path: Path, monkeypatch: py
     runs = asked_runs(recipe, recipe.chosen(["II"]), RecipeRequest(values={}))
     (need,) = [need for need in preflight(runs, tmp_path).needs if need.name == "ram-plus"]
     assert not need.is_required and need.remark == "replaced by the 20 most likely words of a list, by the encoder"
-    assert need.how == "su3d-bench models fetch --for paper, then tools/export_onnx.py ram-plus"
+    assert need.how == "su3d-bench models fetch --profile paper, then tools/export_onnx.py ram-plus"
 
 
 def test_missing_scan_mesh_is_reported_for_methods_that_require_it(
