@@ -74,7 +74,7 @@ def test_estimate_follows_frames_jobs_and_requests(tmp_path: Path, monkeypatch: 
 def test_parallel_jobs_depend_on_number_and_memory_of_gpus(
     profile: str, memory_gb: list[int], expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(profiles.os, "cpu_count", lambda: 16)
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
     monkeypatch.setattr(profiles, "gpu_memory_bytes", lambda device: [10**9 * each for each in memory_gb])
     assert profiles.default_jobs(profile, profiles.PerceptionConfig()) == expected
 

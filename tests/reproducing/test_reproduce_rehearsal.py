@@ -18,7 +18,7 @@ ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=80", "width=160", "h
 WORDS = ["reproduce", "opensu3d", "--tables", *TABLES, "--rehearse", *ROOM, "--jobs", "1", "--quiet"]
 WORDS += ["--refiner", "model"]
 ROOMS = ["rooms/bedroom0", "--protocols", "rooms-reasoning"]
-COMMANDS = [WORDS[:7], ["run", *ROOMS], ["ablate", *ROOMS, "--vary", "top_m=1,2"]]
+COMMANDS = [WORDS[:6], ["run", *ROOMS], ["ablate", *ROOMS, "--vary", "top_m=1,2"]]
 
 
 def last_name(body: Body) -> Answered:
