@@ -142,7 +142,7 @@ def _found(facts: Facts) -> dict[str, Iterable[str]]:
         "encoder": _if(facts.encoder not in {None, *encoders}, printable(str(facts.encoder), 100)),
         "names and captions": captioned if has_captions else [f"names by {NAMED_BY[facts.profile]}{template}"],
         "prompts of language models": [line for line, is_used in prompts.items() if is_used],
-        "temperature": _if(any(prompts.values()) and temperature != 0, str(temperature))
+        "temperature": _if(any(prompts.values()) and temperature not in (0, None), str(temperature))
         + _if("temperature" in facts.dropped, "not accepted by the model"),
         "border": [
             f"{px} px in images {width} px wide ({name})" for name, (px, width) in borders.items() if px != BORDER_PX
