@@ -199,7 +199,7 @@ def clean_name(text: str) -> str | None:
     name = re.sub(r"^(?:an?|the|some)\s+", "", name).replace("**", "").replace("`", "")
     parts = re.findall(r"[^\W\d_]+", name)
     is_short = len(name) <= MAX_NAME_CHARACTERS and len(name.split()) <= MAX_NAME_WORDS
-    if not parts or not is_short or set(parts) & _NO_NAME or {name, parts[-1]} & _NO_OBJECT or _UNNAMED.search(name):
+    if not parts or not is_short or set(parts) & _NO_NAME or name.split()[-1] in _NO_OBJECT or _UNNAMED.search(name):
         return None
     return None if not name.isprintable() or re.search(r"[{}\[\]<>|\\=:;?!\"]", name) else name
 
