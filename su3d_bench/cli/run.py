@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb, run_place
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, run_place
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -35,7 +35,9 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
     parser.option("--protocols PROTOCOL...", "protocols to use (default: those of the dataset)")
-    parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
+    parser.shared("--profile", "--device")
+    parser.shared("--jobs", help=JOBS)
+    parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
