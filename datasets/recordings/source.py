@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, FramesMissing
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
@@ -320,6 +320,8 @@ def list_folder(folder: Path, name: str, where: str) -> list[str]:
     try:
         return sorted(entry.name for entry in os.scandir(folder / name) if not entry.name.startswith("."))
     except OSError as error:
+        if isinstance(error, FileNotFoundError):
+            raise FramesMissing(f"{where}: {name}/ is missing; {EXPORT_AGAIN}") from error
         raise DataError(f"{where}: {name}/ cannot be read: {error.strerror}; {EXPORT_AGAIN}") from error
 
 

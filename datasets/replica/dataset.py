@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
-from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
@@ -55,11 +54,11 @@ class Replica(FileDataset[NoOptions]):
         """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks that files exist."""
         n_frames = "no frames"
         if self._is_rendered(scene):
-            try:
-                n_poses = file_bytes(self.folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
-            except OSError:
-                return "traj.txt is missing"
-            n_frames = counted(n_poses, "frame")
+            render, folder = self.rendered.folder, self.folder(scene)
+            parts = (folder / "traj.txt", folder / "results", render / "cam_params.json")
+            if missing := [part.name for part in parts if not part.exists()]:
+                return f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
+            n_frames = counted(len(frames.trajectory_lines(parts[0], self.where(scene))), "frame")
         try:
             words = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:

@@ -100,6 +100,8 @@ def _exit_code(words: Sequence[str]) -> int:
             arguments = parser.parse_args([*words, arguments.without_command])
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
+        if data := getattr(arguments, "data", None):
+            os.environ["SU3D_DATA"] = data  # workers inherit it
         check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
@@ -120,7 +122,7 @@ def _exit_code(words: Sequence[str]) -> int:
 
             traceback.print_exc()
         if isinstance(error, Su3dError):
-            remark(f"su3d-bench: {error}")
+            remark(f"su3d-bench: {error}", *(f"  {note}" for note in getattr(error, "__notes__", ())))
             return error.exit_code
         if errors.user_code_line(error) or errors.is_unusable_path(error):  # of user-defined code, or a path
             remark(f"su3d-bench: {errors.error_line(error)}")

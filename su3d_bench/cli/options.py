@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,18 +107,27 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
 
 
 def add_verb(
-    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, resumes: bool = False
+    verbs: Verbs,
+    name: str,
+    call: Call,
+    about: str = "",
+    *,
+    uses_all_cores: bool = False,
+    resumes: bool = False,
+    reads_data: bool = False,
 ) -> Parser:
     """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
     Numerical libraries use one thread unless it ``uses_all_cores``. ``resumes``: the command continues after an
-    interruption; others start again.
+    interruption; others start again. ``reads_data``: it has ``--data``, which replaces ``SU3D_DATA``.
     """
     parser = _parser(verbs, name, about or call.__doc__)
     parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, resumes=resumes, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
+    if reads_data:
+        parser.option("--data DIR", "data root (default: $SU3D_DATA)", type=data_folder)
     return parser
 
 
@@ -161,6 +171,13 @@ def index(text: str) -> int:
     if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
+
+
+def data_folder(text: str) -> str:
+    """Option type: the absolute path of an existing data root, or the URL of a store."""
+    if "://" in text or os.path.isdir(text):
+        return text if "://" in text else os.path.abspath(text)
+    raise argparse.ArgumentTypeError(f"{text}: no such folder; name the one that contains the datasets")
 
 
 def output_path(text: str) -> Path:

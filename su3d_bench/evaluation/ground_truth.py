@@ -10,6 +10,7 @@ import fnmatch
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, shown, suggest
-from su3d_bench.core.interfaces import IsAligned, NamesCategories
+from su3d_bench.core.interfaces import HasSurface, IsAligned, NamesCategories
 from su3d_bench.core.registry import GROUND_TRUTH_FILES
-from su3d_bench.core.types import GroundTruth, Int64Array
+from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d.release import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
@@ -53,10 +54,12 @@ class VertexTruth:
 class SceneTruths(ABC):
     """The ground truth of every scene of an evaluation, and the prediction of each that has one.
 
-    ``where`` is its name in messages; ``has_points``: its points have coordinates.
+    ``where`` is its name in messages; ``has_points``: its points have coordinates; ``has_vertices``: those of masks
+    over vertices are known.
     """
 
     has_points = True
+    has_vertices = False
     where: str
     dataset_name: str | None
     scenes: tuple[str, ...]
@@ -93,12 +96,18 @@ class SceneTruths(ABC):
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth | VertexTruth:
         """The ground truth of a scene for a protocol; ``GroundTruthMissing`` if there is none in its form."""
 
+    def vertices(self, scene: str, n: int | None) -> Float32Array | None:
+        """The points (V, 3) that masks over ``n`` vertices refer to; None if their coordinates are not known."""
+        return None
+
 
 # ---- datasets
 
 
 class DatasetTruths(SceneTruths):
     """Ground truth with coordinates, read on demand; that of one scene is cached."""
+
+    has_vertices = True
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         self._target = request.dataset or _dataset_of(sources)
@@ -163,6 +172,15 @@ class DatasetTruths(SceneTruths):
         needs_axes = rules.box_axes == "aligned" and isinstance(dataset, IsAligned)
         alignment = dataset.axis_alignment(scene) if needs_axes else None
         return query_truth(truth, self._queries[scene], where, class_of, alignment)
+
+    def vertices(self, scene: str, n: int | None) -> Float32Array:
+        """Those of the ground truth, unless only the scan's mesh has ``n`` vertices."""
+        points = self._truth(scene, self._dataset.variants[0]).points
+        if len(points) != n and isinstance(self._dataset, HasSurface):
+            with suppress(DataError):  # no mesh
+                vertices = self._dataset.surface(scene).vertices
+                return vertices if len(vertices) == n else points
+        return points
 
     def _truth(self, scene: str, variant: str) -> GroundTruth:
         if (scene, variant) not in self._kept:

@@ -51,6 +51,7 @@ def default_name(out: Path | None) -> str:
 
 
 SCHEMA = 1
+SCENE = "<scene>"  # in reasons of several scenes
 # Names of the metrics in the file; the first ones of each kind are its headline.
 KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
@@ -260,7 +261,23 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
         lines.append(
             f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some_names(kept.missed)}"
         )
-    return lines + [f"{scene}: not scored: {reason}" for scene, reason in kept.unscored.items()]
+    is_one = len(kept.unscored) == 1
+    return lines + [f"{n}: not scored: {why if is_one else why.replace(n, SCENE)}" for n, why in kept.unscored.items()]
+
+
+def grouped_reasons(reasons: Mapping[str, str]) -> list[str]:
+    """One line for each distinct reason of ``reasons`` (by scene), with the scenes that it concerns.
+
+    >>> grouped_reasons({"a": "x/a: no a.ply", "b": "x/b: no b.ply"}), grouped_reasons({"a": "x/a: no a.ply"})
+    (['x/<scene>: no <scene>.ply (2 scenes: a, b)'], ['x/a: no a.ply'])
+    """
+    scenes_of: dict[str, list[str]] = {}
+    for scene, reason in reasons.items():
+        scenes_of.setdefault(reason.replace(scene, SCENE), []).append(scene)
+    return [
+        reasons[scenes[0]] if len(scenes) == 1 else f"{line} ({len(scenes)} scenes: {some_names(scenes)})"
+        for line, scenes in scenes_of.items()
+    ]
 
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
