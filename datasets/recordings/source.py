@@ -325,6 +325,16 @@ def list_folder(folder: Path, name: str, where: str) -> list[str]:
         raise DataError(f"{where}: {name}/ cannot be read: {error.strerror}; {EXPORT_AGAIN}") from error
 
 
+def missing_parts(folder: Path, *names: str) -> str:
+    """A clause on the files and folders that ``folder`` lacks; '' if none. A name may have an alternative: ``a or b``.
+
+    >>> missing_parts(Path("nowhere"), "rgb or rgb.mkv", "depth")
+    'rgb or rgb.mkv, depth are missing'
+    """
+    absent = [name for name in names if not any((folder / one).exists() for one in name.split(" or "))]
+    return f"{', '.join(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else ""
+
+
 def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:
     """The names that match ``pattern``, by frame number (its first group); any other name is an error."""
     name_of: dict[int, str] = {}

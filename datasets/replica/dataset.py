@@ -12,7 +12,10 @@ from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh,
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
+from su3d_bench.datasets.recordings.source import missing_parts
 from su3d_bench.datasets.replica import checks, folders, frames, scene_graphs, truth
+
+CAMERA = "cam_params.json"
 
 
 class Replica(FileDataset[NoOptions]):
@@ -54,11 +57,10 @@ class Replica(FileDataset[NoOptions]):
         """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks that files exist."""
         n_frames = "no frames"
         if self._is_rendered(scene):
-            render, folder = self.rendered.folder, self.folder(scene)
-            parts = (folder / "traj.txt", folder / "results", render / "cam_params.json")
-            if missing := [part.name for part in parts if not part.exists()]:
-                return f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing"
-            n_frames = counted(len(frames.trajectory_lines(parts[0], self.where(scene))), "frame")
+            folder = self.folder(scene)
+            if missing := missing_parts(folder, "traj.txt", "results") or missing_parts(folder.parent, CAMERA):
+                return missing
+            n_frames = counted(len(frames.trajectory_lines(folder / "traj.txt", self.where(scene))), "frame")
         try:
             words = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:
@@ -92,7 +94,7 @@ class Replica(FileDataset[NoOptions]):
                 f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
                 f"{folders.FETCH_FRAMES}; to view the available files: su3d-bench datasets show {where}"
             )
-        camera = frames.read_camera(self.rendered.folder / "cam_params.json", where)
+        camera = frames.read_camera(self.rendered.folder / CAMERA, where)
         poses = frames.read_trajectory(folder / "traj.txt", where)
         frames.check_frames_complete(folder, len(poses), where)
         return frames.ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
@@ -103,12 +105,12 @@ class Replica(FileDataset[NoOptions]):
             return ()
         n_poses = len(frames.read_trajectory(folder / "traj.txt", self.where(scene)))
         images = [folder / name(index) for index in range(n_poses) for name in (frames.colour_name, frames.depth_name)]
-        return (self.rendered.folder / "cam_params.json", folder / "traj.txt", *images)
+        return (self.rendered.folder / CAMERA, folder / "traj.txt", *images)
 
     def recording_key(self, scene: str) -> str:
         """A key of the content of every file; see ``image_key`` for what it does not detect in an image."""
         folder = self.folder(scene)
-        files = (self.rendered.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
+        files = (self.rendered.folder / CAMERA, folder / "traj.txt") if self._is_rendered(scene) else ()
         return checks.digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:

@@ -12,7 +12,7 @@ import hashlib
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -259,6 +259,8 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
         return f"no recording ({scene}.sens is missing)"
     layout = python_layout(place)
     path = place / layout.pose if form == "python" and layout is not None else place
+    if path != place and layout and (missing := sensors.missing_parts(place, *astuple(layout))):
+        return missing
     with reading(where):
         if form == "sens":
             with opened(path) as stream:

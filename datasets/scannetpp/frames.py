@@ -19,7 +19,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError, FramesMissing, counted
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, colour_at, depth_m_of_values, nearest_at
-from su3d_bench.datasets.recordings.source import list_folder, read_size
+from su3d_bench.datasets.recordings.source import list_folder, missing_parts, read_size
 from su3d_bench.datasets.scannetpp import images, poses
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes, sized
 
@@ -44,6 +44,8 @@ def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
 
 def describe_recording(folder: Path, kind: PoseSource) -> str:
     """One-line summary of the frames from a quick look at the iPhone's ``folder``."""
+    if folder.is_dir() and (missing := missing_parts(folder, "rgb or rgb.mkv", "depth or depth.bin")):
+        return missing
     source = pose_source(folder, kind)
     path = folder / poses.COLMAP / poses.IMAGES_NAME if source == "colmap" else folder / poses.TRACKING_NAME
     if not path.is_file():
