@@ -13,7 +13,7 @@ from su3d_bench.analysis.attribution import Inputs, method_of, truth_of_scene
 from su3d_bench.analysis.sides import parse_side
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, some
 from su3d_bench.metrics.compatibility import kind_incompatibility
-from su3d_bench.metrics.matching.nearest import remembering
+from su3d_bench.metrics.matching.memory import remembering
 from su3d_bench.metrics.protocols.mixtures import Mixtures, RuleDifference, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combined_metrics, pack_scores, plain_json, score_scene, unpack_scores
