@@ -83,11 +83,10 @@ def look_at(
         if not isinstance(error, FramesMissing) and not isinstance(error.__cause__, FileNotFoundError):
             raise
         no_frames = str(error)
-        try:
-            if truth is None:
-                mesh = _vertices(dataset, scene, reason)
-        except DataError as fault:
-            raise DataError(f"{no_frames}; {str(fault).removeprefix(f'{dataset.name}/{scene}: ')}") from error
+        if truth is None and not isinstance(dataset, HasSurface):
+            raise DataError(f"{no_frames}; {reason}") from error
+        if truth is None:
+            mesh = dataset.surface(scene).vertices
     positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
     is_shown = set(evenly(len(positions), SHOWN_FRAMES))
     poses, shown, ranges = list[Float64Array](), list[Frame](), list[float]()
@@ -163,13 +162,6 @@ def _truth(dataset: Dataset, scene: str) -> tuple[GroundTruth | None, str]:
         if len(truth.points):
             return truth, ""
     return None, reason or f"{dataset.name} has no ground truth"
-
-
-def _vertices(dataset: Dataset, scene: str, no_truth: str) -> Float32Array:
-    """Return the vertices (V, 3) of the scan's mesh; raise ``DataError`` if there is none."""
-    if not isinstance(dataset, HasSurface):
-        raise DataError(no_truth)
-    return dataset.surface(scene).vertices
 
 
 WIDTH = 1920

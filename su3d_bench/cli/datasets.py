@@ -24,13 +24,13 @@ def add_parser(verbs: Verbs) -> None:
     su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data
     """
     actions = add_group(verbs, "datasets", add_parser, lists=True)
-    parser = add_verb(actions, "list", call_list, reads_data=True)
+    parser = add_verb(actions, "list", call_list, data=True)
     parser.option("names [DATASET...]", "datasets to list (default: all)")
-    parser = add_verb(actions, "check", call_check, reads_data=True)
+    parser = add_verb(actions, "check", call_check, data=True)
     parser.option("scenes SCENE...", "scenes or patterns, such as 'replica/*'")
     parser.option("--quick", "read only 20 evenly spaced frames of each scene")
     parser.shared("--jobs", "--set")
-    parser = add_verb(actions, "show", call_show, reads_data=True)
+    parser = add_verb(actions, "show", call_show, data=True)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
     parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)

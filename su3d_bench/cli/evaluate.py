@@ -25,7 +25,7 @@ REQUEST_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "evaluate", call, reads_data=True)
+    parser = add_verb(verbs, "evaluate", call, data=True)
     parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option(
         "--name METHOD=PREDICTIONS...",

@@ -24,7 +24,7 @@ QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "export", call, reads_data=True)
+    parser = add_verb(verbs, "export", call, data=True)
     parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
     parser.option(
         "--to",

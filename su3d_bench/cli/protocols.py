@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("--names", "print the texts that are encoded for the classes, one per line")
     parser.shared("--queries")
-    parser = add_verb(actions, "diff", call_diff, reads_data=True)
+    parser = add_verb(actions, "diff", call_diff, data=True)
     parser.option("name A", "protocol, or .toml file")
     parser.option("other B", "protocol to compare with")
     parser.option(

@@ -147,7 +147,7 @@ FORMATS = ("csv", "parquet")
 
 
 def _add_instances(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "instances", call_instances, reads_data=True)
+    parser = add_verb(verbs, "instances", call_instances, data=True)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
     parser.option("--format", "csv or parquet (default: by the suffix of --out, else csv)", choices=FORMATS)
@@ -221,7 +221,7 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
 
 
 def _add_attribution(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "attribution", call_attribution, reads_data=True)
+    parser = add_verb(verbs, "attribution", call_attribution, data=True)
     parser.shared("run")
     parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
     parser.shared("--protocols")

@@ -31,7 +31,7 @@ RUN_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "reproduce", call, resumes=True, reads_data=True)
+    parser = add_verb(verbs, "reproduce", call, resumes=True, data=True)
     parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
     parser.option("--table NAME...", "experiments to run (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)

@@ -1,11 +1,8 @@
 """The version of the program, as in pyproject.toml."""
 
-from functools import cache
-
 __version__ = "0.1.0"
 
 
-@cache
 def documentation(page: str) -> str:
     """Where a page such as ``running/gpu`` is: its address, if the installed package names its documentation's."""
     from importlib.metadata import PackageNotFoundError, metadata

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown, with_notes
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown, some, with_notes
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.system.files import noted
@@ -20,15 +20,7 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.openlex3d.release import OpenLexRelease
 from su3d_bench.evaluation import scoring as scene_scoring
 from su3d_bench.evaluation.ground_truth import NOT_INTENDED, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
-from su3d_bench.evaluation.result import (
-    Evaluation,
-    ProtocolEvaluation,
-    Request,
-    SceneOutcomes,
-    formed,
-    grouped_reasons,
-    some_names,
-)
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, grouped_reasons
 from su3d_bench.evaluation.text_ground_truth import FLAG, TextTruths
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
 from su3d_bench.metrics import compatibility
@@ -130,7 +122,7 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
     """Each remark with the scenes it concerns, out of ``n`` scenes with a prediction."""
     for line, scenes in scenes_of_remark.items():
-        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
+        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some(scenes, 5)})"
         yield f"{'every scene' if len(scenes) == n > 1 else which}: {line}"
 
 
@@ -192,11 +184,12 @@ class Scoring:
 
     def _fault(self, scene: str, facts: compatibility.ContentFacts) -> str | None:
         """Why the points of the prediction cannot be those of the ground truth."""
+        if facts.n_points is None or not isinstance(self._truths, DatasetTruths):
+            return None
         try:
-            points = None if facts.n_points is None else self._truths.vertices(scene, facts.n_points)
+            return compatibility.length_mismatch(facts, len(self._truths.vertices(scene, facts.n_points)))
         except GroundTruthMissing as error:
             return str(error)
-        return None if points is None else compatibility.length_mismatch(facts, len(points))
 
     def add_missed(self, scenes: Sequence[str]) -> Content:
         """Scenes without a prediction: skipped if the original evaluator skips them, otherwise counted as missed.
@@ -241,7 +234,7 @@ class Scoring:
     ) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None if it was."""
         has_points, kept = self._truths.has_points, self.outcomes[rules.name]
-        if facts.form == "vertex-masks" and compatibility.needs_map(rules) and self._truths.has_vertices:
+        if facts.form == "vertex-masks" and compatibility.needs_map(rules) and isinstance(self._truths, DatasetTruths):
             facts = replace(facts, form="instances", has_every_label=facts.has_labels, n_points=None)
         reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._is_named and self._first is None:

@@ -54,12 +54,10 @@ class VertexTruth:
 class SceneTruths(ABC):
     """The ground truth of every scene of an evaluation, and the prediction of each that has one.
 
-    ``where`` is its name in messages; ``has_points``: its points have coordinates; ``has_vertices``: those of masks
-    over vertices are known.
+    ``where`` is its name in messages; ``has_points``: its points have coordinates.
     """
 
     has_points = True
-    has_vertices = False
     where: str
     dataset_name: str | None
     scenes: tuple[str, ...]
@@ -96,18 +94,12 @@ class SceneTruths(ABC):
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth | VertexTruth:
         """The ground truth of a scene for a protocol; ``GroundTruthMissing`` if there is none in its form."""
 
-    def vertices(self, scene: str, n: int | None) -> Float32Array | None:
-        """The points (V, 3) that masks over ``n`` vertices refer to; None if their coordinates are not known."""
-        return None
-
 
 # ---- datasets
 
 
 class DatasetTruths(SceneTruths):
     """Ground truth with coordinates, read on demand; that of one scene is cached."""
-
-    has_vertices = True
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         self._target = request.dataset or _dataset_of(sources)
@@ -174,7 +166,7 @@ class DatasetTruths(SceneTruths):
         return query_truth(truth, self._queries[scene], where, class_of, alignment)
 
     def vertices(self, scene: str, n: int | None) -> Float32Array:
-        """Those of the ground truth, unless only the scan's mesh has ``n`` vertices."""
+        """The points (V, 3) of masks over ``n`` vertices: those of the ground truth, unless only the mesh has ``n``."""
         points = self._truth(scene, self._dataset.variants[0]).points
         if len(points) != n and isinstance(self._dataset, HasSurface):
             with suppress(DataError):  # no mesh

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 
+from su3d_bench.core.errors import some
 from su3d_bench.metrics.compatibility import MIN_MULTI_LABEL_SHARE, labels_counted
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
@@ -51,7 +52,6 @@ def default_name(out: Path | None) -> str:
 
 
 SCHEMA = 1
-SCENE = "<scene>"  # in reasons of several scenes
 # Names of the metrics in the file; the first ones of each kind are its headline.
 KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
@@ -255,29 +255,23 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
     if kept.skipped:
         lines.append(
             f"{len(kept.skipped)} of {n} scenes have no prediction and are skipped, as in the original evaluator; "
-            f"their objects do not count as missed: {some_names(kept.skipped)}"
+            f"their objects do not count as missed: {some(kept.skipped, 5)}"
         )
     if kept.missed:
-        lines.append(
-            f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some_names(kept.missed)}"
-        )
-    is_one = len(kept.unscored) == 1
-    return lines + [f"{n}: not scored: {why if is_one else why.replace(n, SCENE)}" for n, why in kept.unscored.items()]
+        lines.append(f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some(kept.missed, 5)}")
+    return lines + [f"{scene}: not scored: {why.replace(scene, '<scene>')}" for scene, why in kept.unscored.items()]
 
 
 def grouped_reasons(reasons: Mapping[str, str]) -> list[str]:
     """One line for each distinct reason of ``reasons`` (by scene), with the scenes that it concerns.
 
-    >>> grouped_reasons({"a": "x/a: no a.ply", "b": "x/b: no b.ply"}), grouped_reasons({"a": "x/a: no a.ply"})
-    (['x/<scene>: no <scene>.ply (2 scenes: a, b)'], ['x/a: no a.ply'])
+    >>> grouped_reasons({"a": "x/a: no a.ply", "b": "x/b: no b.ply"})
+    ['x/<scene>: no <scene>.ply (a, b)']
     """
     scenes_of: dict[str, list[str]] = {}
     for scene, reason in reasons.items():
-        scenes_of.setdefault(reason.replace(scene, SCENE), []).append(scene)
-    return [
-        reasons[scenes[0]] if len(scenes) == 1 else f"{line} ({len(scenes)} scenes: {some_names(scenes)})"
-        for line, scenes in scenes_of.items()
-    ]
+        scenes_of.setdefault(reason.replace(scene, "<scene>"), []).append(scene)
+    return [f"{line} ({some(scenes, 5)})" for line, scenes in scenes_of.items()]
 
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
@@ -300,11 +294,6 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
     if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
         return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP per class is recall x (1 + precision) / 2"]
     return []
-
-
-def some_names(names: Sequence[str]) -> str:
-    """The first five of ``names`` and the number of further ones."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _key(name: str) -> str:

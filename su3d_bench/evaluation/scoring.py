@@ -10,7 +10,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
-from su3d_bench.evaluation.ground_truth import SceneTruths, VertexTruth
+from su3d_bench.evaluation.ground_truth import DatasetTruths, SceneTruths, VertexTruth
 from su3d_bench.evaluation.result import SceneOutcome
 from su3d_bench.metrics.compatibility import ContentFacts, needs_map
 from su3d_bench.metrics.instance import average_precision as instance_ap
@@ -249,8 +249,9 @@ def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Pred
 
 def vertices_for(rules: ProtocolRules, truths: SceneTruths, scene: str, content: Content) -> Float32Array | None:
     """The points of masks over vertices if a protocol scores them as a map; None for other content."""
-    is_placed = isinstance(content, VertexMasks) and len(content) and needs_map(rules)
-    return truths.vertices(scene, content.n_points) if is_placed else None
+    if not isinstance(truths, DatasetTruths) or not isinstance(content, VertexMasks) or not needs_map(rules):
+        return None
+    return truths.vertices(scene, content.n_points) if len(content) else None
 
 
 def on_vertices(content: Content, points: Float32Array, rules: ProtocolRules) -> Instances:
