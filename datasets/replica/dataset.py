@@ -58,8 +58,8 @@ class Replica(FileDataset[NoOptions]):
         n_frames = "no frames"
         if self._is_rendered(scene):
             folder = self.folder(scene)
-            if missing := missing_parts(folder, "traj.txt", "results") or missing_parts(folder.parent, CAMERA):
-                return missing
+            if fault := missing_parts(folder, "traj.txt", "results") or missing_parts(folder.parent, CAMERA):
+                return fault
             n_frames = counted(len(frames.trajectory_lines(folder / "traj.txt", self.where(scene))), "frame")
         try:
             words = f"ground truth in {self._original(scene)}"

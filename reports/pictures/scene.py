@@ -83,9 +83,9 @@ def look_at(
         if not isinstance(error, FramesMissing) and not isinstance(error.__cause__, FileNotFoundError):
             raise
         no_frames = str(error)
-        if truth is None and not isinstance(dataset, HasSurface):
-            raise DataError(f"{no_frames}; {reason}") from error
         if truth is None:
+            if not isinstance(dataset, HasSurface):
+                raise DataError(f"{no_frames}; {reason}") from error
             mesh = dataset.surface(scene).vertices
     positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
     is_shown = set(evenly(len(positions), SHOWN_FRAMES))

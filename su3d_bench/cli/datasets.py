@@ -76,7 +76,7 @@ def call_make(arguments: argparse.Namespace) -> None:
     """Generate scenes on disk; the same command resumes after an interruption.
 
     su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'
-    su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200
+    su3d-bench datasets make rooms --layout scannet --out small --scenes bathroom0 --set n_frames=120
     """
     from su3d_bench.cli import make_scenes
 
