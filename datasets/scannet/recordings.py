@@ -256,7 +256,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
     """The number of frames, including lost ones, from a header or a list of names only."""
     form, place = _find(folder, scene, kind) or (None, folder)
     if form is None:
-        return f"no recording ({scene}.sens is missing)"
+        return "no recording" + (f" ({scene}.sens is missing)" if kind in ("auto", "sens") else "")
     layout = python_layout(place)
     path = place / layout.pose if form == "python" and layout is not None else place
     if path != place and layout and (missing := sensors.missing_parts(place, *astuple(layout))):

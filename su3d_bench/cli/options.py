@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,7 +119,7 @@ def add_verb(
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
     if data:
-        parser.option("--data DIR", "data root (default: $SU3D_DATA)", type=data_folder)
+        parser.option("--data DIR", "data root (default: $SU3D_DATA)", type=str)
     return parser
 
 
@@ -164,13 +163,6 @@ def index(text: str) -> int:
     if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
-
-
-def data_folder(text: str) -> str:
-    """Option type: the absolute path of an existing data root, or the URL of a store."""
-    if "://" in text or os.path.isdir(text):
-        return text if "://" in text else os.path.abspath(text)
-    raise argparse.ArgumentTypeError(f"{text}: no such folder; name the one that contains the datasets")
 
 
 def output_path(text: str) -> Path:

@@ -174,7 +174,10 @@ class Scoring:
         if not self.rules:
             # faults of the data, then the most frequent reason: files that only one protocol needs may not be used
             self._faults += filter(None, [self._fault(scene, facts)])
-            ordered = dict.fromkeys([*self._faults, *(why for why, _ in Counter(reasons.values()).most_common())])
+            count = Counter(reasons.values())
+            ordered = sorted(
+                dict.fromkeys([*self._faults, *count]), key=lambda why: (why not in self._faults, -count[why])
+            )
             first, *others = ((why, [name for name in reasons if reasons[name] == why]) for why in ordered)
             error = PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first[0]}")
             raise with_notes(error, (f"{', '.join(names)}: {why}".removeprefix(": ") for why, names in others))

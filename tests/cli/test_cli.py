@@ -300,7 +300,7 @@ def test_data_option_replaces_the_environment_variable_for_workers_too(
     for words in (["run", "--scenes", "replica/*"], ["evaluate", "here"], ["datasets", "check", "replica/*"]):
         assert main([*words, "--data", "nowhere"]) == 2
         error = capsys.readouterr().err
-        assert "--data: nowhere: no such folder" in error and error.count("\n") == 1
+        assert "--data nowhere: no such folder" in error and error.count("\n") == 1
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "nowhere"))
     for words in (["run", "--scenes", "replica/room0"], ["datasets", "check", "replica/room0"]):
         assert main(words) == 2

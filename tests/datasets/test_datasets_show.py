@@ -105,7 +105,7 @@ def test_scan_without_recording_shows_its_ground_truth_or_mesh(
     assert main(["datasets", "show", "scannet/scene0000_00", "--data", "data"]) == 0
     text = capsys.readouterr().out
     assert "no frames" in text and "mesh of 23,600 vertices" in text and "no recording in" in text
-    assert n_near(pixels(Path("scannet-scene0000_00.png")), (214, 214, 210)) > 50_000
+    assert n_near(pixels(Path("scannet-scene0000_00.png")), (214, 214, 210)) > 1000
 
 
 @pytest.mark.parametrize(
