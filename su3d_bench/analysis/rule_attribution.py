@@ -102,7 +102,7 @@ class RuleStepper:
         """
         mixtures = Mixtures(first, second)
         if first.kind not in KINDS:
-            raise ConfigError(f"--prediction needs protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
+            raise ConfigError(f"--run needs protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
         runs, named = parse_side(prediction, None)
         if len(runs) > 1:
             raise ConfigError(f"{printable(prediction, 200)}: names several runs; give one")
