@@ -143,7 +143,7 @@ class Scoring:
         self._truths, self._texts, self._file_confidences = truths, texts, file_confidences
         self._is_named = bool(named)
         self._first: Content | None = None  # the first prediction that is not empty
-        self._faults: list[str] = []  # of the data: reasons, and what hides behind others
+        self._faults: list[str] = []  # reasons that are faults of the data
         for rules in map(load_protocol, dict.fromkeys(named or protocol_names())):
             reason = truths.incompatibility(rules, is_named=self._is_named)
             if reason is None:
@@ -175,9 +175,7 @@ class Scoring:
             # faults of the data, then the most frequent reason: files that only one protocol needs may not be used
             self._faults += filter(None, [self._fault(scene, facts)])
             count = Counter(reasons.values())
-            ordered = sorted(
-                dict.fromkeys([*self._faults, *count]), key=lambda why: (why not in self._faults, -count[why])
-            )
+            ordered = sorted({*self._faults, *count}, key=lambda why: (why not in self._faults, -count[why], why))
             first, *others = ((why, [name for name in reasons if reasons[name] == why]) for why in ordered)
             error = PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first[0]}")
             raise with_notes(error, (f"{', '.join(names)}: {why}".removeprefix(": ") for why, names in others))
