@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.options import Verbs, add_verb, output_path
-from su3d_bench.cli.output import answer_tables, remark
+from su3d_bench.cli.output import answer_tables, remark, steps
 from su3d_bench.core.errors import ConfigError
 
 SCHEMA = 1  # version of the JSON for several methods
@@ -71,7 +71,8 @@ def call(arguments: argparse.Namespace) -> None:
         "scenes": tuple(arguments.scenes),
     }
     requests = {method: Request(tuple(paths), method=method, **chosen) for method, paths in _named(arguments).items()}
-    run = evaluate_methods(requests, arguments.out)
+    with steps("evaluate", is_quiet=arguments.quiet) as step:
+        run = evaluate_methods(requests, arguments.out, step)
     results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
     if len(results) == 1:

@@ -40,10 +40,7 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
             action="extend",
             default=[],
         )
-        parser.option(
-            "--sources FILE",
-            "TOML file of sources that override the built-in ones",
-        )
+        parser.option("--sources FILE", "TOML file of sources that override the built-in ones")
 
 
 def retries_of(arguments: argparse.Namespace) -> int:

@@ -79,13 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def complete(parser: Parser) -> None:
-    """Print completions for the shell and exit."""
-    import argcomplete
-
-    argcomplete.autocomplete(parser)
-
-
 def _exit_code(words: Sequence[str]) -> int:
     """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
@@ -93,7 +86,9 @@ def _exit_code(words: Sequence[str]) -> int:
         words = [*words[1:], "--help"]
     try:
         parser = build_parser(words[0] if words else None)
-        if "_ARGCOMPLETE" in os.environ:  # shell completion; see su3d-bench dev completion
+        if "_ARGCOMPLETE" in os.environ:
+            from su3d_bench.cli.completion import complete
+
             complete(parser)
         arguments = parser.parse_args(words)
         if "call" not in arguments:  # a group of commands without a command

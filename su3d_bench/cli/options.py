@@ -53,6 +53,9 @@ class Parser(argparse.ArgumentParser):
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             if isinstance(action, argparse._SubParsersAction):
                 name = action.dest
+                if value == "help":
+                    self.print_help()
+                    self.exit()
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
     def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:
@@ -242,6 +245,11 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "how to answer questions: built-in (geometry) or llm (default: built-in)",
             choices=("built-in", "llm"),
         ),
+        option(
+            "--refiner",
+            "labels n' by vote (sum of scores) or model (language model, as in the paper; default: vote)",
+            choices=("vote", "model"),
+        ),
         option("--exclude-ids FILE", "CSV file with ids of questions to exclude"),
         option(
             "--text-features FILE",
@@ -263,6 +271,8 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--dry-run", "show what would be done and what it needs, and exit"),
     ]
 )
+# Of commands that run methods.
+JOBS = "number of parallel jobs (default: one per CPU core, with foundation models on GPUs at most 2 per GPU)"
 # Where scenes run; see docs/running/clusters.md.
 EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
 
@@ -292,7 +302,7 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
     return resolve(settings, ("perception",), PerceptionConfig)
 
 
-def add_language_options(parser: Parser, default: str = "the paper's gpt-4-1106-preview") -> None:
+def add_language_options(parser: Parser, default: str = "perception.language.text_model") -> None:
     """Add the options of commands that use a language model."""
     parser.option("--model NAME", f"language model (default: {default})")
     parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI)")

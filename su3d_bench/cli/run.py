@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb, run_place
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, run_place
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -35,7 +35,9 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
     parser.option("--protocols PROTOCOL...", "protocols to use (default: those of the dataset)")
-    parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
+    parser.shared("--profile", "--device")
+    parser.shared("--jobs", help=JOBS)
+    parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
@@ -49,9 +51,7 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option(
-        "--out DIR",
-        "run folder or URL, such as s3://bucket/run (default: a folder in runs/)",
-        type=run_place,
+        "--out DIR", "run folder or URL, such as s3://bucket/run (default: a folder in runs/)", type=run_place
     )
     into = parser.add_mutually_exclusive_group()
     what = "add scenes, methods and protocols to the run in --out"

@@ -54,6 +54,9 @@ class EvaluatedRun:
     existed: bool = False
 
 
+Progress = Callable[[str, int, int], None]  # the scene, the number of scenes done and of all, for one method
+
+
 @dataclass
 class _Kept:
     """The state of one method's predictions; the maps go to ``folder``, if there is one."""
@@ -61,7 +64,9 @@ class _Kept:
     method: str
     request: Request
     folder: RunFolder | None
+    progress: Progress
     files: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    n_done: int = 0
 
     def begin(self, truths: SceneTruths, sources: Sequence[Source], *, counts_file_confidences: bool) -> None:
         self.truths = truths
@@ -69,6 +74,8 @@ class _Kept:
         self.confidences = "file" if counts_file_confidences else "protocol"
 
     def keep(self, scene: str, content: Content, files: Iterable[Path], rules: Sequence[ProtocolRules]) -> None:
+        self.n_done += 1
+        self.progress(scene, self.n_done, len(self.truths.scenes))
         if self.folder is None:
             return
         address = self.truths.address(scene)
@@ -111,7 +118,9 @@ class _Kept:
         )
 
 
-def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -> EvaluatedRun:
+def evaluate_methods(
+    requests: Mapping[str, Request], out: Path | None = None, progress: Progress = lambda scene, n_done, n_all: None
+) -> EvaluatedRun:
     """The numbers of each method's predictions, written as one run to ``out`` if given.
 
     A folder with the same evaluation is not changed; ``StoreError`` if it contains another evaluation or anything else.
@@ -119,7 +128,7 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
     for method in requests:
         check_method_name(method)
     if out is None:
-        kept = [_Kept(method, request, None) for method, request in requests.items()]
+        kept = [_Kept(method, request, None, progress) for method, request in requests.items()]
         return _evaluated(kept)
     _check_same_runs(out)
     place = out.absolute()
@@ -127,7 +136,7 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
     try:
         with unfinished_folder(place) as filled:
             folder = RunFolder(filled)
-            kept = [_Kept(method, request, folder) for method, request in requests.items()]
+            kept = [_Kept(method, request, folder, progress) for method, request in requests.items()]
             run = _evaluated(kept)
             record = _write(kept, run, folder)
             if atomic.is_file(out / "run.json"):

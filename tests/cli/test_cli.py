@@ -60,6 +60,40 @@ def test_simple_commands_import_no_heavy_modules(words: list[str], unneeded: tup
     assert done.stdout.splitlines()[-1].split() == ["loaded:", "0"], done.stderr
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("su3d-bench re", {"report", "reproduce"}),
+        ("su3d-bench query ", {"text", "ask", "make", "show", "audit", "score"}),
+        ("su3d-bench report tables runs/demo --format ", {"text", "markdown", "latex", "csv", "html"}),
+        ("su3d-bench run rooms/liv", {"rooms/living0", "rooms/living1"}),
+        ("su3d-bench run --scenes re", {"replica/"}),
+        ("su3d-bench run --methods conceptg", {"conceptgraphs", "conceptgraphs-detector"}),
+        ("su3d-bench evaluate p --protocols rooms-se", {"rooms-semantic"}),
+        ("su3d-bench evaluate p --dataset scan", {"scannet", "scannetpp"}),
+        ("su3d-bench compare runs/b runs/", {"runs/a", "runs/b"}),
+        ("su3d-bench report bundle runs/a --out pap", {"paper.zip"}),
+    ],
+)
+def test_shell_completes_commands_and_values_without_heavy_imports(
+    line: str, words: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in ("runs/a/run.json", "runs/b/run.json", "paper.zip"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text("")
+    found = tmp_path / "found"
+    environment = {
+        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
+        "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_COMP_WORDBREAKS": " ",
+    }  # fmt: skip
+    program = [sys.executable, "-X", "importtime", "-m", "su3d_bench"]
+    done = subprocess.run(program, env=os.environ | environment, check=True, capture_output=True, text=True)
+    assert not {row.rpartition("|")[2].strip() for row in done.stderr.splitlines()} & set(HEAVY)
+    assert words <= {word.strip() for word in found.read_text().split("\n")}
+    assert not {"run", "evaluate"} & {word.strip() for word in found.read_text().split("\n")}
+
+
 def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -73,7 +107,18 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
     assert rules.digest in text
 
 
-@pytest.mark.parametrize(("words", "prog"), [("", ""), ("help", ""), ("report", " report"), ("help run", " run")])
+@pytest.mark.parametrize(
+    ("words", "prog"),
+    [
+        ("", ""),
+        ("help", ""),
+        ("report", " report"),
+        ("help run", " run"),
+        ("help report tables", " report tables"),
+        ("report help", " report"),
+        ("dev cache help", " dev cache"),
+    ],
+)
 def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 0
     assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")

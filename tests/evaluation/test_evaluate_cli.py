@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 from evaluated_text import CHAIR, TABLE, scene, write_truth
 from prediction_files import write_scannet_text
 
+from su3d_bench.cli import output
 from su3d_bench.cli.main import main
 
 
@@ -53,6 +55,17 @@ def test_json_file_has_the_documented_form(capsys: pytest.CaptureFixture[str]) -
     assert one["per_class"]["table"] == {"ap": 0.5, "ap50": 0.5, "ap25": 0.5}
     assert one["per_class"]["sofa"]["ap"] is None
     assert one["per_scene"]["scene0001_01"]["ap"] == 0.5
+
+
+def test_long_evaluation_prints_lines_with_the_time_left_where_there_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(WORDS) == 0 and "steps" not in capsys.readouterr().err
+    monkeypatch.setattr(output, "LINE_EVERY_S", 1e-9)
+    assert main(WORDS) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("evaluate: ")]
+    assert re.fullmatch(r"evaluate: scene0001_00 done, 1 of 2 steps, about \d+ s left", lines[0])
+    assert lines[1:] == ["evaluate: scene0001_01 done, 2 of 2 steps"]
 
 
 WRONG = {
