@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, printable
 from su3d_bench.core.geometry import back_project, turn_to_z, valid_depth
-from su3d_bench.core.interfaces import Dataset, ProvidesUpAxis
+from su3d_bench.core.interfaces import Dataset, HasSurface, ProvidesUpAxis
 from su3d_bench.core.types import (
     BoolArray,
     Float32Array,
@@ -38,9 +38,10 @@ class SceneView:
     """The data for the picture of a scene.
 
     ``poses`` (n, 4, 4): camera-to-world of the frames read, of ``n_frames`` in the scene; ``seen`` (m, 3): observed
-    points in metres in the world frame, z up, and ``seen_rgb`` (m, 3) their colours; ``shown``: some of the frames;
-    ``depth_m``: minimum and maximum depth; ``truth``, or the reason why it is missing; ``up``: for datasets without a
-    fixed up axis; if it is only estimated, the world of the picture is rotated and that of the frames is not.
+    points in metres in the world frame, z up, and ``seen_rgb`` (m, 3) their colours, or the vertices of the scan's mesh
+    if there are neither frames nor ground truth; ``shown``: some of the frames; ``depth_m``: minimum and maximum depth;
+    ``truth``, or the reason why it is missing, as for the frames; ``up``: for datasets without a fixed up axis; if it
+    is only estimated, the world of the picture is rotated and that of the frames is not.
     """
 
     scene: str
@@ -52,6 +53,7 @@ class SceneView:
     depth_m: tuple[float, float]
     truth: GroundTruth | None
     no_truth: str
+    no_frames: str = ""
     up: WorldUp | None = None
 
     @property
@@ -68,22 +70,27 @@ def look_at(
 ) -> SceneView:
     """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its ground truth.
 
-    A ``DataError`` for corrupted frames or ground truth, or if both are missing; one of them may be missing.
+    A ``DataError`` for corrupted frames or ground truth, or if both and the scan's mesh are missing.
     """
     frames: Sequence[Frame] = ()
-    n_frames = 0
+    n_frames, no_frames, mesh = 0, "", np.zeros((0, 3), np.float32)
     truth, reason = _truth(dataset, scene)
     try:
         frames, n_frames = dataset.frames(scene, stride or 1), dataset.info(scene, 1).n_frames
         if not len(frames):
             raise DataError(f"{dataset.name}/{scene}: has no frames to show")
-    except FramesMissing as error:
+    except DataError as error:
+        if not isinstance(error, FramesMissing) and not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        no_frames = str(error)
         if truth is None:
-            raise DataError(reason) from error
+            if not isinstance(dataset, HasSurface):
+                raise DataError(f"{no_frames}; {reason}") from error
+            mesh = dataset.surface(scene).vertices
     positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
     is_shown = set(evenly(len(positions), SHOWN_FRAMES))
     poses, shown, ranges = list[Float64Array](), list[Frame](), list[float]()
-    points, colours = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+    points, colours = [mesh], [np.full((len(mesh), 3), UNSEEN, np.uint8)]
     for k, position in enumerate(positions):
         progress(k, len(positions))
         frame = frames[position]
@@ -103,7 +110,7 @@ def look_at(
     seen = (np.concatenate(points) @ turn.T).astype(np.float32)
     depth_m = (float(min(ranges, default=0.0)), float(max(ranges, default=0.0)))
     about = (f"{dataset.name}/{scene}", n_frames, drawn, seen, np.concatenate(colours), tuple(shown), depth_m)
-    return SceneView(*about, truth, reason, up)
+    return SceneView(*about, truth, reason, no_frames, up)
 
 
 def evenly(n: int, most: int) -> Sequence[int]:
@@ -213,7 +220,7 @@ def draw_scene_picture(look: SceneView, path: Path) -> None:
 
 def facts_line(look: SceneView) -> str:
     """Return the facts about the scene in one line."""
-    words = ["no frames"]
+    words = ["no frames", *([f"mesh of {len(look.seen):,} vertices"] if len(look.seen) else [])]
     if look.shown:
         height, width = look.shown[0].rgb.shape[:2]
         words = [
@@ -239,8 +246,9 @@ def _panels(look: SceneView) -> tuple[Panel, ...]:
         cameras = (_camera_above(look, points), *corners)
         size_m = _drawn_size(points)
         pictures = [canvas.colour(canvas.render(points, size_m, camera), colours) for camera in cameras]
+        title = f"trajectory over the points of {len(look.poses)} frames" if look.shown else "the scan's mesh"
         return (
-            (f"trajectory over the points of {len(look.poses)} frames, from above", pictures[0], cameras[0]),
+            (f"{title}, from above", pictures[0], cameras[0]),
             ("the same points, from one corner", pictures[1], None),
             ("from the other corner", pictures[2], None),
         )

@@ -19,7 +19,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--protocols")
     parser.option("--per-class", "also show each class")
     parser.shared("--format")
-    parser = add_verb(verbs, "check", call_check)
+    parser = add_verb(verbs, "check", call_check, data=True)
     parser.option("runs [RUN...]", "run to check")
     parser.option("--against FILE", "reference file")
     parser.option("--recompute", "also score the maps again (slower)")

@@ -28,7 +28,8 @@ def add_parser(verbs: Verbs) -> None:
     """
     actions = add_group(verbs, "dev", add_parser)
     _add_cache(actions)
-    add_verb(actions, "doctor", doctor.call, uses_all_cores=True)  # computes nothing, and shows the thread settings
+    # computes nothing, and shows the thread settings
+    add_verb(actions, "doctor", doctor.call, data=True).set_defaults(uses_all_cores=True)
     parser = add_verb(actions, "completion", call_completion)
     parser.option("shell", "shell to complete for", choices=SHELLS)
     _add_registry(actions)
@@ -134,7 +135,7 @@ def _add_registry(verbs: Verbs) -> None:
     su3d-bench dev registry build my-registry --out site
     """
     actions = add_group(verbs, "registry", _add_registry)
-    parser = add_verb(actions, "add", call_registry_add)
+    parser = add_verb(actions, "add", call_registry_add, data=True)
     parser.option("bundles BUNDLE...", "archives written by report bundle or reproduce")
     parser.option("--registry DIR", "registry folder (default: the current folder)", type=output_path, default=Path())
     parser.option("--bundle-name NAME", "name of the bundle in the registry (default: from its file or recipe)")

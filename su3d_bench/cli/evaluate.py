@@ -24,7 +24,7 @@ REQUEST_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "evaluate", call)
+    parser = add_verb(verbs, "evaluate", call, data=True)
     parser.option("paths [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option("--name NAME", "name of the method (default: name of --out)")
     parser.option("--predictions METHOD=PREDICTIONS...", "predictions of several methods", action="extend", default=[])

@@ -24,7 +24,7 @@ QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "export", call)
+    parser = add_verb(verbs, "export", call, data=True)
     parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
     parser.option("--to", "format to write (of these evaluators)", required=True, choices=TARGETS)
     parser.option("--out DIR", "new folder for the files", type=output_path, required=True)

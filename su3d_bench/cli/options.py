@@ -116,18 +116,20 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
 
 
 def add_verb(
-    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, resumes: bool = False
+    verbs: Verbs, name: str, call: Call, about: str = "", *, data: bool = False, resumes: bool = False
 ) -> Parser:
     """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
-    Numerical libraries use one thread unless it ``uses_all_cores``. ``resumes``: the command continues after an
-    interruption; others start again.
+    ``resumes``: the command continues after an interruption; others start again. ``data``: it reads datasets, and has
+    ``--data``, which replaces ``SU3D_DATA``. Numerical libraries use one thread unless its default ``uses_all_cores``.
     """
     parser = _parser(verbs, name, about or call.__doc__)
-    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, resumes=resumes, json_file=None)
+    parser.set_defaults(call=call, parser=parser, uses_all_cores=False, resumes=resumes, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
+    if data:
+        parser.option("--data DIR", "data root (default: $SU3D_DATA)", type=str)
     return parser
 
 

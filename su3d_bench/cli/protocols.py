@@ -32,7 +32,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("--list-texts", "print the texts that are encoded, one per line")
     parser.shared("--queries")
-    parser = add_verb(actions, "diff", call_diff)
+    parser = add_verb(actions, "diff", call_diff, data=True)
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("other PROTOCOL", "protocol to compare with")
     parser.option("--run RUN", "run folder (or RUN:METHOD; scored under both, for the effect of each rule)", type=str)

@@ -147,7 +147,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
 
 
 def _add_instances(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "instances", call_instances)
+    parser = add_verb(verbs, "instances", call_instances, data=True)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
     parser.option("--out FILE", ".csv or .parquet file to write (default: print CSV)", type=output_path)
@@ -241,7 +241,7 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
 
 
 def _add_attribution(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "attribution", call_attribution)
+    parser = add_verb(verbs, "attribution", call_attribution, data=True)
     parser.shared("run")
     parser.option("--method METHOD", "method to use (default: the only one of the run)")
     parser.shared("--protocols")

@@ -41,7 +41,7 @@ RUN_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "reproduce", call, resumes=True)
+    parser = add_verb(verbs, "reproduce", call, resumes=True, data=True)
     parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
     parser.option("--tables TABLE...", "tables of the paper (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)

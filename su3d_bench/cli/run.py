@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "run", call_run, resumes=True)
+    parser = add_verb(verbs, "run", call_run, resumes=True, data=True)
     parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
     _add_run_options(parser)
-    parser = add_verb(verbs, "ablate", call_ablate, resumes=True)
+    parser = add_verb(verbs, "ablate", call_ablate, resumes=True, data=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
     parser.option("--method METHOD", "method to use (or file.py:Class; default: opensu3d)", default="opensu3d")
     parser.option("--also-methods METHOD...", "additional methods to run without variation", default=[])

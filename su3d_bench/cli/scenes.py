@@ -158,12 +158,13 @@ def show(arguments: argparse.Namespace) -> None:
         "up": None if look.up is None else asdict(look.up),
         "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
         "no_ground_truth": look.no_truth or None,
+        "no_frames": look.no_frames or None,
     }
     if answer_json(arguments, printable_json(table)):
         return
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:
         answer(f"up: {printable(up_text(look.up))}")
-    if look.no_truth:
-        answer(printable(look.no_truth))
+    for reason in filter(None, (look.no_frames, look.no_truth)):
+        answer(printable(reason))
     answer(f"picture: {printable(str(path))}")

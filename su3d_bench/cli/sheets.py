@@ -165,7 +165,7 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 
 
 def _add_pictures(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "pictures", call_pictures)
+    parser = add_verb(verbs, "pictures", call_pictures, data=True)
     parser.shared("run")
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")

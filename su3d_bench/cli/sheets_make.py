@@ -32,7 +32,7 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "make", call)
+    parser = add_verb(verbs, "make", call, data=True)
     parser.option("run [RUN]", "run folder (not needed for --kinds questions with --scenes)")
     parser.option(
         "--kinds ...",

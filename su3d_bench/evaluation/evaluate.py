@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown, some, with_notes
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.system.files import noted
@@ -20,7 +20,7 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.openlex3d.release import OpenLexRelease
 from su3d_bench.evaluation import scoring as scene_scoring
 from su3d_bench.evaluation.ground_truth import NOT_INTENDED, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
-from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, some_names
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, grouped_reasons
 from su3d_bench.evaluation.text_ground_truth import FLAG, TextTruths
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
 from su3d_bench.metrics import compatibility
@@ -122,7 +122,7 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
     """Each remark with the scenes it concerns, out of ``n`` scenes with a prediction."""
     for line, scenes in scenes_of_remark.items():
-        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
+        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some(scenes, 5)})"
         yield f"{'every scene' if len(scenes) == n > 1 else which}: {line}"
 
 
@@ -143,6 +143,7 @@ class Scoring:
         self._truths, self._texts, self._file_confidences = truths, texts, file_confidences
         self._is_named = bool(named)
         self._first: Content | None = None  # the first prediction that is not empty
+        self._faults: list[str] = []  # reasons that are faults of the data
         for rules in map(load_protocol, dict.fromkeys(named or protocol_names())):
             reason = truths.incompatibility(rules, is_named=self._is_named)
             if reason is None:
@@ -171,13 +172,25 @@ class Scoring:
             del self.rules[name], self.outcomes[name]
             self.unfit[name] = reason
         if not self.rules:
-            # the most frequent reason says most: files that only one protocol needs may not be used at all
-            (first, _), *others = Counter(reasons.values()).most_common()
-            more = f" (and {len(others)} more reasons)" if others else ""
-            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
+            # faults of the data, then the most frequent reason: files that only one protocol needs may not be used
+            self._faults += filter(None, [self._fault(scene, facts)])
+            count = Counter(reasons.values())
+            ordered = sorted({*self._faults, *count}, key=lambda why: (why not in self._faults, -count[why], why))
+            first, *others = ((why, [name for name in reasons if reasons[name] == why]) for why in ordered)
+            error = PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first[0]}")
+            raise with_notes(error, (f"{', '.join(names)}: {why}".removeprefix(": ") for why, names in others))
         is_empty = isinstance(prediction.content, VertexMasks | Instances) and not len(prediction.content)
         if self._first is None and not is_empty:
             self._first = prediction.content
+
+    def _fault(self, scene: str, facts: compatibility.ContentFacts) -> str | None:
+        """Why the points of the prediction cannot be those of the ground truth."""
+        if facts.n_points is None or not isinstance(self._truths, DatasetTruths):
+            return None
+        try:
+            return compatibility.length_mismatch(facts, len(self._truths.vertices(scene, facts.n_points)))
+        except GroundTruthMissing as error:
+            return str(error)
 
     def add_missed(self, scenes: Sequence[str]) -> Content:
         """Scenes without a prediction: skipped if the original evaluator skips them, otherwise counted as missed.
@@ -210,9 +223,11 @@ class Scoring:
             elif kept.scores:
                 protocols.append(formed(rules, kept, file_confidences=self._file_confidences))
             else:
-                not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
+                not_scored[name] = "; ".join(grouped_reasons(kept.unscored)) or "no scene was scored"
         if not protocols:
-            raise PredictionError(f"nothing could be scored: {not_scored[next(iter(self.outcomes))]}")
+            lines = [line for kept in self.outcomes.values() for line in grouped_reasons(kept.unscored)]
+            first, *others = dict.fromkeys(lines or [not_scored[name] for name in self.outcomes])
+            raise with_notes(PredictionError(f"nothing could be scored: {first}"), others)
         return tuple(protocols), dict(sorted(not_scored.items()))
 
     def _score(
@@ -220,6 +235,8 @@ class Scoring:
     ) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None if it was."""
         has_points, kept = self._truths.has_points, self.outcomes[rules.name]
+        if facts.form == "vertex-masks" and compatibility.needs_map(rules) and isinstance(self._truths, DatasetTruths):
+            facts = replace(facts, form="instances", has_every_label=facts.has_labels, n_points=None)
         reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._is_named and self._first is None:
             reason = compatibility.class_id_incompatibility(rules, facts)
@@ -250,11 +267,19 @@ class Scoring:
         kept, facts = self.outcomes[rules.name], scene_scoring.facts_of(content)
         try:
             truth = self._truths.of_scene(rules, scene)
+            points = scene_scoring.vertices_for(rules, self._truths, scene, content)
         except GroundTruthMissing as error:
             if kept.scores or len(self._truths.scenes) > 1:
                 kept.unscored[scene] = str(error)
                 return None
+            self._faults.append(str(error))
             return str(error)
+        over = truth.points if points is None and isinstance(truth, GroundTruth) else points
+        if over is not None and (reason := compatibility.length_mismatch(facts, len(over))) is not None:
+            self._faults.append(reason)
+            return reason
+        if points is not None:
+            content = scene_scoring.on_vertices(content, points, rules)
         used = scene_scoring.with_confidences_of_files(rules) if self._file_confidences else rules
         if isinstance(truth, VertexTruth):
             if (reason := compatibility.length_mismatch(facts, len(truth.values))) is not None:
@@ -262,8 +287,6 @@ class Scoring:
             outcome = scene_scoring.score_on_vertices(used, truth, scene, content, encoder)
             kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
         elif isinstance(truth, GroundTruth):
-            if (reason := compatibility.length_mismatch(facts, len(truth.points))) is not None:
-                return reason
             outcome = scene_scoring.score_on_truth(used, truth, scene, content, encoder)
         else:
             outcome = scene_scoring.score_on_objects(used, truth, scene, content, encoder)

@@ -10,6 +10,7 @@ import fnmatch
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, shown, suggest
-from su3d_bench.core.interfaces import IsAligned, NamesCategories
+from su3d_bench.core.interfaces import HasSurface, IsAligned, NamesCategories
 from su3d_bench.core.registry import GROUND_TRUTH_FILES
-from su3d_bench.core.types import GroundTruth, Int64Array
+from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d.release import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
@@ -163,6 +164,15 @@ class DatasetTruths(SceneTruths):
         needs_axes = rules.box_axes == "aligned" and isinstance(dataset, IsAligned)
         alignment = dataset.axis_alignment(scene) if needs_axes else None
         return query_truth(truth, self._queries[scene], where, class_of, alignment)
+
+    def vertices(self, scene: str, n: int | None) -> Float32Array:
+        """The points (V, 3) of masks over ``n`` vertices: those of the ground truth, unless only the mesh has ``n``."""
+        points = self._truth(scene, self._dataset.variants[0]).points
+        if len(points) != n and isinstance(self._dataset, HasSurface):
+            with suppress(DataError):  # no mesh
+                vertices = self._dataset.surface(scene).vertices
+                return vertices if len(vertices) == n else points
+        return points
 
     def _truth(self, scene: str, variant: str) -> GroundTruth:
         if (scene, variant) not in self._kept:

@@ -25,7 +25,8 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.ground_truth import SceneTruths
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request
-from su3d_bench.evaluation.scoring import map_of
+from su3d_bench.evaluation.scoring import map_of, on_vertices, vertices_for
+from su3d_bench.metrics.compatibility import needs_map
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
@@ -83,7 +84,10 @@ class _Kept:
 
     def _shown(self, scene: str, content: Content, rules: Sequence[ProtocolRules]) -> Content:
         """The map as scored: on the ground-truth points, with the names of the first protocol with classes."""
-        for each in sorted(rules, key=lambda one: one.class_agnostic is not None):
+        for each in sorted(rules, key=lambda one: (needs_map(one), one.class_agnostic is not None or not one.classes)):
+            points = vertices_for(each, self.truths, scene, content)
+            if points is not None:
+                return on_vertices(content, points, each)
             truth = self.truths.of_scene(each, scene)
             if isinstance(truth, GroundTruth):
                 return map_of(content, truth.points, each)

@@ -11,6 +11,7 @@ from typing import Any
 from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
 from su3d_bench.core.errors import ModelMissing, Su3dError, counted
 from su3d_bench.core.system.devices import require_installed
+from su3d_bench.core.version import documentation
 from su3d_bench.fetching.sources import built_in
 from su3d_bench.formats.tables.table import Table, text_table
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -77,7 +78,7 @@ def _fetched(dataset: str) -> tuple[float | None, str]:
         if source.group == dataset and source.scenes is not None:
             mean = None if source.n_bytes is None else source.n_bytes / source.scenes.n_scenes
             return mean, f"su3d-bench datasets fetch {source.group}"
-    return None, "see docs/datasets.md"
+    return None, f"see {documentation('datasets')}"
 
 
 def _data(run: RecipeRun) -> Iterator[Need]:

@@ -1,22 +1,25 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from email import message_from_string
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fuzz_words import verbs
-from places import SCENES
+from places import ROOT, SCENES
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.output import answer_either, file_name_of, file_name_of_scene
 from su3d_bench.core.errors import EXIT_INTERNAL, ConfigError
+from su3d_bench.core.version import documentation
 from su3d_bench.reports.pictures import maps
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -353,3 +356,52 @@ def test_undefined_number_is_null_in_json(capsys: pytest.CaptureFixture[str]) ->
     arguments = argparse.Namespace(json=True, json_file=None)
     answer_either(arguments, {"x": [float("nan"), (float("inf"), 1.5)]}, "words")
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"x": [None, [None, 1.5]]}
+
+
+def test_data_option_replaces_the_environment_variable_for_workers_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "other"))
+    (tmp_path / "here").mkdir()
+    assert main(["datasets", "list", "--data", "here", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["data_root"] == os.environ["SU3D_DATA"] == str(tmp_path / "here")
+    for words in (["run", "--scenes", "replica/*"], ["evaluate", "here"], ["datasets", "check", "replica/*"]):
+        assert main([*words, "--data", "nowhere"]) == 2
+        error = capsys.readouterr().err
+        assert "--data nowhere: no such folder" in error and error.count("\n") == 1
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "nowhere"))
+    for words in (["run", "--scenes", "replica/room0"], ["datasets", "check", "replica/room0"]):
+        assert main(words) == 2
+        assert f"no scene in {tmp_path / 'nowhere'} (there is no such folder)" in capsys.readouterr().err
+
+
+def test_messages_name_pages_of_the_documentation_not_files_of_the_repository() -> None:
+    named = re.compile(r"\bdocs/[\w/-]+\.md")
+    for file in (
+        file for name in ("su3d_bench", "datasets", "baselines", "reports") for file in (ROOT / name).rglob("*")
+    ):
+        if file.suffix == ".py":
+            tree = ast.parse(file.read_text())
+            described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+            texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in described]
+            assert not [node.value for node in texts if named.search(str(node.value))], file
+        elif file.parent.name == "templates" or file.suffix in (".js", ".html"):
+            assert file.is_dir() or not named.search(file.read_text()), file
+
+
+@pytest.mark.parametrize(
+    ("fields", "place"),
+    [("", "page a/b of the documentation"), ("Project-URL: Documentation, https://x.org/y/\n", "https://x.org/y/a/b/")],
+)
+def test_address_of_the_documentation_is_that_of_the_package(
+    fields: str, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.metadata.metadata", lambda name: message_from_string(fields))
+    assert documentation("a/b") == place
+
+
+def test_other_systems_are_refused_in_one_line() -> None:
+    code = "import sys; sys.platform = 'win32'; import su3d_bench"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == "su3d-bench: needs Linux or macOS; on Windows use WSL\n"
