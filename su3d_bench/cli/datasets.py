@@ -33,6 +33,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(actions, "show", call_show)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
+    parser.shared("--width")
     parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, resumes=True)

@@ -40,7 +40,7 @@ def add_parser(verbs: Verbs) -> None:
         "run to score under both, to show the effect of each rule",
     )
     parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --prediction)")
-    parser.shared("--jobs", "--format")
+    parser.shared("--width", "--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol P", "protocol, or .toml file", required=True)
     parser.option("--encoder E", "embedded, or from models list (default: the protocol's)")
@@ -122,8 +122,8 @@ def call_diff(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot is slower than the tables
-        draw_walk(value, arguments.out)
-        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
+        caption = draw_walk(value, arguments.out, arguments.width)
+        remark(f"plot: {arguments.out}: {caption}", quiet=arguments.quiet)
 
 
 def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:
