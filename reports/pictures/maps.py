@@ -16,7 +16,7 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.reports.pictures import canvas
-from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
+from su3d_bench.reports.pictures.items import OUTLINE, draw_outline, png_bytes
 
 PALE_GREY = 232
 RENDERED = 1.5  # render scale; a room fills only a part of a corner view
@@ -128,6 +128,7 @@ def pale(colours: UInt8Array, share: float) -> UInt8Array:
 
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
+THUMBNAIL = (240, 180)  # pixels
 DRAWN_SPACING_M = 0.015  # one point per cell of this size is drawn
 SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps between surface points up to two cells apart
 LEGEND_STEP, COLUMN_WIDTH, MAX_COLUMNS = 22, 250, 10  # pixels; layout of the legend
@@ -183,6 +184,18 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
 
 
 @canvas.figure_style()
+def thumbnail(prediction: Prediction) -> bytes | None:
+    """Return a small PNG of a map from one corner, in the colours of its classes; None without instances."""
+    if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
+        return None
+    cloud, names = thinned(map_cloud(prediction)), names_of(prediction)
+    camera = canvas.view_cameras(canvas.room_bounds(cloud.points), *THUMBNAIL)[1]
+    palette = canvas.class_colours(names)
+    colours = [palette[name] for name in names] if any(names) else canvas.instance_colours(names)
+    (picture,) = _paint([canvas.render(cloud.points, SQUARE_M, camera)], cloud, colours)
+    return png_bytes(picture)
+
+
 def draw_heat_map(
     instances: Instances, similarity: Float64Array, path: Path, caption: str, top: Sequence[str],
     width: canvas.Width = "17cm",

@@ -46,10 +46,6 @@ LEGEND_COLUMNS, HANDLE_LETTERS = 3, 7
 MIB = 2**20
 NARROW, WIDE = 6, 60  # ratio of axis limits below and above which 1, 2, 5 per decade are too few and too many ticks
 POINTS, UPDATES = "number of map points", "number of updates"
-MAX_NAMES = 3  # method names; more are counted
-
-
-Captioned = tuple["Figure", str]
 
 
 @figure_style()
@@ -59,8 +55,8 @@ def draw_timing(
     warm_up: int,
     folder: Path,
     width: Width = "17cm",
-) -> dict[Path, str]:
-    """Write the plots as PNG and PDF and return their paths and captions.
+) -> list[Path]:
+    """Write the plots as PNG and PDF and return their paths.
 
     ``update-cost`` over map points, ``update-course`` over updates, ``memory``, ``stages`` and, if intermediate maps
     were scored, ``anytime``.
@@ -73,13 +69,10 @@ def draw_timing(
     }
     if _curves(anytime):
         figures["anytime"] = _anytime(anytime, width)
-    captions = dict[Path, str]()
-    for name, (figure, caption) in figures.items():
-        for kind in ("png", "pdf"):
-            path = folder / f"{name}.{kind}"
-            write_figure(figure, path, caption)
-            captions[path] = caption
-    return captions
+    paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}
+    for path, figure in paths.items():
+        write_figure(figure, path)
+    return list(paths)
 
 
 def _figure(width: Width, *panels_in: float) -> tuple[Figure, list[Axes]]:
@@ -104,8 +97,7 @@ def _style(index: int) -> dict[str, Any]:
 @figure_style()
 def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
     """Return the plot of update time over map points, as a ``png`` or ``pdf`` file."""
-    figure, caption = _update_cost(times, warm_up, POINTS, "17cm")
-    return figure_bytes(figure, kind, caption)
+    return figure_bytes(_update_cost(times, warm_up, POINTS, "17cm"), kind)
 
 
 def _label(method: str, run: str, several_runs: bool) -> str:
@@ -125,13 +117,12 @@ def _sizes(scene: UpdateTimes, against: str, warm_up: int) -> Float64Array | Non
     return scene.columns["n_points"][warm_up:] if "n_points" in scene.columns else None
 
 
-def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: str, width: Width) -> Captioned:
+def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: str, width: Width) -> Figure:
     """Plot the time per update without perception over the size ``against``, on log-log axes.
 
     Each update is a dot; a method's line connects the medians of updates of similar size.
     """
     figure, (axes,) = _figure(width, 2.2 + (2 if width == "8cm" else 1) * LINE_IN * len(times))
-    found: dict[str, list[str]] = {}
     for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
         sized = [(scene, size) for scene in of_method if (size := _sizes(scene, against, warm_up)) is not None]
         sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
@@ -141,7 +132,6 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
             continue
         growth = growth_exponent(sizes, costs)
         if growth is not None:
-            found.setdefault(growth.words, []).append(label)
             label += f": slope {growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}]"
         sizes, costs, style = sizes[usable], costs[usable], _style(index)
         step = 1 + len(sizes) // MAX_DRAWN
@@ -152,28 +142,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
     _number_by_1_2_5(axes.yaxis)
     axes.grid(True, which="major")
     _one_legend(figure, [axes])
-    return figure, cost_sentence(found, against)
-
-
-def cost_sentence(found: Mapping[str, Sequence[str]], against: str) -> str:
-    """Return the sentence on the growth of all methods; ``found``: words of the growth -> methods.
-
-    >>> cost_sentence({"grows": ["a", "b"], "constant per update": ["c"]}, POINTS)
-    'Time per update over map points: grows for a and b; constant for c'
-    """
-    verbs = {"grows": "grows for", "constant per update": "constant for", "not settled": "growth undetermined for"}
-    parts = [f"{words} {_listed(found[kind])}" for kind, words in verbs.items() if kind in found]
-    with_what = "Time per update over map points" if against == POINTS else "Time per update over updates"
-    if not parts:
-        return f"{with_what}: growth unknown (too few updates or too similar sizes)"
-    return f"{with_what}: {'; '.join(parts)}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Return the names as a list in words, or their number if there are many."""
-    if len(names) > MAX_NAMES:
-        return f"{len(names)} methods"
-    return " and ".join([*([", ".join(names[:-1])] if len(names) > 1 else []), names[-1]])
+    return figure
 
 
 def _number_by_1_2_5(axis: Axis) -> None:
@@ -189,11 +158,10 @@ def _number_by_1_2_5(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _draw_medians(axes: Axes, sizes: Float64Array, values: Float64Array, label: str, style: Mapping[str, Any]) -> float:
-    """Draw a method's line through the medians of similar sizes and return the largest median."""
+def _draw_medians(axes: Axes, sizes: Float64Array, values: Float64Array, label: str, style: Mapping[str, Any]) -> None:
+    """Draw a method's line through the medians of similar sizes."""
     x, y = medians_by_size(sizes, values)
     axes.plot(x, y, markerfacecolor="white", label=label, **style)
-    return float(y.max())
 
 
 def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -205,7 +173,7 @@ def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Ar
     return x, y
 
 
-def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int, width: Width) -> Captioned:
+def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int, width: Width) -> Figure:
     """Plot the mean update time of each method, stacked by stage."""
     labels = _labels(times)
     stages = list(dict.fromkeys(stage for of_method in times for scene in of_method for stage in scene.stages))
@@ -213,7 +181,6 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int, width: Width) 
     figure, (axes,) = _figure(width, 0.7 + 2.2 * LINE_IN * len(times) + LINE_IN * -(-len(stages) // columns))
     left = np.zeros(len(times))
     rows = np.arange(len(times))
-    shares: dict[str, Float64Array] = {}
     for index, stage in enumerate(stages):
         steady = [pooled(of_method, stage, warm_up) for of_method in times]
         widths = np.array([values.mean() if len(values) else 0.0 for values in steady])
@@ -221,45 +188,14 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int, width: Width) 
         style: dict[str, Any] = {"hatch": hatch, "color": COLOURS[index % len(COLOURS)]}
         axes.barh(rows, widths, left=left, edgecolor="white", label=stage, **style)
         left += widths
-        shares[stage] = widths
     axes.set_yticks(rows, [fitted(label, 0.3 * WIDTHS_IN[width]) for label in labels])
     axes.invert_yaxis()
     axes.set_xlabel("mean ms per update")
     figure.legend(loc="outside lower center", ncols=columns, frameon=False)
-    return figure, stages_sentence(labels, shares)
+    return figure
 
 
-def stages_sentence(labels: Sequence[str], shares: Mapping[str, Float64Array]) -> str:
-    """Return the sentence on the slowest stages; ``shares``: stage -> mean ms (N,) of N methods.
-
-    >>> stages_sentence(["a"], {"segment": np.array([75.0]), "match": np.array([25.0])})
-    'Most of the update time of a is segment: 75 % of 100 ms'
-    """
-    total = np.sum([*shares.values()], axis=0) if shares else np.zeros(0)
-    if not np.any(total):
-        return "No update times were measured"
-    largest = [max(shares, key=lambda stage: shares[stage][row]) for row in range(len(labels))]
-    if len(labels) == 1:
-        share = 100 * shares[largest[0]][0] / total[0]
-        most = "Most" if share > 50 else "The largest part"
-        return f"{most} of the update time of {labels[0]} is {largest[0]}: {share:.0f} % of {_rounded(total[0])} ms"
-    slow, fast = int(np.argmax(total)), int(np.argmin(total))
-    slowest, fastest = (f"{_rounded(total[row])} ms ({labels[row]}, mostly {largest[row]})" for row in (slow, fast))
-    return f"Mean update: {fastest}; {slowest}"
-
-
-def _rounded(value: float) -> str:
-    """Format with three significant digits, without an exponent.
-
-    >>> _rounded(12345.6), _rounded(4.5678), _rounded(0.00001)
-    ('12,346', '4.57', 'under 0.001')
-    """
-    if value >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.3g}" if value >= 0.001 else "under 0.001"
-
-
-def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Captioned:
+def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Figure:
     """Plot MiB of the map over its points, if recorded, and MiB of the process over updates.
 
     Medians over the scenes.
@@ -267,9 +203,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Captioned:
     timed = {column for of_method in times for scene in of_method for column in scene.columns}
     drawn = [("map_bytes", POINTS)] * ("map_bytes" in timed) + [("rss_bytes", UPDATES)]
     figure, panels = _figure(width, *[2.2 + LINE_IN * len(times) / len(drawn)] * len(drawn))
-    sentences = []
     for axes, (column, against) in zip(panels, drawn, strict=True):
-        most: dict[str, float] = {}
         for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
             counted = [scene for scene in of_method if column in scene.columns]
             sized = [(scene, size) for scene in counted if (size := _sizes(scene, against, 0)) is not None]
@@ -277,29 +211,15 @@ def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Captioned:
             values = np.concatenate([scene.columns[column] for scene, _ in sized] or [np.zeros(0)])
             if not (sizes > 0).any():
                 continue
-            most[label] = _draw_medians(axes, sizes[sizes > 0], values[sizes > 0] / MIB, label, _style(index))
+            _draw_medians(axes, sizes[sizes > 0], values[sizes > 0] / MIB, label, _style(index))
         what = "the map" if column == "map_bytes" else "the process"
         axes.margins(y=0.12)  # do not cut the markers at the top
         axes.set(xscale="log", xlabel=against, ylabel=f"memory of {what} (MiB)")
         axes.set_ylim(bottom=0)
-        sentences.append(memory_sentence(most, what))
         _number_by_1_2_5(axes.xaxis)
         axes.grid(True, which="major")
     _one_legend(figure, panels)
-    return figure, ". ".join(sentences)
-
-
-def memory_sentence(most: Mapping[str, float], what: str) -> str:
-    """Return the sentence on peak memory; ``most``: method -> largest median in MiB.
-
-    >>> memory_sentence({"a": 210.4, "b": 95.0}, "the map")
-    'Peak memory of the map: 210 MiB (a), 95 MiB (b)'
-    """
-    if not most:
-        return f"No method recorded the memory of {what}"
-    high, low = max(most, key=most.__getitem__), min(most, key=most.__getitem__)
-    text = f"Peak memory of {what}: {_rounded(most[high])} MiB ({high})"
-    return text if high == low else f"{text}, {_rounded(most[low])} MiB ({low})"
+    return figure
 
 
 def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
@@ -329,40 +249,22 @@ def _curves(points: Sequence[AnytimePoint]) -> list[tuple[str, str]]:
     return list(dict.fromkeys(defined))
 
 
-def _anytime(points: Sequence[AnytimePoint], width: Width) -> Captioned:
+def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
     """Plot each headline metric of each protocol over the seconds until the map was available."""
     panels = _curves(points)
     figure, all_axes = _figure(width, *[2.2] * len(panels))
-    sentences = []
     several = len({point.run for point in points}) > 1
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
         curves = dict.fromkeys((point.run, point.method) for point in points)
-        best: dict[str, float] = {}
         for index, (run, method) in enumerate(curves):
             mine = [point for point in points if (point.run, point.method, point.protocol) == (run, method, protocol)]
             values = [100.0 * value if (value := point.metrics.get(name)) is not None else np.nan for point in mine]
             label = _label(method, run, several)
-            if np.isfinite(values).any():
-                best[label] = float(np.asarray(values)[np.isfinite(values)][-1])
             axes.plot([point.seconds for point in mine], values, label=label, **_style(index))
         axes.set(xlabel="seconds until the map was available", ylabel=f"{protocol}: {name} (%)")
-        sentences.append(anytime_sentence(protocol, name, best))
         axes.grid(True)
     _one_legend(figure, all_axes)
-    return figure, ". ".join(sentences)
-
-
-def anytime_sentence(protocol: str, metric: str, last: Mapping[str, float]) -> str:
-    """Return the sentence on the final values of a metric; ``last``: method -> last value.
-
-    >>> anytime_sentence("rooms-instance", "AP", {"a": 41.0, "b": 12.5})
-    'rooms-instance: final AP is highest for a (41.0 %)'
-    """
-    highest = max(last.values())
-    best = _listed([name for name, value in last.items() if value == highest])
-    if len(last) == 1:
-        return f"{protocol}: final {metric} of {best} is {highest:.1f} %"
-    return f"{protocol}: final {metric} is highest for {best} ({highest:.1f} %)"
+    return figure
 
 
 # Shades and hatches distinguish the bars in black and white.

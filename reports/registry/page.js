@@ -42,6 +42,10 @@ function bestOf(rows, value) {
   return numbers.some((one) => one < most) ? most : null;
 }
 
+const pictureOf = (row) => (!row.picture ? null : h('img', { class: 'map', width: 120, height: 90, alt: `Map of ${row.method}`,
+  src: `data:image/png;base64,${DATA.pictures[row.picture]}` }));
+const authorsOf = (row) => (row.link
+  ? h('a', { href: row.link, rel: 'noreferrer', 'aria-label': `${row.method}: ${row.authors}` }, row.authors) : row.authors);
 const words = (label, value, more = {}) => ({ label, value, words: true, ...more });
 
 function headlineColumns(board, valueOf, withIntervals) {
@@ -67,13 +71,15 @@ function table(caption, columns, rows) {
 function boardTable(board, rows) {
   const metrics = headlineColumns(board, (row, k) => row.values[k], true);
   return table(`${scenesText(board)}; per cent with the 95 % confidence interval over scenes, best in bold`, [
-    { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
+    { label: 'Method', value: (row) => row.method, show: (row) => [pictureOf(row), link(row.page, row.method)] },
     { label: 'Rank', title: 'Simultaneous 95 % rank interval', num: true,
       value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null), show: ranksText },
     ...metrics,
     { label: 'Time per frame, as submitted', title: 'Median time per processed frame, not measured again; in brackets without perception', num: true,
       value: (row) => row.update_s,
       show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
+    words('Authors', (row) => row.authors, { show: authorsOf }),
+    { label: 'Date', value: (row) => row.date || null },
     words('Hardware', (row) => shortHardware(row)),
     words('Weights trained on', (row) => row.trained_on),
     { label: 'Perception profile', value: (row) => row.profile },
@@ -128,7 +134,7 @@ function indexPage() {
     return { made, place };
   });
   const says = (row, board) => [board.protocol, board.summary, ...board.scenes, row.method, row.hardware, row.trained_on,
-    row.profile, row.encoder, row.command, row.bundle.file, row.bundle.sha256, row.caveat].join('\n').toLowerCase();
+    row.profile, row.encoder, row.authors, row.command, row.bundle.file, row.bundle.sha256, row.caveat].join('\n').toLowerCase();
   function draw() {
     let n = 0;
     DATA.boards.forEach((board, k) => {
@@ -168,7 +174,8 @@ function methodPage() {
     section(id, board.protocol,
       intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
       h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),
-      facts([
+      pictureOf(row), facts([
+        ['Authors', authorsOf(row)], ['Date', row.date],
         ['Time per frame, as submitted', isNumber(row.update_s)
           ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception (median of ${plural(row.n_updates, 'frame')}, `
             + 'excluding the first of each scene)' : 'not measured'],

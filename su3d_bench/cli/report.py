@@ -138,10 +138,9 @@ def call_timing(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / "timing.md", markdown(tables))
     write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
     write_text(arguments.out / "methods.csv", methods_csv(summaries, hardware, arguments.camera_rate))
-    captions = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
+    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
     files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
-    remark(*(f"wrote {path}" for path in files), quiet=arguments.quiet)
-    remark(*(f"wrote {path}: {caption}" for path, caption in captions.items()), quiet=arguments.quiet)
+    remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
 
 FORMATS = ("csv", "parquet")
