@@ -26,7 +26,7 @@ from su3d_bench.core.errors import DataError, PredictionError, shown
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.maps import Masks, Proposals
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Surface
-from su3d_bench.metrics.matching.nearest import transfer_masks
+from su3d_bench.metrics.matching.transfer import transfer_masks
 from su3d_bench.predictions.base import VertexMasks
 
 NOISE = -1
