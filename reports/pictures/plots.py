@@ -277,8 +277,8 @@ Bar = tuple[str, float, str, str]  # name, length, style, label
 
 
 @figure_style()
-def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = "17cm") -> str:
-    """Write the plot as PDF, PNG or SVG and return its caption: one panel per protocol and metric."""
+def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = "17cm") -> None:
+    """Write the plot as PDF, PNG or SVG: one panel per protocol and metric, the most costly error first."""
     panels = [(protocol, metric) for protocol in attribution["protocols"] for metric in protocol["values"]]
     figure, all_axes = _figure(width, *(0.7 + 2.2 * LINE_IN * len(_bars(*panel)) for panel in panels))
     for axes, (protocol, metric) in zip(all_axes, panels, strict=True):
@@ -288,7 +288,6 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = 
         "corrected, most costly first; hatched: what no single correction recovers; dotted: stages from ground truth"
     )
     write_figure(figure, path, caption)
-    return caption
 
 
 def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
@@ -335,8 +334,8 @@ def _without_frame(axes: Any, label: str) -> None:
 
 
 @figure_style()
-def draw_walk(apart: Mapping[str, Any], path: Path, width: Width = "17cm") -> str:
-    """Write the plot as PDF, PNG or SVG and return its caption.
+def draw_walk(apart: Mapping[str, Any], path: Path, width: Width = "17cm") -> None:
+    """Write the plot as PDF, PNG or SVG.
 
     One panel per metric, from the first protocol (top) to the second (bottom).
     """
@@ -347,7 +346,6 @@ def draw_walk(apart: Mapping[str, Any], path: Path, width: Width = "17cm") -> st
         _draw_shift(axes, apart, name, WIDTHS_IN[width] / min(len(names), PANELS_PER_ROW[width]))
     caption = f"Scores of {walk['method']} in {walk['run']} from {apart['first']} to {apart['second']}, rule by rule"
     write_figure(figure, path, caption)
-    return caption
 
 
 def _draw_shift(axes: Any, apart: Mapping[str, Any], name: str, width_in: float) -> None:

@@ -119,8 +119,8 @@ def call_diff(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot is slower than the tables
-        caption = draw_walk(value, arguments.out, arguments.width)
-        remark(f"plot: {arguments.out}: {caption}", quiet=arguments.quiet)
+        draw_walk(value, arguments.out, arguments.width)
+        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 
 def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:

@@ -241,8 +241,8 @@ def call_attribution(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_attribution
 
         output.show()  # the plot is slower than the answer
-        caption = draw_attribution(attribution, arguments.out, arguments.width)
-        remark(f"plot: {arguments.out}: {caption}", quiet=arguments.quiet)
+        draw_attribution(attribution, arguments.out, arguments.width)
+        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 
 def _add_power(verbs: Verbs) -> None:
