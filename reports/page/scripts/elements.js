@@ -60,7 +60,7 @@ function save(name, url) {
   h('a', { href: url, download: name }).click();
 }
 function downloadButton(what, title, make) {
-  return h('p', { class: 'get' }, h('button', { type: 'button', 'aria-label': `Download ${what}: ${title}`,
+  return h('p', { class: 'get' }, h('button', { type: 'button', class: 'download', 'aria-label': `Download ${what}: ${title}`,
     onclick: make }, `Download ${what}`));
 }
 function csvButton(title, lines) {
