@@ -59,7 +59,7 @@ def draw_grid(
     width_in = canvas.WIDTHS_IN[width]
     cell_in = (width_in - GAP_IN * (side_by_side - 1)) / side_by_side
     picture_in, line_in = cell_in * aspect, canvas.LINE_IN
-    letters = int(width_in * canvas.LETTERS_PER_INCH)
+    letters = int(0.88 * width_in * canvas.LETTERS_PER_INCH)  # bold ones are wider
     placed: list[tuple[float, float, str, dict[str, Any]]] = []  # x, y, text and style
     pictures: list[tuple[float, float, Cell]] = []
     y = 0.02
@@ -67,7 +67,7 @@ def draw_grid(
         title = textwrap.wrap(canvas.drawable(printable(row.title)), letters, max_lines=3, placeholder=" ...")
         placed += [(0.0, y + line_in * k, line, {"colour": INK, "weight": "bold"}) for k, line in enumerate(title)]
         note = printable(row.note, 60)
-        if len(title) == 1 and len(title[0]) + len(note) < 0.9 * letters:  # bold letters are wider
+        if len(title) == 1 and len(title[0]) + len(note) < letters:
             placed.append((width_in - 0.03, y, note, {"colour": SOFT_INK, "ha": "right"}))
         y += line_in * len(title)
         heading_in = line_in if row is rows[0] or side_by_side < len(columns) else 0.0

@@ -76,7 +76,7 @@ function csvButton(title, lines) {
 // A box that scrolls sideways, with a line above it where it does.
 const overflowing = new ResizeObserver((entries) => {
   for (const box of new Set(entries.map((one) => one.target.closest('.wide')))) {
-    if (box) box.previousElementSibling.hidden = box.scrollWidth <= box.clientWidth + 1;
+    if (box?.isConnected) box.previousElementSibling.hidden = box.scrollWidth <= box.clientWidth + 1;
   }
 });
 function scrollBox(label, node, classes = 'wide') {
