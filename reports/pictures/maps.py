@@ -183,7 +183,6 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     return [instances, classes]
 
 
-@canvas.figure_style()
 def thumbnail(prediction: Prediction) -> bytes | None:
     """Return a small PNG of a map from one corner, in the colours of its classes; None without instances."""
     if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
@@ -196,6 +195,7 @@ def thumbnail(prediction: Prediction) -> bytes | None:
     return png_bytes(picture)
 
 
+@canvas.figure_style()
 def draw_heat_map(
     instances: Instances, similarity: Float64Array, path: Path, caption: str, top: Sequence[str],
     width: canvas.Width = "17cm",
