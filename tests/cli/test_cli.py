@@ -318,9 +318,9 @@ def test_every_figure_has_its_printed_width_and_8_pt_type(width_cm: int, capsys:
         f"datasets show {PAINTED}/a",
         "report attribution runs/one",
         "protocols diff rooms-semantic replica-mesh-ex6 --run runs/one",
-        "sheets pictures runs/one --queries sofa",
+        "sheets pictures runs/one --texts sofa",
         "sheets pictures runs/one --draw labels",
-        "sheets pictures runs/one --draw reasoning --queries 'How many chairs are there?'",
+        "sheets pictures runs/one --draw reasoning --texts 'How many chairs are there?'",
     ):
         assert main([*shlex.split(words), "--out", "figure.svg", "--width", f"{width_cm}cm", "--quiet"]) == 0, words
         text = Path("figure.svg").read_text(encoding="utf-8")
