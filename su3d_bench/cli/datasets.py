@@ -33,6 +33,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(actions, "show", call_show, data=True)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
+    parser.shared("--width")
     parser.option("--stride N", "use every Nth frame (default: 48 frames in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, resumes=True)

@@ -178,7 +178,7 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.registry import read_registry
     from su3d_bench.reproducing.registry_site import TITLE, write_site
 
-    registry = read_registry(arguments.folder)
+    registry = read_registry(arguments.folder, with_pictures=True)
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
     pages = write_site(registry, arguments.out, title, arguments.bundle_url)
     refused = [f"excluded: {one.run}, {one.what}: {one.reason}" for one in registry.refused]

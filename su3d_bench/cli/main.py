@@ -93,6 +93,7 @@ def _exit_code(words: Sequence[str]) -> int:
         arguments = parser.parse_args(words)
         if "call" not in arguments:  # a group of commands without a command
             arguments = parser.parse_args([*words, arguments.without_command])
+        arguments.words = words
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
         if data := getattr(arguments, "data", None):

@@ -234,6 +234,12 @@ SHARED: dict[str, dict[str, Any]] = dict(
             dest="table_format",
             choices=TABLE_FORMATS,
         ),
+        option(
+            "--width",
+            "printed width of the figure, with 8 pt type: one or two columns of a paper (default: 17cm)",
+            choices=("8cm", "17cm"),
+            default="17cm",
+        ),
         option("--seed N", "random seed (default: 0)", type=index, default=0),
         option("--limit N", "process only the first N frames of each scene (results are marked partial)", type=int),
         option(

@@ -103,7 +103,7 @@ def _add_timing(verbs: Verbs) -> None:
     parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
     parser.option("--camera-rate HZ", "frame rate, for the real-time factor (default: 30)", type=positive, default=30.0)
     parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots", type=output_path)
-    parser.shared("--format")
+    parser.shared("--width", "--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> None:
@@ -141,7 +141,7 @@ def call_timing(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / "timing.md", markdown(tables))
     write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
     write_text(arguments.out / "methods.csv", methods_csv(summaries, hardware, arguments.camera_rate))
-    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out)
+    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
     files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
     remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
@@ -247,7 +247,7 @@ def _add_attribution(verbs: Verbs) -> None:
     parser.shared("--protocols")
     parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
     parser.option("--out FIGURE", ".pdf, .png or .svg plot to write")
-    parser.shared("--format")
+    parser.shared("--width", "--format")
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
@@ -266,7 +266,7 @@ def call_attribution(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_attribution
 
         output.show()  # the plot is slower than the answer
-        draw_attribution(attribution, arguments.out)
+        draw_attribution(attribution, arguments.out, arguments.width)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 

@@ -148,7 +148,7 @@ def show(arguments: argparse.Namespace) -> None:
     path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
-        draw_scene_picture(look, path)
+        draw_scene_picture(look, path, arguments.width)
     table = {
         "scene": name,
         "picture": str(path),

@@ -168,6 +168,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser = add_verb(verbs, "pictures", call_pictures, data=True)
     parser.shared("run")
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
+    parser.shared("--width")
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--texts TEXT...", "texts to compare with maps (or questions to answer)", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
@@ -227,6 +228,6 @@ def call_pictures(arguments: argparse.Namespace) -> None:
             output.remark_unseen(encoder, text, quiet=arguments.quiet)
         rows = figures.similarity(texts, encoder, arguments.colours)
         scale = scale_stops(arguments.colours)
-    draw_grid(arguments.out, columns, rows, scale)
+    draw_grid(arguments.out, columns, rows, scale, arguments.width)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
     output.answer_either(arguments, value, str(arguments.out))

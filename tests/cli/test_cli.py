@@ -405,3 +405,27 @@ def test_other_systems_are_refused_in_one_line() -> None:
     code = "import sys; sys.platform = 'win32'; import su3d_bench"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr == "su3d-bench: needs Linux or macOS; on Windows use WSL\n"
+
+
+@pytest.mark.parametrize("width_cm", [8, 17])
+def test_every_figure_has_its_printed_width_and_8_pt_type(width_cm: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--out", "runs/one"]) == 0
+    for words in (
+        "query text painted/a sofa --run runs/one --method collector",
+        "query ask painted/a 'How many chairs are there?' --run runs/one --method collector",
+        f"datasets show {PAINTED}/a",
+        "report attribution runs/one",
+        "protocols diff rooms-semantic replica-mesh-ex6 --run runs/one",
+        "sheets pictures runs/one --texts sofa",
+        "sheets pictures runs/one --draw labels",
+        "sheets pictures runs/one --draw reasoning --texts 'How many chairs are there?'",
+    ):
+        assert main([*shlex.split(words), "--out", "figure.svg", "--width", f"{width_cm}cm", "--quiet"]) == 0, words
+        text = Path("figure.svg").read_text(encoding="utf-8")
+        (width_pt,) = re.findall(r'<svg [^>]*width="([0-9.]+)pt"', text)
+        assert float(width_pt) == pytest.approx(width_cm / 2.54 * 72, abs=0.1), words
+        sizes = set(re.findall(r"font(?:-size)?: (?:[a-z0-9]+ )?([0-9.]+)px", text))
+        assert sizes <= {"8", "12"} and "8" in sizes, words  # 12: coloured squares of a legend
+        Path("figure.svg").unlink()
+    assert main(["query", "text", "painted/a", "sofa", "--width", "9cm"]) == 2
+    assert "unknown --width '9cm'" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, look_at
+from su3d_bench.reports.pictures.scene import draw_scene_picture, look_at
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_picture_shows_frames_classes_and_trajectory(whole: Path, tmp_path: Path
     draw_scene_picture(look_at(Replica(whole), "room0"), tmp_path / "new" / "room0.png")
     picture = pixels(tmp_path / "new" / "room0.png")
     height, width = picture.shape[:2]
-    assert width == WIDTH and 900 < height < 1400
+    assert width == 2007 and 900 < height < 1500  # 17 cm at 300 dpi
     assert n_near(picture, (0xD6, 0x24, 0x6E)) > 300  # the trajectory
     assert n_near(picture, (0x1A, 0x98, 0x50)) > 30  # its start
     assert sum(n_near(picture, rgb) > 1000 for rgb in COLOURS) >= 4  # the frames
@@ -82,7 +82,7 @@ def test_command_writes_the_picture_and_prints_counts(capsys: pytest.CaptureFixt
     assert lines[0].startswith("replica/room0: 12 frames of 48x36 · depth 1.")
     assert lines[0].endswith("6 objects of 3 classes · 23,600 ground-truth points (mesh-vertices)")
     assert lines[1] == "picture: replica-room0.png"
-    assert pixels(Path("replica-room0.png")).shape[1] == WIDTH
+    assert pixels(Path("replica-room0.png")).shape[1] == 2007
 
 
 def test_scan_without_recording_shows_its_ground_truth_or_mesh(
