@@ -34,7 +34,9 @@ def _add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns (default: 'rooms/*')")
-    parser.option("--protocols PROTOCOL...", "protocols to score (default: those of the dataset)")
+    headline = "protocols to score (default: the dataset's headline protocol)"
+    parser.option("--protocols PROTOCOL...", headline, action="extend")
+    parser.shared("--all-protocols")
     parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)

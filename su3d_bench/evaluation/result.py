@@ -26,7 +26,8 @@ class Request:
     """What to score: ``predictions`` are folders or files; everything else is optional.
 
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
-    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default all that fit.
+    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default the dataset's headline
+    protocol if it fits, otherwise all that fit (as with "all").
     ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
     the values in the files ("file"); None: those in the files for the formats of ScanNet's and MaskClustering's
     scripts, as these do, and the protocol's rule for all others. ``queries``: a file of texts and the objects that they
