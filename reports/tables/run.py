@@ -154,8 +154,8 @@ MAX_SCENES = 20  # named per line
 MAX_NOTES = 12  # printed warnings of a method; the file has all
 MEAN, POOLED, EVERY_CLASS = "mean over scenes", "all scenes pooled", "each mask under each class"
 NOTE_OF_MEAN = (
-    "values over all scenes pool the counts of the scenes (for AP, detections are ranked together); the mean over scenes "
-    "weights each scene equally and averages only over the classes in it, so the two differ"
+    "values over all scenes pool their counts (for AP, the detections of all scenes are ranked together); the mean "
+    "over scenes weights each scene equally and averages over the classes in it, so the two differ"
 )
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}  # prefix of metric names -> row label
 
@@ -228,7 +228,9 @@ def _protocol_table(
         notes += [NOTE_OF_MEAN] if {MEAN, POOLED} & details.keys() and NOTE_OF_MEAN not in notes else []
     body += _cheap_rows(rows, names, len(header))
     notes += [line for row in rows for line in _notes(row)]
-    notes += [f"{method}: {line}" for method, one in scored.items() if one for line in _facts_of_files(one)]
+    for method, one in scored.items():
+        whose = f"{method}: " if len(rows) > 1 else ""
+        notes += [f"{whose}{line}" for line in (_facts_of_files(one) if one else ())]
     notes += confidence_notes({str(row["method"]): row.get("confidences") for row in rows})
     own = [row for row in rows if not is_ceiling(str(row["method"]), row["caveat"])]
     notes += label_count_notes({str(row["method"]): row.get("labels") for row in own})
@@ -246,13 +248,14 @@ def _details(
     if result is None or is_ceiling(str(row["method"]), row["caveat"]):
         return {}
     details: dict[str, Mapping[str, Any]] = {}
-    if result["n_scenes"] > 1 and result["scene_mean"] and result["pooled"]:
-        is_pooled = all(result["metrics"].get(name) == result["pooled"].get(name) for name in names)
-        details = {MEAN: result["scene_mean"]} if is_pooled else {POOLED: result["pooled"]}
+    mean, pooled = result.get("scene_mean"), result.get("pooled")
+    if result["n_scenes"] > 1 and mean and pooled:
+        is_pooled = all(result["metrics"].get(name) == pooled.get(name) for name in names)
+        details = {MEAN: mean} if is_pooled else {POOLED: pooled}
     for label, key in (("all confidences 1", "every_confidence_1"), (EVERY_CLASS, "every_mask_every_class")):
         if scored is not None and scored[key] is not None:
             details[label] = {name: scored[key].get(name.lower()) for name in names}
-    return details | result["groups"]
+    return details | result.get("groups", {})
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, frame
-from su3d_bench.api.tables import Names, several
+from su3d_bench.api.tables import Names
+from su3d_bench.core.arguments import several, typed
 
 if TYPE_CHECKING:
     import pandas
 
 
+@typed
 def list_datasets(names: Names = ()) -> pandas.DataFrame:
     """The datasets and their available scenes, one row per scene; a dataset without scenes has one row without a scene.
 
@@ -26,7 +28,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     from su3d_bench.runs.scenes import data_root
 
     rows: list[tuple[object, ...]] = []
-    for one in known_datasets(several(names), data_root()):
+    for one in known_datasets(several("names", names), data_root()):
         rows += [(one["name"], scene["scene"], scene["status"], one["summary"], True) for scene in one["scenes"]]
         if not one["scenes"]:
             rows.append((one["name"], "", one["error"] or "has no scene", one["summary"], False))
@@ -34,6 +36,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     return frame(columns, rows)
 
 
+@typed
 def list_methods() -> pandas.DataFrame:
     """The methods that can be run by name: ``name``, ``summary``, ``paper``, ``source``, ``licence``, ``status`` and
     ``needs``, separated by commas (string, empty for none).
@@ -49,6 +52,7 @@ def list_methods() -> pandas.DataFrame:
     return frame(columns, rows)
 
 
+@typed
 def list_protocols() -> pandas.DataFrame:
     """The built-in protocols: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics, separated by
     commas, ``label_space``, ``original`` (string), ``version`` (int64). ``load_protocol`` returns all rules of one.

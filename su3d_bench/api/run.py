@@ -8,20 +8,31 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from su3d_bench.api.tables import Names, Place, Run, Scores, several
-from su3d_bench.core.errors import ConfigError, RunIncomplete, counted, suggest
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.api.tables import Names, Place, Run, Scores
+from su3d_bench.core import registry
+from su3d_bench.core.arguments import several, typed
+from su3d_bench.core.errors import ConfigError, PredictionError, RunIncomplete, counted, printable, suggest
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 
 if TYPE_CHECKING:
     from su3d_bench.evaluation.result import Confidences, Request, ValuesForm
+    from su3d_bench.predictions.base import Content
     from su3d_bench.runs.executors import Event, Report
-    from su3d_bench.runs.existing import Into
 
 Predictions = Place | Sequence[Place]
+Methods = str | type | Sequence[str | type]
+# One scene's map: as a method returns it; masks (N, M), or (masks, scores, classes), over the N ground-truth points;
+# or the dict of pred_masks, pred_scores and pred_classes of ScanNet's and OpenMask3D's evaluators.
+SceneMap = Prediction | NDArray[Any] | tuple[NDArray[Any] | None, ...] | Mapping[str, NDArray[Any]]
 
 
+@typed
 def run(
     scenes: Names,
-    methods: Names = "opensu3d",
+    methods: Methods = "opensu3d",
     *,
     protocols: Names | None = None,
     profile: str | None = None,
@@ -40,7 +51,8 @@ def run(
 ) -> Run:
     """Run methods over scenes, score their maps, and return the finished run, as ``su3d-bench run``.
 
-    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``settings``
+    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``methods``
+    names or classes (one defined in a notebook or script runs in this process, with ``jobs=1``), ``settings``
     are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as
     ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
     call resumes a run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend``
@@ -64,13 +76,24 @@ def run(
     from su3d_bench.runs.plan import asked_settings, make_plan
     from su3d_bench.runs.runner import run_plan
 
-    chosen: tuple[Into, ...] = ("own", "extend", "replace")
-    if into not in chosen:
-        raise ConfigError(f"run(into={into!r}): expected one of {', '.join(chosen)}")
+    _check_known("run: into", into, ("own", "extend", "replace"))
+    targets = [
+        registry.target_of("method", one) if isinstance(one, type) else one
+        for one in several("methods", methods, str | type)
+    ]
+    here = [one for one in targets if ":" in one and ".py:" not in one and not registry.is_importable(one)]
+    if here:
+        if jobs not in (None, 1) or more.get("executor", "inline") not in ("auto", "inline"):
+            name = here[0].rpartition(":")[2]
+            raise ConfigError(
+                f"run: {name} is defined in this session, and other processes cannot import it; use jobs=1, or save it "
+                f"in a file and pass 'file.py:{name}'"
+            )
+        jobs = 1
     values = {
-        "scenes": list(several(scenes)),
-        "methods": list(several(methods)),
-        "protocols": None if protocols is None else list(several(protocols)),
+        "scenes": list(several("scenes", scenes)),
+        "methods": targets,
+        "protocols": None if protocols is None else list(several("protocols", protocols)),
         "profile": profile,
         "stride": stride,
         "seed": seed,
@@ -123,7 +146,7 @@ def _script_kept_out_of_workers() -> Iterator[None]:
 
 @overload
 def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
+    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
     *,
     dataset: str | None = ...,
     ground_truth: Place | None = ...,
@@ -140,7 +163,7 @@ def evaluate(
 
 @overload
 def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
+    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
     *,
     dataset: str | None = ...,
     ground_truth: Place | None = ...,
@@ -155,8 +178,9 @@ def evaluate(
 ) -> Run: ...
 
 
+@typed
 def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
+    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
     *,
     dataset: str | None = None,
     ground_truth: Place | None = None,
@@ -171,9 +195,11 @@ def evaluate(
 ) -> Scores | Run:
     """Score existing predictions with every protocol that fits, as ``su3d-bench evaluate``.
 
-    ``predictions`` is a folder, a file or several of them, or for several methods a mapping
-    ``{"mine": folder, "theirs": folder}``. The keywords are the options of the command. Returns the numbers; with
-    ``out`` they are written there and returned as a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
+    ``predictions`` is a folder, a file or several of them; or for each scene its map, ``{"scene0011_00": map}``: as a
+    method returns it, or ``(masks, scores, classes)`` with masks (N, M) over the N ground-truth points, M scores and M
+    class ids. For several methods it is a mapping, ``{"mine": folder, "theirs": folder}``. The keywords are the
+    options of the command. Returns the numbers; with ``out`` they are written there and returned as a ``Run``, which
+    also has ``instances``, ``errors`` and ``compare``.
 
     Raises ``PredictionError`` for predictions that cannot be scored, ``DataError`` for missing ground truth,
     ``ConfigError`` for an invalid request, ``StoreError`` if ``out`` contains another run.
@@ -189,28 +215,33 @@ def evaluate(
     from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.result import Request, default_name
     from su3d_bench.evaluation.run_output import evaluate_methods
+    from su3d_bench.predictions.formats import IN_MEMORY
 
-    _check_known("ground_truth_values", ground_truth_values, ("classes", "instances", "numbers"))
-    _check_known("confidences", confidences, ("protocol", "file"))
+    _check_known("evaluate: ground_truth_values", ground_truth_values, ("classes", "instances", "numbers"))
+    _check_known("evaluate: confidences", confidences, ("protocol", "file"))
     place = None if out is None else Path(out)
-    named = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
+    named: Mapping[Any, Any] = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
     if not named:
-        raise ConfigError("evaluate: no predictions; pass a folder, files, or a mapping of methods")
-    requests: dict[str, Request] = {
-        str(method): Request(
-            tuple(map(Path, [paths] if isinstance(paths, str | Path) else paths)),
+        raise ConfigError("evaluate: no predictions; pass a folder, files, maps by scene, or a mapping of methods")
+    if all(map(_is_map, named.values())):
+        named = {default_name(place): named}
+    requests: dict[str, Request] = {}
+    for method, given in named.items():
+        contents = {str(scene): _content(scene, one) for scene, one in given.items()} if _are_maps(given) else None
+        paths = (IN_MEMORY,) if contents else several(f"predictions of {method}", given, str | Path)
+        requests[str(method)] = Request(
+            tuple(map(Path, paths)),
+            contents=contents,
             dataset=dataset,
             ground_truth=_path(ground_truth),
             ground_truth_values=ground_truth_values,
-            protocols=several(protocols),
-            scenes=several(scenes),
+            protocols=several("protocols", protocols),
+            scenes=several("scenes", scenes) or tuple(contents or ()),
             format=format,
             text_features=_path(text_features),
             confidences=confidences,
             queries=_path(queries),
         )
-        for method, paths in named.items()
-    }
     evaluated = evaluate_methods(requests, place)
     remarks = [
         f"{method}: {line}" if len(requests) > 1 else line
@@ -220,10 +251,42 @@ def evaluate(
     return Scores(evaluated.metrics, remarks) if place is None else Run(place, remarks)
 
 
+def _is_map(value: Any) -> bool:
+    """Whether a value is the map of one scene, in a form of ``SceneMap``."""
+    if isinstance(value, Mapping):
+        return "pred_masks" in value
+    is_array = isinstance(value, np.ndarray) or (
+        isinstance(value, tuple) and any(isinstance(one, np.ndarray) for one in value)
+    )
+    return is_array or isinstance(value, Instances | Partition | DenseFeatures)
+
+
+def _are_maps(value: Any) -> bool:
+    return isinstance(value, Mapping) and bool(value) and all(map(_is_map, value.values()))
+
+
+def _content(scene: str, value: Any) -> Content:
+    """The checked map of a scene; ``PredictionError`` if it cannot be scored."""
+    from su3d_bench.predictions.masks import matrix_masks
+    from su3d_bench.runs.plugins import in_stored_form, validation_error
+
+    if isinstance(value, Mapping):
+        value = tuple(value.get(key) for key in ("pred_masks", "pred_scores", "pred_classes"))
+    if isinstance(value, np.ndarray | tuple):
+        arrays = value if isinstance(value, tuple) else (value,)
+        if len(arrays) > 3:
+            raise PredictionError(f"{scene}: {len(arrays)} arrays; expected (masks, scores, classes)")
+        return matrix_masks(scene, arrays[0], *(None if one is None else np.asarray(one) for one in arrays[1:]))
+    found = in_stored_form(value)
+    if fault := validation_error(found):
+        raise PredictionError(f"{scene}: {fault}")
+    return found
+
+
 def _path(place: Place | None) -> Path | None:
     return None if place is None else Path(place)
 
 
-def _check_known(name: str, value: str | None, known: Sequence[str]) -> None:
-    if value is not None and value not in known:
-        raise ConfigError(f"evaluate({name}={value!r}): unknown value{suggest(value, known)}")
+def _check_known(name: str, value: Any, known: Sequence[str]) -> None:
+    if value is not None and not (isinstance(value, str) and value in known):
+        raise ConfigError(f"{name} is {printable(repr(value), 60)}{suggest(str(value), known)}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.arguments import check_fields, typed
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import (
     BoolArray,
@@ -19,7 +21,6 @@ from su3d_bench.core.types import (
     Int64Array,
     IntArray,
     Places,
-    check_arrays,
 )
 
 
@@ -48,8 +49,9 @@ class Masks:
     @staticmethod
     def of_sets(sets: Sequence[IntArray]) -> Masks:
         """The masks of these point indices, each list ascending."""
-        indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
-        return Masks(starts_of(map(len, sets)), indices)
+        with _converting("masks"):
+            indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
+            return Masks(starts_of(map(len, sets)), indices)
 
     def __len__(self) -> int:
         return len(self.indptr) - 1
@@ -136,8 +138,7 @@ class Instances(Masks):
     places: Places | None = None
 
     def __post_init__(self) -> None:
-        arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
-        check_arrays(self, "instances", arrays, PredictionError)
+        check_fields(self, "instances", PredictionError)
         k, v = len(self.scores), len(self.views)
         if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
             raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
@@ -171,6 +172,7 @@ class Instances(Masks):
             raise PredictionError(f"instances: an edge names instance {int(edges.max())} of {k} (0..{k - 1})")
 
     @classmethod
+    @typed
     def of(
         cls,
         points: Float32Array,
@@ -209,24 +211,34 @@ class Instances(Masks):
             members = points[masks.mask(row)]
             boxes[row] = members.min(axis=0), members.max(axis=0)
             means[row] = members.mean(axis=0, dtype=np.float64)
-        return cls(
-            masks.indptr,
-            masks.indices,
-            points=points,
-            scores=np.ones(k) if scores is None else _scores(scores, k),
-            features=None if features is None else _features(features, k),
-            labels=None if labels is None else tuple(labels),
-            names=("",) * k if names is None else tuple(names),
-            captions=("",) * k if captions is None else tuple(captions),
-            boxes=boxes,
-            centroids=means if centroids is None else centroids,
-            view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
-            views=_views(views or [()] * k, k),
-            ids=np.array(ids, np.int64),
-            view_names=view_names,
-            view_scores=view_scores,
-            further_labels=tuple(map(tuple, further_labels)) if further_labels else None,
-        )
+        with _converting("instances"):
+            return cls(
+                masks.indptr,
+                masks.indices,
+                points=points,
+                scores=np.ones(k) if scores is None else _scores(scores, k),
+                features=None if features is None else _features(features, k),
+                labels=None if labels is None else tuple(labels),
+                names=("",) * k if names is None else tuple(names),
+                captions=("",) * k if captions is None else tuple(captions),
+                boxes=boxes,
+                centroids=means if centroids is None else centroids,
+                view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
+                views=_views([()] * k if views is None else views, k),
+                ids=_array("ids", ids, (None,), "iu", "integers").astype(np.int64),
+                view_names=view_names,
+                view_scores=view_scores,
+                further_labels=None if further_labels is None else tuple(map(tuple, further_labels)) or None,
+            )
+
+
+@contextmanager
+def _converting(what: str) -> Iterator[None]:
+    """Raise failed conversions of a caller's values in the block as ``PredictionError``."""
+    try:
+        yield
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PredictionError(f"{what}: {error}") from error
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...], kinds: str, expected: str) -> NDArray[Any]:
@@ -323,6 +335,9 @@ class Partition:
     instance: Int32Array
     features: Float32Array
 
+    def __post_init__(self) -> None:
+        check_fields(self, "partition", PredictionError)
+
 
 @dataclass(frozen=True)
 class DenseFeatures:
@@ -335,6 +350,9 @@ class DenseFeatures:
 
     points: Float32Array
     features: NDArray[np.float16]
+
+    def __post_init__(self) -> None:
+        check_fields(self, "dense features", PredictionError)
 
 
 Prediction = Instances | Partition | DenseFeatures

@@ -12,12 +12,14 @@ import importlib.util
 import inspect
 import os
 import sys
+import uuid
 from functools import cache
 from importlib.metadata import entry_points
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.digests import digest_json
+from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import ConfigError, PlugInError, suggest
 from su3d_bench.core.system.files import user_folder
 
@@ -67,8 +69,53 @@ def names(kind: str) -> list[str]:
     return known
 
 
+_PASSED: dict[str, tuple[type, str]] = {}  # classes passed from Python and a key of their code, by target
+
+
+def target_of(kind: str, plug_in: type) -> str:
+    """The name under which ``load`` finds a class passed from Python: its built-in name or ``module:Class``.
+
+    The key of its code is that of its file; without one, as in a notebook, it differs for every class.
+    """
+    target = f"{plug_in.__module__}:{plug_in.__qualname__}"
+    for name, place in BUILT_IN[kind].items():
+        if place == target:
+            return name
+    file = getattr(sys.modules.get(plug_in.__module__), "__file__", None)
+    before = _PASSED.get(target)
+    if file is not None and Path(file).is_file():
+        key = digest_file(Path(file))
+    else:
+        key = before[1] if before is not None and before[0] is plug_in else uuid.uuid4().hex
+    _PASSED[target] = plug_in, key
+    return target
+
+
+def is_importable(target: str) -> bool:
+    """Whether other processes can import the class at ``module:Class``, which was passed from Python."""
+    return not target.startswith("__main__:") and _imported(target) is _PASSED[target][0]
+
+
+def code_key(target: str) -> str | None:
+    """A key of the file of a user-defined class, or of one passed from Python; None for any other."""
+    if ".py:" in target:
+        return digest_file(Path(target.rpartition(":")[0]))[:16]
+    if target not in _PASSED and ":" in target and isinstance(plug_in := _imported(target), type):
+        target_of("method", plug_in)  # in a worker process
+    return _PASSED[target][1][:16] if target in _PASSED else None
+
+
+def _imported(target: str) -> Any:
+    """The class at ``module:Class``; None if there is none."""
+    module, _, path = target.partition(":")
+    try:
+        return attrgetter(path)(importlib.import_module(module))
+    except (ImportError, AttributeError, ValueError, TypeError):
+        return None
+
+
 def load(kind: str, name: str) -> Any:
-    """The class with this ``name``: a built-in, an entry point or ``path/to/file.py:Class``."""
+    """The class with this ``name``: a built-in, an entry point, ``path/to/file.py:Class`` or ``module:Class``."""
     return checked(kind, name, _found(kind, name))
 
 
@@ -82,6 +129,9 @@ def _found(kind: str, name: str) -> Any:
                 return entry.load()
     if ".py:" in name:
         return _from_file(kind, name)
+    found = _PASSED[name][0] if name in _PASSED else _imported(name) if ":" in name else None
+    if found is not None:
+        return found
     known = names(kind)
     raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known)}")
 
@@ -139,7 +189,8 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
     interface, where = INTERFACES[kind], f"{kind} '{target}'"
     if not plug_in.__module__.startswith("su3d_bench."):
         module = sys.modules.get(plug_in.__module__)
-        where = f"{_line_of(plug_in, Path(getattr(module, '__file__', None) or '').name)}: {where}"
+        line = _line_of(plug_in, Path(getattr(module, "__file__", None) or "").name)
+        where = f"{line}: {where}" if line else where
     own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
     known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
     required = {*REQUIRED_CLASS_ATTRS[kind], *(name for name, called in _members(interface).items() if called)}
@@ -160,8 +211,8 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
 
 def _members(plug_in: type) -> dict[str, bool]:
     """The public members of a class, without those of its bases, and whether each is a function."""
-    members = dict.fromkeys(vars(plug_in).get("__annotations__", ()), False)
+    members = dict.fromkeys(inspect.get_annotations(plug_in), False)
     for name in vars(plug_in):
-        value = getattr(plug_in, name)
+        value = getattr(plug_in, name, None)
         members[name] = callable(value) and not isinstance(value, type)
     return {name: is_called for name, is_called in members.items() if not name.startswith("_")}

@@ -51,7 +51,7 @@ def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluatio
     # Load.
     _check_values_have_texts(request, is_text=request.ground_truth is not None)
     texts = read_text_features(request.text_features)
-    sources = open_sources(request.predictions, request.format)
+    sources = open_sources(request.predictions, request.format, request.contents)
 
     # Match to ground truth.
     truths = _open_truths(request, sources)

@@ -16,6 +16,7 @@ from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
+from su3d_bench.predictions.base import Content
 
 Confidences = Literal["protocol", "file"]
 ValuesForm = Literal["classes", "instances", "numbers"]
@@ -23,7 +24,7 @@ ValuesForm = Literal["classes", "instances", "numbers"]
 
 @dataclass(frozen=True)
 class Request:
-    """What to score: ``predictions`` are folders or files; everything else is optional.
+    """What to score: ``predictions`` are folders or files, ``contents`` maps in memory by scene instead.
 
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
     ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default the dataset's headline
@@ -35,6 +36,7 @@ class Request:
     """
 
     predictions: tuple[Path, ...]
+    contents: Mapping[str, Content] | None = None
     dataset: str | None = None
     ground_truth: Path | None = None
     ground_truth_values: ValuesForm | None = None

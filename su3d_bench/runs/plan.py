@@ -58,7 +58,6 @@ from su3d_bench.runs.job import (
     Part,
     SceneJob,
     check_same_run,
-    custom_code_key,
     options_model,
     part_of,
 )
@@ -428,6 +427,6 @@ def asks_questions(protocols: Sequence[str]) -> bool:
 def _run_name(config: RunConfig, methods: Sequence[Part], datasets: Sequence[Part], perception: str) -> str:
     request = config.model_dump(mode="json", exclude=set(NEUTRAL_SETTINGS))
     options = [part.options for part in (*methods, *datasets)]
-    own = [digest for part in (*methods, *datasets) if (digest := custom_code_key(part.target))]
+    own = [digest for part in (*methods, *datasets) if (digest := registry.code_key(part.target))]
     key = digest_json([request, options, perception, code_digest(), *own])[:8]
     return "-".join([*(part.name for part in datasets), config.profile, key])

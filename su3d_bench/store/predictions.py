@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.arguments import typed
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacing, row_blocks, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
@@ -142,6 +143,7 @@ def _write_rows(path: Path, table: NDArray[Any]) -> None:
             stream.write(np.ascontiguousarray(block).data)
 
 
+@typed
 def read_prediction(path: Path) -> Prediction:
     """The prediction that a run stored at ``path``; features of a dense one are memory-mapped.
 

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from su3d_bench.core.arguments import typed
 from su3d_bench.core.errors import ConfigError, counted, suggest
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
@@ -332,6 +333,7 @@ def not_comparable_with(rules: ProtocolRules) -> list[str]:
     return sorted({*rules.not_comparable_with, *naming})
 
 
+@typed
 def load_protocol(name: str) -> ProtocolRules:
     """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``.
 
