@@ -10,6 +10,7 @@ from typing import Any
 from su3d_bench.core.english import is_countable, plural
 from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, is_count, percent, text_table, with_interval
+from su3d_bench.metrics.scoring import EVERY_SCENE
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
 from su3d_bench.store.records import UnscoredRecord
@@ -301,7 +302,8 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
     warnings = [] if row["result"] is None else [str(line) for line in row["result"]["warnings"]]
     lines = summed(warnings, {line.partition(": ")[0] for line in warnings if ": " in line})
     for said, scenes in lines[:MAX_NOTES]:
-        yield f"{method}: {said}" + (f" ({some(scenes, 3)})" if scenes else "")
+        where = [EVERY_SCENE] if EVERY_SCENE in scenes else scenes
+        yield f"{method}: {said}" + (f" ({some(where, 3)})" if where else "")
     if len(lines) > MAX_NOTES:
         yield f"{method}: and {len(lines) - MAX_NOTES} more warnings, all in --json"
 

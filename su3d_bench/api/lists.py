@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, frame
 from su3d_bench.api.tables import Names
-from su3d_bench.core.arguments import several, typed
+from su3d_bench.core.arguments import several
 
 if TYPE_CHECKING:
     import pandas
 
 
-@typed
 def list_datasets(names: Names = ()) -> pandas.DataFrame:
     """The datasets and their available scenes, one row per scene; a dataset without scenes has one row without a scene.
 
@@ -36,7 +35,6 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     return frame(columns, rows)
 
 
-@typed
 def list_methods() -> pandas.DataFrame:
     """The methods that can be run by name: ``name``, ``summary``, ``paper``, ``source``, ``licence``, ``status`` and
     ``needs``, separated by commas (string, empty for none).
@@ -52,7 +50,6 @@ def list_methods() -> pandas.DataFrame:
     return frame(columns, rows)
 
 
-@typed
 def list_protocols() -> pandas.DataFrame:
     """The built-in protocols: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics, separated by
     commas, ``label_space``, ``original`` (string), ``version`` (int64). ``load_protocol`` returns all rules of one.

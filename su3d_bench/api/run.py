@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from su3d_bench.api.tables import Names, Place, Run, Scores
 from su3d_bench.core import registry
 from su3d_bench.core.arguments import several, typed
-from su3d_bench.core.errors import ConfigError, PredictionError, RunIncomplete, counted, printable, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, RunIncomplete, counted
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.evaluation.result import Confidences, Request, ValuesForm, default_name
+from su3d_bench.runs.existing import Into
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.result import Confidences, Request, ValuesForm
     from su3d_bench.predictions.base import Content
     from su3d_bench.runs.executors import Event, Report
 
@@ -27,6 +28,8 @@ Methods = str | type | Sequence[str | type]
 # One scene's map: as a method returns it; masks (N, M), or (masks, scores, classes), over the N ground-truth points;
 # or the dict of pred_masks, pred_scores and pred_classes of ScanNet's and OpenMask3D's evaluators.
 SceneMap = Prediction | NDArray[Any] | tuple[NDArray[Any] | None, ...] | Mapping[str, NDArray[Any]]
+
+Given = Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]]
 
 
 @typed
@@ -45,14 +48,14 @@ def run(
     settings: Mapping[str, Any] | None = None,
     config: Place | None = None,
     out: Place | None = None,
-    into: Literal["own", "extend", "replace"] = "own",
+    into: Into = "own",
     report: Report | None = None,
     **more: Any,
 ) -> Run:
     """Run methods over scenes, score their maps, and return the finished run, as ``su3d-bench run``.
 
     The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``methods``
-    names or classes (one defined in a notebook or script runs in this process, with ``jobs=1``), ``settings``
+    names or classes, which run in this process with ``jobs=1``, ``settings``
     are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as
     ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
     call resumes a run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend``
@@ -76,19 +79,11 @@ def run(
     from su3d_bench.runs.plan import asked_settings, make_plan
     from su3d_bench.runs.runner import run_plan
 
-    _check_known("run: into", into, ("own", "extend", "replace"))
-    targets = [
-        registry.target_of("method", one) if isinstance(one, type) else one
-        for one in several("methods", methods, str | type)
-    ]
-    here = [one for one in targets if ":" in one and ".py:" not in one and not registry.is_importable(one)]
-    if here:
+    given = several("methods", methods, str | type)
+    targets = [registry.target_of("method", one) if isinstance(one, type) else one for one in given]
+    if any(isinstance(one, type) and one.__module__.partition(".")[0] != "su3d_bench" for one in given):
         if jobs not in (None, 1) or more.get("executor", "inline") not in ("auto", "inline"):
-            name = here[0].rpartition(":")[2]
-            raise ConfigError(
-                f"run: {name} is defined in this session, and other processes cannot import it; use jobs=1, or save it "
-                f"in a file and pass 'file.py:{name}'"
-            )
+            raise ConfigError("run: a class runs in this process; use jobs=1, or save it and pass 'file.py:Class'")
         jobs = 1
     values = {
         "scenes": list(several("scenes", scenes)),
@@ -144,43 +139,29 @@ def _script_kept_out_of_workers() -> Iterator[None]:
         main.__file__ = file
 
 
-@overload
-def evaluate(
-    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
-    *,
-    dataset: str | None = ...,
-    ground_truth: Place | None = ...,
-    ground_truth_values: ValuesForm | None = ...,
-    protocols: Names = ...,
-    scenes: Names = ...,
-    format: str | None = ...,
-    text_features: Place | None = ...,
-    confidences: Confidences | None = ...,
-    queries: Place | None = ...,
-    out: None = ...,
-) -> Scores: ...
+class _Options(TypedDict, total=False):
+    dataset: str | None
+    ground_truth: Place | None
+    ground_truth_values: ValuesForm | None
+    protocols: Names
+    scenes: Names
+    format: str | None
+    text_features: Place | None
+    confidences: Confidences | None
+    queries: Place | None
 
 
 @overload
-def evaluate(
-    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
-    *,
-    dataset: str | None = ...,
-    ground_truth: Place | None = ...,
-    ground_truth_values: ValuesForm | None = ...,
-    protocols: Names = ...,
-    scenes: Names = ...,
-    format: str | None = ...,
-    text_features: Place | None = ...,
-    confidences: Confidences | None = ...,
-    queries: Place | None = ...,
-    out: Place,
-) -> Run: ...
+def evaluate(predictions: Given, *, out: None = ..., **options: Unpack[_Options]) -> Scores: ...
+
+
+@overload
+def evaluate(predictions: Given, *, out: Place, **options: Unpack[_Options]) -> Run: ...
 
 
 @typed
 def evaluate(
-    predictions: Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]],
+    predictions: Given,
     *,
     dataset: str | None = None,
     ground_truth: Place | None = None,
@@ -213,12 +194,9 @@ def evaluate(
     su3d_bench.core.errors.ConfigError: unknown protocol 'scanet-instance'; did you mean 'scannet-instance'? ...
     """
     from su3d_bench.evaluation.evaluate import warnings_of
-    from su3d_bench.evaluation.result import Request, default_name
     from su3d_bench.evaluation.run_output import evaluate_methods
     from su3d_bench.predictions.formats import IN_MEMORY
 
-    _check_known("evaluate: ground_truth_values", ground_truth_values, ("classes", "instances", "numbers"))
-    _check_known("evaluate: confidences", confidences, ("protocol", "file"))
     place = None if out is None else Path(out)
     named: Mapping[Any, Any] = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
     if not named:
@@ -285,8 +263,3 @@ def _content(scene: str, value: Any) -> Content:
 
 def _path(place: Place | None) -> Path | None:
     return None if place is None else Path(place)
-
-
-def _check_known(name: str, value: Any, known: Sequence[str]) -> None:
-    if value is not None and not (isinstance(value, str) and value in known):
-        raise ConfigError(f"{name} is {printable(repr(value), 60)}{suggest(str(value), known)}")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields
-from functools import cache, wraps
+from functools import wraps
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
@@ -17,14 +16,13 @@ from su3d_bench.core.errors import ConfigError, Su3dError, printable
 P = ParamSpec("P")
 R = TypeVar("R")
 # Annotation, without what is in brackets -> accepted types, and their name in messages.
-_KINDS: dict[str, tuple[tuple[Any, ...], str]] = {
+_KINDS: dict[str, tuple[tuple[type, ...], str]] = {
     "str": ((str,), "text"),
     "int": ((Integral,), "an integer"),
     "float": ((Real,), "a number"),
     "None": ((NoneType,), "None"),
-    **dict.fromkeys(("Path", "Place"), ((str, Path), "a path")),
+    "Place": ((str, Path), "a path"),
     "Mapping": ((Mapping,), "a mapping"),
-    **dict.fromkeys(("tuple", "Sequence"), ((Iterator,), "a sequence")),
 }
 
 
@@ -36,59 +34,49 @@ def fault(annotation: str, value: Any, known: Mapping[str, Any]) -> str | None:
     >>> fault("int | None", "3", {}), fault("int | None", 3, {})
     ("is '3'; expected an integer or None", None)
     """
-    words: dict[str, None] = {}
+    words = dict[str, None]()
     for part in annotation.split(" | "):
         name = part.partition("[")[0]
-        accepted, word = _KINDS.get(name, ((), name))
         own = known.get(name)
-        if get_origin(own) is Literal:
-            if isinstance(value, str) and value in get_args(own):
-                return None
+        accepted, word = _KINDS.get(name) or ((own,) if isinstance(own, type) else (), name)
+        if name.endswith("Array"):
+            fits, word = isinstance(value, sys.modules["numpy"].ndarray) and value.ndim > 0, "an array"
+        elif name in ("tuple", "Sequence"):
+            fits, word = is_sequence(value), "a sequence"
+        elif get_origin(own) is Literal:
+            fits = isinstance(value, str) and value in get_args(own)
             word = f"one of {', '.join(map(repr, get_args(own)))}"
-        elif name.endswith("Array"):
-            word = "an array"
-            if isinstance(value, sys.modules["numpy"].ndarray) and value.ndim:
-                return None
-        elif getattr(own, "_is_protocol", False):
-            if type(value).__module__ != "builtins":
-                return None
-        elif isinstance(own, type) or (isinstance(own, UnionType) and not any(map(get_origin, get_args(own)))):
-            accepted = accepted or (own,)
-        if word == name and not accepted:
+        elif isinstance(own, UnionType) and not any(map(get_origin, get_args(own))):
+            fits = isinstance(value, own)
+        elif accepted and not getattr(own, "_is_protocol", False):
+            fits = isinstance(value, accepted) and not (isinstance(value, str) and "\0" in value)
+        else:
+            fits = own is None or type(value).__module__ != "builtins"  # any object may have the members of a protocol
+        if fits:
             return None
-        if isinstance(value, accepted) or (Iterator in accepted and is_sequence(value)):
-            return "has a null character" if isinstance(value, str) and "\0" in value else None
         words[word] = None
-    is_plain = isinstance(value, str | int | float | None)
-    found = printable(repr(value), 60) if is_plain else f"a {type(value).__name__}"
-    return f"is {found}; expected {' or '.join(words)}"
+    found = repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    return f"is {printable(found, 60)}; expected {' or '.join(words)}"
 
 
 def check_fields(value: Any, where: str, error: type[Su3dError]) -> None:
     """Raise ``error`` if a field of the dataclass object ``value`` is not of its annotated type."""
     known = vars(sys.modules[type(value).__module__])
-    for name, annotation in _annotations(type(value)):
-        if (wrong := fault(annotation, getattr(value, name), known)) is not None:
+    for name, field in type(value).__dataclass_fields__.items():
+        if (wrong := fault(str(field.type), getattr(value, name), known)) is not None:
             raise error(f"{where}: {name} {wrong}")
 
 
-@cache
-def _annotations(of: type) -> tuple[tuple[str, str], ...]:
-    return tuple((field.name, str(field.type)) for field in fields(of))
-
-
 def is_sequence(value: Any) -> bool:
-    """Whether ``value`` is a list, tuple, array, table column or the like, not a text."""
-    try:
-        len(value)
-    except TypeError:
+    """Whether ``value`` is a list, tuple, array, table column, generator or the like, not a text."""
+    if isinstance(value, str | bytes | Mapping | type) or getattr(value, "ndim", 1) == 0:
         return False
-    return hasattr(value, "__iter__") and not isinstance(value, str | bytes | Mapping)
+    return hasattr(value, "__iter__") and (hasattr(value, "__len__") or isinstance(value, Iterator))
 
 
 def several(name: str, value: Any, kind: Any = str) -> tuple[Any, ...]:
     """One value of ``kind`` or several of them, as a tuple; ``ConfigError`` otherwise."""
-    found = tuple(value) if is_sequence(value) or isinstance(value, Iterator) else (value,)
+    found = tuple(value) if is_sequence(value) else (value,)
     for one in found:
         if not isinstance(one, kind):
             raise ConfigError(f"{name}: expected one name or several, not {printable(repr(one), 60)}")

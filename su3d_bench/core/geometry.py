@@ -31,12 +31,10 @@ def back_project(
     >>> su3d.back_project(np.full((3, 3), 2.0, np.float32), camera, np.eye(4), is_centre).tolist()
     [[0.0, 0.0, 2.0]]
     """
-    shapes = depth_m.shape, intrinsics.shape, camera_to_world.shape
-    if shapes != (pixels.shape, (3, 3), (4, 4)) or depth_m.ndim != 2 or pixels.dtype != np.bool_:
-        raise DataError(
-            f"back-projection: depth {shapes[0]}, intrinsics {shapes[1]}, pose {shapes[2]} and pixels {pixels.shape} "
-            f"{pixels.dtype}; expected (H, W), (3, 3), (4, 4) and (H, W) bool"
-        )
+    if depth_m.ndim != 2 or pixels.shape != depth_m.shape or pixels.dtype != np.bool_:
+        raise DataError(f"back-projection: depth {depth_m.shape}, pixels {pixels.shape}; expected (H, W), and bools")
+    if (intrinsics.shape, camera_to_world.shape) != ((3, 3), (4, 4)):
+        raise DataError("back-projection: expected intrinsics (3, 3) and a pose (4, 4)")
     of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)
     points = np.empty((len(z), 3))

@@ -15,7 +15,6 @@ import sys
 import uuid
 from functools import cache
 from importlib.metadata import entry_points
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -75,47 +74,25 @@ _PASSED: dict[str, tuple[type, str]] = {}  # classes passed from Python and a ke
 def target_of(kind: str, plug_in: type) -> str:
     """The name under which ``load`` finds a class passed from Python: its built-in name or ``module:Class``.
 
-    The key of its code is that of its file; without one, as in a notebook, it differs for every class.
+    Its key is that of its file; without one, as in a notebook, it differs for every class.
     """
     target = f"{plug_in.__module__}:{plug_in.__qualname__}"
-    for name, place in BUILT_IN[kind].items():
-        if place == target:
-            return name
-    file = getattr(sys.modules.get(plug_in.__module__), "__file__", None)
-    before = _PASSED.get(target)
-    if file is not None and Path(file).is_file():
-        key = digest_file(Path(file))
-    else:
-        key = before[1] if before is not None and before[0] is plug_in else uuid.uuid4().hex
-    _PASSED[target] = plug_in, key
+    if target in BUILT_IN[kind].values():
+        return next(name for name, place in BUILT_IN[kind].items() if place == target)
+    file = Path(getattr(sys.modules.get(plug_in.__module__), "__file__", None) or "")
+    if file.is_file() or _PASSED.get(target, (None,))[0] is not plug_in:
+        _PASSED[target] = plug_in, digest_file(file) if file.is_file() else uuid.uuid4().hex
     return target
 
 
-def is_importable(target: str) -> bool:
-    """Whether other processes can import the class at ``module:Class``, which was passed from Python."""
-    return not target.startswith("__main__:") and _imported(target) is _PASSED[target][0]
-
-
 def code_key(target: str) -> str | None:
-    """A key of the file of a user-defined class, or of one passed from Python; None for any other."""
-    if ".py:" in target:
-        return digest_file(Path(target.rpartition(":")[0]))[:16]
-    if target not in _PASSED and ":" in target and isinstance(plug_in := _imported(target), type):
-        target_of("method", plug_in)  # in a worker process
-    return _PASSED[target][1][:16] if target in _PASSED else None
-
-
-def _imported(target: str) -> Any:
-    """The class at ``module:Class``; None if there is none."""
-    module, _, path = target.partition(":")
-    try:
-        return attrgetter(path)(importlib.import_module(module))
-    except (ImportError, AttributeError, ValueError, TypeError):
-        return None
+    """A key of the code of a class that is user-defined or passed from Python; None for any other."""
+    key = digest_file(Path(target.rpartition(":")[0])) if ".py:" in target else _PASSED.get(target, (None, ""))[1]
+    return key[:16] or None
 
 
 def load(kind: str, name: str) -> Any:
-    """The class with this ``name``: a built-in, an entry point, ``path/to/file.py:Class`` or ``module:Class``."""
+    """The class with this ``name``: a built-in, an entry point, ``file.py:Class``, or one passed from Python."""
     return checked(kind, name, _found(kind, name))
 
 
@@ -129,9 +106,8 @@ def _found(kind: str, name: str) -> Any:
                 return entry.load()
     if ".py:" in name:
         return _from_file(kind, name)
-    found = _PASSED[name][0] if name in _PASSED else _imported(name) if ":" in name else None
-    if found is not None:
-        return found
+    if name in _PASSED:
+        return _PASSED[name][0]
     known = names(kind)
     raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known)}")
 

@@ -442,6 +442,9 @@ class Surface:
     triangles: Int32Array
     segments: Int32Array | None = None
 
+    def __post_init__(self) -> None:
+        check_fields(self, "surface", DataError)
+
 
 @dataclass(frozen=True)
 class Regions:
