@@ -38,7 +38,7 @@ def fault(annotation: str, value: Any, known: Mapping[str, Any]) -> str | None:
     for part in annotation.split(" | "):
         name = part.partition("[")[0]
         own = known.get(name)
-        accepted, word = _KINDS.get(name) or ((own,) if isinstance(own, type) else (), name)
+        accepted, word = _KINDS.get(name) or ((own,) if isinstance(own, type) and own is not Any else (), name)
         if name.endswith("Array"):
             fits, word = isinstance(value, sys.modules["numpy"].ndarray) and value.ndim > 0, "an array"
         elif name in ("tuple", "Sequence"):
@@ -48,10 +48,10 @@ def fault(annotation: str, value: Any, known: Mapping[str, Any]) -> str | None:
             word = f"one of {', '.join(map(repr, get_args(own)))}"
         elif isinstance(own, UnionType) and not any(map(get_origin, get_args(own))):
             fits = isinstance(value, own)
-        elif accepted and not getattr(own, "_is_protocol", False):
-            fits = isinstance(value, accepted) and not (isinstance(value, str) and "\0" in value)
+        elif getattr(own, "_is_protocol", False):  # any object of a class may have its members
+            fits = type(value).__module__ != "builtins"
         else:
-            fits = own is None or type(value).__module__ != "builtins"  # any object may have the members of a protocol
+            fits = not accepted or (isinstance(value, accepted) and not (isinstance(value, str) and "\0" in value))
         if fits:
             return None
         words[word] = None
