@@ -1,9 +1,9 @@
 """Reproduce a paper's tables from the wheel only: fetched from loopback servers, reproduced, verified separately.
 
 ``.ci/two_commands.py`` builds the wheel, installs it next to the packages of the project's environment and, with
-an empty home, runs a user's commands: ``fetch models --for paper``, ``fetch replica``, ``reproduce opensu3d --table II
-III``, ``report verify``. The servers provide tiny networks and rooms in the published layouts, first damaged in every
-named way; damaged files must never be accepted as complete.
+an empty home, runs a user's commands: ``models fetch --profile paper``, ``datasets fetch replica``, ``reproduce
+opensu3d --tables II III``, ``report verify``. The servers provide tiny networks and rooms in the published layouts,
+first damaged in every named way; damaged files must never be accepted as complete.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     """Each kind of damage gives its message, and no incomplete model is found."""
     once = ("--accept", "models", "--retries", "0", "--quiet")
     before = len(server.asked)
-    expect("licence not accepted", fetch("models", "--for", "paper"), 2, "not accepted")
+    expect("licence not accepted", fetch("models", "--profile", "paper"), 2, "not accepted")
     assert len(server.asked) == before
     stores = [path for path in server.files if path.startswith("/store/")]
     store = max(stores, key=lambda path: len(server.files[path].content))
@@ -170,7 +170,10 @@ def damages_of_models(server: FileServer, place: Place, fetch: Callable[..., tup
     expect("break in the middle", fetch("models", "sam-vit-h", *once), 2, "rerun to resume")
     assert not here(place), "a damaged file was accepted as complete"
     expect(
-        "the same again", fetch("models", "--for", "paper", *once), 0, f"{SAM}  (verified against: published SHA-256)"
+        "the same again",
+        fetch("models", "--profile", "paper", *once),
+        0,
+        f"{SAM}  (verified against: published SHA-256)",
     )
     assert server.asked and any(one.path.endswith(SAM) and one.range for one in server.asked), "nothing was resumed"
     assert here(place) == {*HUB, "sam-vit-h", "ram-plus"}
@@ -197,7 +200,7 @@ def damages_of_replica(server: FileServer, place: Place, fetch: Callable[..., tu
 
 def reproduced(place: Place) -> Path:
     """Tables II and III of OpenSU3D's paper from the fetched data; the archive."""
-    words = ("reproduce", "opensu3d", "--table", *TABLES, "--limit", "1", "--out", place.folder / "out")
+    words = ("reproduce", "opensu3d", "--tables", *TABLES, "--limit", "1", "--out", place.folder / "out")
     expect("preflight", place.run(*words, "--dry-run"), 0, "all requirements are available")
     # The fetched networks are tiny, with random weights: the numbers come from embedded perception.
     rc, out, err = place.run(*words, "--profile", "embedded", "--encoder", "embedded", "--quiet")
@@ -232,7 +235,7 @@ def main() -> int:
             verb = ("models", "fetch") if what == "models" else ("datasets", "fetch", what)
             return place.run(*verb, *words, "--sources", table, *beside[what], max_bytes=max_bytes)
 
-        words = ("reproduce", "opensu3d", "--table", *TABLES, "--dry-run")
+        words = ("reproduce", "opensu3d", "--tables", *TABLES, "--dry-run")
         rc, out, err = place.run(*words)
         assert rc == 1 and "missing, about" in out, out + err
         damages_of_models(server, place, fetch)

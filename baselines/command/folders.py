@@ -16,7 +16,7 @@ from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
 from su3d_bench.formats.images import depth_in_units, jpeg_bytes, list_column, png_bytes
 from su3d_bench.formats.ply import PlyElement, write_ply
-from su3d_bench.metrics.matching.nearest import select
+from su3d_bench.metrics.matching.transfer import select
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 

@@ -25,7 +25,7 @@ from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, PredictionError, shown
 from su3d_bench.core.maps import Masks, Proposals
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, SceneInfo, Surface
-from su3d_bench.metrics.matching.nearest import transfer_masks
+from su3d_bench.metrics.matching.transfer import transfer_masks
 from su3d_bench.predictions.base import VertexMasks
 
 NOISE = -1

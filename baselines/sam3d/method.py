@@ -33,7 +33,7 @@ from su3d_bench.core.types import (
     SceneInfo,
     Surface,
 )
-from su3d_bench.metrics.matching.nearest import masks_of_partition, select
+from su3d_bench.metrics.matching.transfer import masks_of_partition, select
 
 logger = logging.getLogger(__name__)
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

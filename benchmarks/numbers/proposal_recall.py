@@ -22,7 +22,7 @@ from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_propo
 from su3d_bench.core import registry
 from su3d_bench.core.maps import Proposals
 from su3d_bench.core.types import Float64Array, GroundTruth
-from su3d_bench.metrics.matching.nearest import transfer_masks
+from su3d_bench.metrics.matching.transfer import transfer_masks
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.runs.scenes import data_root

@@ -26,7 +26,7 @@ class KilledVerb:
 
 
 RUN_AGAIN = (*SUBJECTS["light"], *EXECUTORS["inline"], "--out", "run")
-SHEETS = ("sheets", "make", "run", "--kind", "annotation", "--methods", "collector", "--per-kind", "2", "--quiet")
+SHEETS = ("sheets", "make", "run", "--kinds", "annotation", "--methods", "collector", "--per-kind", "2", "--quiet")
 VERBS = {
     "export": KilledVerb(
         ("runs", "export", "run", "--to", "openlex3d", "--method", "collector", "--out", "run/exported", "--quiet"),
@@ -38,9 +38,7 @@ VERBS = {
         ("sheets", "score", "answers.csv", "--key", "sheets-key", "--out", "scores", "--quiet"),
         ("sheets", "sheets-key", "answers.csv"),
     ),
-    "report-html": KilledVerb(
-        ("report", "html", "run", "--queries", "chair", "--out", "page.html", "--quiet"), ("run",)
-    ),
+    "report-html": KilledVerb(("report", "html", "run", "--texts", "chair", "--out", "page.html", "--quiet"), ("run",)),
 }
 
 

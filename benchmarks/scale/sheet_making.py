@@ -42,7 +42,7 @@ def main() -> int:
         timed([*words, "--quiet", "--out", str(arguments.run)])
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        make = ["sheets", "make", str(arguments.run), "--quiet", "--out", folder + "/sheets", "--kind"]
+        make = ["sheets", "make", str(arguments.run), "--quiet", "--out", folder + "/sheets", "--kinds"]
         for name, kinds in {"all three": KINDS, **{kind: (kind,) for kind in KINDS}}.items():
             found[name] = timed([*make, *kinds])
             print(f"{name}: {found[name][0]:.1f} s, {found[name][1]:.1f} s of processor", flush=True)

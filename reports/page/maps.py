@@ -24,7 +24,8 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.formats.images import jpeg_bytes
-from su3d_bench.metrics.matching.nearest import Candidates, first_rows
+from su3d_bench.metrics.matching.nearest import Candidates
+from su3d_bench.metrics.matching.rows import first_rows
 from su3d_bench.reports.pictures.maps import map_cloud
 
 MIN_SPACING_M = 0.015  # between drawn points; finer spacing is invisible on a screen

@@ -99,7 +99,7 @@ def parquet_of(rows: Sequence[InstanceRow]) -> bytes:
         import pyarrow.parquet
     except ImportError as error:
         raise ModelMissing(
-            "--format parquet needs the parquet extra: pip install 'su3d-bench[parquet]'; or use --format csv"
+            ".parquet files need the parquet extra: pip install 'su3d-bench[parquet]'; or write a .csv file"
         ) from error
     types = {
         "text": pyarrow.string(),

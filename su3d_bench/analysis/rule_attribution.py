@@ -13,7 +13,7 @@ from su3d_bench.analysis.attribution import Inputs, method_of, truth_of_scene
 from su3d_bench.analysis.sides import parse_side
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, some
 from su3d_bench.metrics.compatibility import kind_incompatibility
-from su3d_bench.metrics.matching.nearest import remembering
+from su3d_bench.metrics.matching.memory import remembering
 from su3d_bench.metrics.protocols.mixtures import Mixtures, RuleDifference, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combined_metrics, pack_scores, plain_json, score_scene, unpack_scores
@@ -102,7 +102,7 @@ class RuleStepper:
         """
         mixtures = Mixtures(first, second)
         if first.kind not in KINDS:
-            raise ConfigError(f"--prediction needs protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
+            raise ConfigError(f"--run needs protocols of kind {' or '.join(KINDS)}, these are '{first.kind}'")
         runs, named = parse_side(prediction, None)
         if len(runs) > 1:
             raise ConfigError(f"{printable(prediction, 200)}: names several runs; give one")

@@ -54,12 +54,12 @@ def run(
 ) -> Run:
     """Run methods over scenes, score their maps, and return the finished run, as ``su3d-bench run``.
 
-    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``methods``
-    names or classes, which run in this process with ``jobs=1``, ``settings``
-    are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as
-    ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
-    call resumes a run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend``
-    or ``--replace``. ``report`` is called with every ``Event``, to show progress.
+    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``),
+    ``methods`` names or classes, which run in this process with ``jobs=1``, ``settings`` are those of ``--set``
+    such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as ``executor`` or
+    ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same call resumes a
+    run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend`` or
+    ``--replace``. ``report`` is called with every ``Event``, to show progress.
 
     Raises ``ConfigError`` for an invalid request, before any work; ``DataError`` or ``ModelMissing`` for missing data
     or models; ``StoreError`` for a folder with another run; ``RunIncomplete`` if scenes failed: the folder then
@@ -145,7 +145,7 @@ class _Options(TypedDict, total=False):
     ground_truth_values: ValuesForm | None
     protocols: Names
     scenes: Names
-    format: str | None
+    input_format: str | None
     text_features: Place | None
     confidences: Confidences | None
     queries: Place | None
@@ -168,13 +168,14 @@ def evaluate(
     ground_truth_values: ValuesForm | None = None,
     protocols: Names = (),
     scenes: Names = (),
-    format: str | None = None,
+    input_format: str | None = None,
     text_features: Place | None = None,
     confidences: Confidences | None = None,
     queries: Place | None = None,
     out: Place | None = None,
 ) -> Scores | Run:
-    """Score existing predictions with every protocol that fits, as ``su3d-bench evaluate``.
+    """Score existing predictions with the dataset's headline protocol if that fits, otherwise or with
+    ``protocols="all"`` with all that fit, as ``su3d-bench evaluate``.
 
     ``predictions`` is a folder, a file or several of them; or for each scene its map, ``{"scene0011_00": map}``: as a
     method returns it, or ``(masks, scores, classes)`` with masks (N, M) over the N ground-truth points, M scores and M
@@ -215,7 +216,7 @@ def evaluate(
             ground_truth_values=ground_truth_values,
             protocols=several("protocols", protocols),
             scenes=several("scenes", scenes) or tuple(contents or ()),
-            format=format,
+            format=input_format,
             text_features=_path(text_features),
             confidences=confidences,
             queries=_path(queries),

@@ -33,11 +33,11 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(actions, "show", call_show)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
-    parser.option("--stride N", "draw every Nth camera (default: 48 cameras in total)", type=count)
+    parser.option("--stride N", "use every Nth frame (default: 48 frames in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, resumes=True)
     parser.option("dataset", "dataset to generate: rooms")
-    parser.option("--scenes SCENE...", "scenes or patterns (default: 'DATASET/*')")
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'DATASET/*')")
     parser.option(
         "--layout",
         "file layout: native (ground truth only), replica or scannet (default: native)",

@@ -130,18 +130,18 @@ def call_completion(arguments: argparse.Namespace) -> None:
 def _add_registry(verbs: Verbs) -> None:
     """Maintain a registry of results: add re-scored bundles and build a site of rankings.
 
-    su3d-bench dev registry add reproduced/rooms/bundle.zip --to my-registry
+    su3d-bench dev registry add reproduced/rooms/bundle.zip --registry my-registry
     su3d-bench dev registry build my-registry --out site
     """
     actions = add_group(verbs, "registry", _add_registry)
     parser = add_verb(actions, "add", call_registry_add)
     parser.option("bundles BUNDLE...", "archives written by report bundle or reproduce")
-    parser.option("--to DIR", "registry folder (default: the current folder)", type=output_path, default=Path())
-    parser.option("--name NAME", "name of the bundle in the registry (default: from its file or recipe)")
+    parser.option("--registry DIR", "registry folder (default: the current folder)", type=output_path, default=Path())
+    parser.option("--bundle-name NAME", "name of the bundle in the registry (default: from its file or recipe)")
     parser = add_verb(actions, "build", call_registry_build)
     parser.option("folder DIR", "registry, or any folder of bundles", type=searched_folder)
     parser.option("--out DIR", "folder of the site (default: site)", type=output_path, default=Path("site"))
-    parser.option("--title TEXT", "title of the first page (default: Registry of results)")
+    parser.option("--title TEXT", "title of the page (default: Registry of results)")
     parser.option("--bundle-url URL", "base URL for links to bundles (default: no links)")
     add_new(actions, REGISTRY)
 
@@ -149,18 +149,18 @@ def _add_registry(verbs: Verbs) -> None:
 def call_registry_add(arguments: argparse.Namespace) -> int:
     """Re-score bundles and add them to a registry; exit code 1 if one is rejected.
 
-    su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms
+    su3d-bench dev registry add bundle.zip --registry my-registry --bundle-name opensu3d-rooms
     su3d-bench dev registry add bundles/mine.zip
     """
     from dataclasses import asdict
 
     from su3d_bench.reproducing.registry import add_bundle, lines_of
 
-    if arguments.name is not None and len(arguments.bundles) > 1:
-        raise ConfigError("--name: applies to one bundle; add the bundles one at a time")
+    if arguments.bundle_name is not None and len(arguments.bundles) > 1:
+        raise ConfigError("--bundle-name: applies to one bundle; add the bundles one at a time")
     found = []
     for bundle in arguments.bundles:
-        found.append(add_bundle(bundle, arguments.to, arguments.name))
+        found.append(add_bundle(bundle, arguments.registry, arguments.bundle_name))
         if not arguments.json:
             answer(*lines_of(found[-1]))
             show()

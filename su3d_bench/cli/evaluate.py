@@ -17,7 +17,6 @@ REQUEST_OPTIONS = (
     "dataset",
     "ground_truth",
     "ground_truth_values",
-    "format",
     "text_features",
     "confidences",
     "queries",
@@ -26,15 +25,11 @@ REQUEST_OPTIONS = (
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "evaluate", call)
-    parser.option("predictions [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
-    parser.option(
-        "--name METHOD=PREDICTIONS...",
-        "method's name (default: name of --out), or METHOD=PREDICTIONS to score several",
-        action="extend",
-        default=[],
-    )
+    parser.option("paths [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
+    parser.option("--name NAME", "name of the method (default: name of --out)")
+    parser.option("--predictions METHOD=PREDICTIONS...", "predictions of several methods", action="extend", default=[])
     parser.option("--out DIR", "write a run folder, for compare, check, report, sheets and query", type=output_path)
-    parser.option("--dataset NAME", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
+    parser.option("--dataset DATASET", "dataset with the ground truth, in $SU3D_DATA: replica, scannet, ...")
     parser.option(
         "--ground-truth DIR",
         "folder of ground truth, one <scene>.txt per scene; or OpenLex3D's release",
@@ -45,7 +40,7 @@ def add_parser(verbs: Verbs) -> None:
         choices=("classes", "instances", "numbers"),
     )
     parser.shared("--protocols", "--all-protocols", "--scenes")
-    parser.option("--format FORMAT", "format of the predictions (default: detected)")
+    parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.shared("--text-features")
     parser.option(
         "--confidences",
@@ -53,15 +48,15 @@ def add_parser(verbs: Verbs) -> None:
         choices=("protocol", "file"),
     )
     parser.shared("--queries")
-    parser.option("--per-class", "also print the table of every class")
-    parser.shared("--table-format")
+    parser.option("--per-class", "also show each class")
+    parser.shared("--format")
 
 
 def call(arguments: argparse.Namespace) -> None:
     """Score predictions of other programs under every protocol that fits.
 
     su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
-    su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
+    su3d-bench evaluate --predictions mine=predA theirs=predB --dataset replica --out runs/both
     """
     from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.result import Request
@@ -70,8 +65,12 @@ def call(arguments: argparse.Namespace) -> None:
     from su3d_bench.store.records import plain
 
     chosen: dict[str, Any] = {name: getattr(arguments, name) for name in REQUEST_OPTIONS}
-    chosen |= {"protocols": tuple(arguments.protocols), "scenes": tuple(arguments.scenes)}
-    requests = {method: Request(tuple(paths), **chosen) for method, paths in _named(arguments).items()}
+    chosen |= {
+        "format": arguments.input_format,
+        "protocols": tuple(arguments.protocols),
+        "scenes": tuple(arguments.scenes),
+    }
+    requests = {method: Request(tuple(paths), method=method, **chosen) for method, paths in _named(arguments).items()}
     run = evaluate_methods(requests, arguments.out)
     results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
@@ -93,23 +92,23 @@ def call(arguments: argparse.Namespace) -> None:
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by method name."""
     from su3d_bench.evaluation.result import default_name
+    from su3d_bench.predictions.run_predictions import methods_of
 
-    if not arguments.predictions and not arguments.name:
-        raise ConfigError("evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS")
+    if not arguments.paths and not arguments.predictions:
+        raise ConfigError("evaluate: no predictions given; name a folder or files, or --predictions METHOD=PREDICTIONS")
+    if arguments.predictions and (arguments.paths or arguments.name is not None):
+        raise ConfigError("evaluate: --predictions names methods and predictions; leave out PREDICTIONS and --name")
     named: dict[str, list[Path]] = {}
-    for text in arguments.name:
-        method, equals, path = text.partition("=")
-        if equals and method and path and not arguments.predictions:
-            named.setdefault(method, []).append(Path(path))
-        elif equals or not arguments.predictions or len(arguments.name) > 1:
-            raise ConfigError(
-                f"evaluate: --name {text}: expected METHOD=PREDICTIONS for each method, or PREDICTIONS... --name METHOD"
-            )
-        else:
-            named[text] = list(arguments.predictions)
-    if len(named) == 1 and arguments.out is None:
-        raise ConfigError("evaluate: --name names a method of a run; add --out DIR")
-    return named or {default_name(arguments.out): list(arguments.predictions)}
+    if len(arguments.paths) == 1 and arguments.name is None and (methods := methods_of(arguments.paths[0])):
+        return dict.fromkeys(methods, arguments.paths)
+    for text in arguments.predictions:
+        method, _, path = text.partition("=")
+        if not method or not path:
+            raise ConfigError(f"evaluate: --predictions {text}: expected METHOD=PREDICTIONS")
+        named.setdefault(method, []).append(Path(path))
+    if arguments.out is None and (arguments.name is not None or len(named) == 1):
+        raise ConfigError("evaluate: a run has names of methods; add --out DIR")
+    return named or {arguments.name or default_name(arguments.out): arguments.paths}
 
 
 def _print_next_steps(out: Path, methods: Sequence[str], *, existed: bool, is_quiet: bool) -> None:

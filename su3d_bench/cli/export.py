@@ -28,17 +28,17 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
     parser.option(
         "--to",
-        "format to write: openlex3d, scannet, scannetpp or opensun3d",
+        "format to write (of these evaluators)",
         required=True,
         choices=TARGETS,
     )
     parser.option("--out DIR", "new folder for the files", type=output_path, required=True)
-    parser.option("--method METHOD", "method whose maps are exported (default: the only one of the run)")
+    parser.option("--method METHOD", "method to use (default: the only one of the run)")
     parser.shared("--scenes")
-    parser.option("--format FORMAT", "format of the predictions (default: detected)")
+    parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.option(
         "--protocol PROTOCOL",
-        "protocol that defines the classes of scannet(pp) files (default: the only one)",
+        "protocol to use (for the classes of scannet and scannetpp; default: the only one)",
     )
     parser.shared("--text-features")
 
@@ -69,7 +69,9 @@ def call(arguments: argparse.Namespace) -> None:
     ):
         if value is not None and arguments.to not in users:
             raise ConfigError(f"{flag} {value}: only valid with --to {' or '.join(users)}; leave it out")
-    sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
+    sources = chosen(
+        sources_of(arguments.path, arguments.input_format, arguments.method), arguments.scenes, arguments.path
+    )
     names = _names([source.address for source in sources], is_flat=not is_openlex)
     rows = []
     with whole_folder(arguments.out) as folder:

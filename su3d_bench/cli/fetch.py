@@ -32,7 +32,7 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
         default=[],
     )
     parser.shared("--dry-run")
-    parser.option("--retries N", "download retries (default: 3)", type=int, default=3)
+    parser.option("--retries N", "number of retries (of a download; default: 3)", type=int, default=3)
     if has_servers:
         parser.option(
             "--mirror NAME=URL...",
@@ -170,7 +170,7 @@ def progress_callback(arguments: argparse.Namespace) -> Iterator[Progress]:
 def add_models(verbs: Verbs) -> None:
     parser = add_verb(verbs, "fetch", call_models, resumes=True)
     parser.option("names [MODEL...]", "names from models list")
-    parser.option("--for PROFILE", "all models of profile paper", dest="profile")
+    parser.option("--profile PROFILE", "perception profile (all its models: paper)")
     _add_fetch_options(parser)
     parser.shared("--set")
 
@@ -178,7 +178,7 @@ def add_models(verbs: Verbs) -> None:
 def call_models(arguments: argparse.Namespace) -> None:
     """Download foundation models into $SU3D_MODELS.
 
-    su3d-bench models fetch --for paper --accept MIT Apache-2.0
+    su3d-bench models fetch --profile paper --accept MIT Apache-2.0
     su3d-bench models fetch sam-vit-h --dry-run
     """
     from su3d_bench.fetching.fetch import plan_models

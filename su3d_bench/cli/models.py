@@ -20,7 +20,7 @@ def add_parser(verbs: Verbs) -> None:
     """List, download, check and benchmark foundation models.
 
     su3d-bench models list
-    su3d-bench models fetch --for paper --dry-run
+    su3d-bench models fetch --profile paper --dry-run
     """
     actions = add_group(verbs, "models", add_parser, lists=True)
     listing = add_verb(actions, "list", call_list)
@@ -30,7 +30,7 @@ def add_parser(verbs: Verbs) -> None:
     checking.shared("--set")
     parser = add_verb(actions, "warm", call_warm)
     parser.option("name [ENCODER]", "encoder to load (default: all models of the profile)")
-    parser.option("--profile PROFILE", "profile whose models are loaded (default: paper)")
+    parser.option("--profile PROFILE", "perception profile (default: paper)")
     parser.shared("--device", "--set")
     fetch.add_models(actions)
 

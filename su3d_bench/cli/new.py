@@ -27,7 +27,7 @@ NEXT = {
     "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
     "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
     "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
-    REGISTRY: ("dev registry add BUNDLE --to {at}", "dev registry build {at} --out site"),
+    REGISTRY: ("dev registry add BUNDLE --registry {at}", "dev registry build {at} --out site"),
 }
 
 

@@ -1,4 +1,8 @@
-"""The argument parser, how commands are added to it, and the options that several commands share."""
+"""The argument parser, how commands are added to it, and the options that several commands share.
+
+An option has one name and one meaning in all commands, its help up to the parentheses; the name is plural if it takes
+several values (``--methods METHOD...``), otherwise singular (``--method METHOD``).
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,9 @@ LANGUAGE = ("perception", "language")
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt command or option."""
+
+    def __init__(self, **form: Any) -> None:
+        super().__init__(allow_abbrev=False, **form)
 
     def error(self, message: str) -> None:  # type: ignore[override]
         verb = self.prog.partition(" ")[2]
@@ -215,8 +222,8 @@ SHARED: dict[str, dict[str, Any]] = dict(
             default=[],
         ),
         option("--config FILE", "TOML file of settings, such as the run.toml of a run"),
-        option("--run DIR", "run folder (default: the latest in runs/ that has the scene)"),
-        option("--method METHOD", "method whose maps are used (default: opensu3d)", default="opensu3d"),
+        option("--run RUN", "run folder (default: the latest in runs/ that has the scene)"),
+        option("--method METHOD", "method to use (default: opensu3d)", default="opensu3d"),
         option(
             "--format",
             "table format (default: text; in files markdown)",
@@ -227,7 +234,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--limit N", "process only the first N frames of each scene (results are marked partial)", type=int),
         option(
             "--profile PROFILE",
-            "perception: embedded (built-in models), paper, stored, oracle or auto (default)",
+            "perception profile (embedded: built-in models, paper, stored, oracle; default: auto)",
         ),
         option(
             "--question-solver",
@@ -249,13 +256,12 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "address of the Ray cluster, or local to start one (default: $RAY_ADDRESS)",
         ),
         option("--gpus-per-job N", "GPUs per job (ray, slurm), such as 0.5", type=float),
-        option("--retries N", "retries of a scene after a lost worker (default: 2)", type=int),
+        option("--retries N", "number of retries (of a scene after a lost worker; default: 2)", type=int),
         option("--slurm KEY=VALUE...", "submitit options, such as slurm_partition=gpu timeout_min=60"),
         option("--offline", "use only stored replies of language models", action=argparse.BooleanOptionalAction),
         option("--dry-run", "show what would be done and what it needs, and exit"),
     ]
 )
-SHARED["--table-format"] = SHARED["--format"]  # where --format is an input format
 # Where scenes run; see docs/running/clusters.md.
 EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
 

@@ -18,7 +18,7 @@ from su3d_bench.core.errors import ConfigError, shown
 
 RUN_VERBS = ("run", "ablate", "evaluate")  # whose --out may be an existing run
 # Texts that contain the path of a file or folder; in other texts, such as METHOD, only files are inputs.
-TEXTS = ("A", "B", "RUN[:METHOD]", "METHOD=PREDICTIONS", "METHOD=DIR", "METHOD=FILE", "KEY=VALUE", "FILE")
+TEXTS = ("A", "B", "RUN", "METHOD=PREDICTIONS", "METHOD=FILE", "KEY=VALUE", "FILE")
 FREE_TEXTS = (None, "TEXT", "NAME")
 
 

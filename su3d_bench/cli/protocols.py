@@ -30,20 +30,17 @@ def add_parser(verbs: Verbs) -> None:
     add_verb(actions, "list", call_list)
     parser = add_verb(actions, "show", call_show)
     parser.option("name PROTOCOL", "protocol, or .toml file")
-    parser.option("--names", "print the texts that are encoded for the classes, one per line")
+    parser.option("--list-texts", "print the texts that are encoded, one per line")
     parser.shared("--queries")
     parser = add_verb(actions, "diff", call_diff)
     parser.option("name A", "protocol, or .toml file")
     parser.option("other B", "protocol to compare with")
-    parser.option(
-        "--prediction RUN[:METHOD]",
-        "run to score under both, to show the effect of each rule",
-    )
-    parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --prediction)")
+    parser.option("--run RUN", "run folder (or RUN:METHOD; scored under both, for the effect of each rule)", type=str)
+    parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --run)")
     parser.shared("--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
-    parser.option("--protocol P", "protocol, or .toml file", required=True)
-    parser.option("--encoder E", "embedded, or from models list (default: the protocol's)")
+    parser.option("--protocol PROTOCOL", "protocol to use (or .toml file)", required=True)
+    parser.option("--encoder ENCODER", "encoder to use (embedded, or from models list; default: the protocol's)")
     parser.shared("--queries", "--device", "--set")
     parser.option("--out FILE", ".npz file to write", type=output_path, required=True)
     add_new(actions, "protocol")
@@ -74,17 +71,17 @@ def call_show(arguments: argparse.Namespace) -> None:
     """Show every rule of a protocol with its source.
 
     su3d-bench protocols show rooms-semantic
-    su3d-bench protocols show rooms-semantic --names
+    su3d-bench protocols show rooms-semantic --list-texts
     """
     from su3d_bench.metrics.compatibility import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
     rules = load_protocol(arguments.name)
-    if arguments.names:
+    if arguments.list_texts:
         _answer_names(arguments, rules)
         return
     if arguments.queries is not None:
-        raise ConfigError("protocols show: --queries needs --names")
+        raise ConfigError("protocols show: --queries needs --list-texts")
     stated = original_of(arguments.name)
     value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
     facts = {"original": "not said"} if stated is None else stated.facts
@@ -98,21 +95,21 @@ def _plain(stated: ResolvedOriginal | None) -> dict[str, Any] | None:
 
 
 def call_diff(arguments: argparse.Namespace) -> None:
-    """Show the rules in which two protocols differ, and with --prediction the effect of each.
+    """Show the rules in which two protocols differ, and with --run the effect of each.
 
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
-    su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --run runs/demo --out steps.png
     """
     from su3d_bench.analysis.rule_attribution import RuleStepper, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.comparison import rules_tables
 
-    if arguments.out is not None and arguments.prediction is None:
-        raise ConfigError("protocols diff: --out needs --prediction")
+    if arguments.out is not None and arguments.run is None:
+        raise ConfigError("protocols diff: --out needs --run")
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
     apart = rules_apart(first, second)
-    if arguments.prediction is not None:
-        walker = RuleStepper.of(first, second, arguments.prediction)
+    if arguments.run is not None:
+        walker = RuleStepper.of(first, second, arguments.run)
         with progress(len(walker.scenes), is_quiet=arguments.quiet) as report:
             walk = walker.walk(arguments.jobs or os.cpu_count() or 1, report)
         apart = rules_apart(first, second, walk)

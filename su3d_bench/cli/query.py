@@ -43,8 +43,8 @@ def add_parser(verbs: Verbs) -> None:
         "--question-solver", SHARED["--question-solver"]["help"], choices=("built-in", "llm"), default="built-in"
     )
     parser.option(
-        "--names",
-        "original labels or those of runs refine (default: refined if available)",
+        "--labels",
+        "labels to use: label, or refined by runs refine (default: refined if available)",
         choices=("auto", "label", "refined"),
         default="auto",
     )
@@ -122,7 +122,7 @@ def call_ask(arguments: argparse.Namespace) -> None:
     run, job, instances = options.open_map(arguments, "ask", arguments.question)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: has no instances, so questions cannot be answered")
-    refined, note = _refined(job, arguments.names)
+    refined, note = _refined(job, arguments.labels)
     scene = map_of(instances, refined)
     if arguments.dry_run:
         _estimate(scene, run, arguments)

@@ -17,7 +17,6 @@ from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-SOURCES = ("auto", "generated")
 FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
 FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question with --json
@@ -26,24 +25,14 @@ MAX_CHARACTERS = 80
 
 
 def add_parser(verbs: Verbs) -> None:
-    scenes = "--scenes SCENE...", "scenes or patterns, such as 'rooms/*'"
+    scenes = "--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')"
     parser = add_verb(verbs, "make", _make)
     parser.option(*scenes, required=True)
     parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", type=output_path, required=True)
-    parser.option("--per-kind N", "maximum number of questions per kind and scene (default: all)", type=count)
-    parser.option(
-        "--source",
-        "auto (from the dataset if it has questions) or generated (default: auto)",
-        default=SOURCES[0],
-        choices=SOURCES,
-    )
+    parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
+    parser.option("--generated", "generate all questions (default: use the dataset's own, if any)")
     parser.shared("--exclude-ids")
-    parser.option(
-        "--format",
-        "format of this program, or Beacon3D's metadata_*.json (default: own)",
-        default=FORMS[0],
-        choices=FORMS,
-    )
+    parser.option("--to", "format to write (default: own)", default=FORMS[0], choices=FORMS)
     parser = add_verb(verbs, "show", _show)
     parser.option(
         "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
@@ -53,7 +42,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--out DIR", "folder for page, pictures and table", type=output_path)
     parser.option("--n-questions N", "number of questions (default: 200)", type=count, default=200)
     parser.shared("--seed")
-    parser.option("--kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[])
+    parser.option(
+        "--question-kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[]
+    )
     parser.option("--score FILE", "summarise the verdicts in this audit.csv")
     parser.shared("--format")
     parser = add_verb(verbs, "score", _score)
@@ -68,11 +59,11 @@ def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
     su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
-    su3d-bench query make --scenes 'rooms/*' --format beacon3d-qa --out metadata_qa.json
+    su3d-bench query make --scenes 'rooms/*' --to beacon3d-qa --out metadata_qa.json
     """
     from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.format != FORMS[0]:
+    if arguments.to != FORMS[0]:
         _make_beacon3d(arguments)
         return
     check_form(arguments.out)
@@ -89,17 +80,17 @@ def _make_beacon3d(arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, scene_objects
 
-    if arguments.exclude_ids is not None or arguments.source != SOURCES[0]:
-        raise ConfigError("query make: --exclude-ids and --source need --format own")
+    if arguments.exclude_ids is not None or arguments.generated:
+        raise ConfigError("query make: --exclude-ids and --generated need --to own")
     if arguments.out.suffix != ".json":
-        raise ConfigError(f"query make: --format {arguments.format} writes JSON; use --out FILE.json")
+        raise ConfigError(f"query make: --to {arguments.to} writes JSON; use --out FILE.json")
     objects = {}
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         if scene in objects:
             raise ConfigError(f"query make: two datasets have a scene '{scene}', this form identifies scenes by name")
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
-    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.format) - 1]
+    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.to) - 1]
     write_json(arguments.out, content)
     n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
     line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
@@ -115,7 +106,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
     left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        found = questions_of(dataset, scene, own=arguments.source == "auto")
+        found = questions_of(dataset, scene, own=not arguments.generated)
         kept = [question for question in found if question.id not in left_out]
         questions = chosen(kept, arguments.per_kind)
         without = f", {len(found) - len(kept)} excluded" if left_out else ""
@@ -185,7 +176,7 @@ def _audit(arguments: argparse.Namespace) -> None:
         of_scene = list(audited_questions(dataset, scene, n_each=n_each, seed=arguments.seed))
         remark(f"{dataset.name}/{scene}: {counted(len(of_scene), 'question')}", quiet=arguments.quiet)
         every += of_scene
-    drawn = sample(of_kinds(every, arguments.kinds), arguments.n_questions, arguments.seed)
+    drawn = sample(of_kinds(every, arguments.question_kinds), arguments.n_questions, arguments.seed)
     if not drawn:
         raise DataError("query audit: these scenes give no questions")
     places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}

@@ -20,7 +20,7 @@ PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 def add_parser(verbs: Verbs) -> None:
     """Create tables, pages and archives from finished runs, and verify published tables.
 
-    su3d-bench report tables runs/my-run --format latex --table II
+    su3d-bench report tables runs/my-run --format latex --tables II
     su3d-bench report verify paper.tex
     """
     actions = add_group(verbs, "report", add_parser)
@@ -38,20 +38,21 @@ def _add_tables(verbs: Verbs) -> None:
     parser = add_verb(verbs, "tables", call_tables)
     parser.option("runs RUN...", "run folders, or folders written by sheets score")
     parser.shared("--format")
-    parser.option("--table ...", "tables of the paper (default: none)", choices=PAPER_TABLES, default=[])
+    tables = f"tables of the paper ({', '.join(PAPER_TABLES)}; default: none)"
+    parser.option("--tables TABLE...", tables, choices=PAPER_TABLES, default=[])
     for name, what in (
-        ("methods", "methods to show, in this order (default: all)"),
-        ("datasets", "datasets to show (default: all)"),
-        ("protocols", "protocols to show (default: all)"),
-        ("metrics", "metrics to show (default: the headline metrics)"),
+        ("methods", "methods to use (in this order; default: all)"),
+        ("datasets", "datasets to use (default: all)"),
+        ("protocols", "protocols to use (default: all)"),
+        ("metrics", "metrics to use (default: the headline metrics)"),
     ):
         parser.option(f"--{name} {name[:-1].upper()}...", what, default=[])
-    parser.option("--intervals", "show 95 %% confidence intervals over scenes")
+    parser.option("--intervals", "show 95 %% confidence intervals (over scenes)")
     parser.option("--ceiling", "show the ground-truth ceiling")
     parser.option("--scenes-count", "always show the number of scenes")
     parser.option("--significant", "mark the best only if significantly better (p < 0.05)")
     parser.option(
-        "--published", "show published results (default: with --table)", action=argparse.BooleanOptionalAction
+        "--published", "show published results (default: with --tables)", action=argparse.BooleanOptionalAction
     )
     parser.option("--out FILE", "file to write (default: print)", type=output_path)
 
@@ -59,8 +60,8 @@ def _add_tables(verbs: Verbs) -> None:
 def call_tables(arguments: argparse.Namespace) -> None:
     """Create tables from runs: tables of the OpenSU3D paper, or one per protocol.
 
-    su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex
-    su3d-bench report tables runs/my-run scores --table IV V --intervals
+    su3d-bench report tables runs/my-run --tables II III --format latex --out tables.tex
+    su3d-bench report tables runs/my-run scores --tables IV V --intervals
     """
     tables = _tables(arguments)
     output.answer_or_write(arguments, list(map(asdict, tables)), tables)
@@ -77,19 +78,19 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         scenes_count=arguments.scenes_count,
         only_significant=arguments.significant,
     )
-    with_published = bool(arguments.table) if arguments.published is None else arguments.published
+    with_published = bool(arguments.tables) if arguments.published is None else arguments.published
     every = measured_results(arguments.runs)
-    is_selection = bool(arguments.table or arguments.protocols or arguments.metrics)
+    is_selection = bool(arguments.tables or arguments.protocols or arguments.metrics)
     found = [] if is_selection else found_tables(arguments.runs, arguments.methods, arguments.datasets)
     if not found:
         check_scored(every, arguments.runs)
     elif not any(row.per_scene for row in every):
         return found
     measured = choose(every, arguments.methods, arguments.protocols, arguments.datasets)
-    if not arguments.table:
+    if not arguments.tables:
         return [*selection_tables(measured, shown, with_published=with_published), *found]
     return numbered_tables(
-        tuple(dict.fromkeys(arguments.table)), measured, arguments.runs, shown, with_published=with_published
+        tuple(dict.fromkeys(arguments.tables)), measured, arguments.runs, shown, with_published=with_published
     )
 
 
@@ -143,24 +144,20 @@ def call_timing(arguments: argparse.Namespace) -> None:
     remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
 
-FORMATS = ("csv", "parquet")
-
-
 def _add_instances(verbs: Verbs) -> None:
     parser = add_verb(verbs, "instances", call_instances)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
-    parser.option("--format", "csv or parquet (default: by the suffix of --out, else csv)", choices=FORMATS)
-    parser.option("--out FILE", "file to write (default: print CSV)", type=output_path)
+    parser.option("--out FILE", ".csv or .parquet file to write (default: print CSV)", type=output_path)
     parser.option("--describe-columns", "describe the columns and exit")
-    parser.shared("--table-format")
+    parser.set_defaults(table_format=None)
 
 
 def call_instances(arguments: argparse.Namespace) -> None:
     """List every predicted and ground-truth instance: class, confidence, best IoU, error type, box.
 
     su3d-bench report instances runs/my-run --out instances.csv
-    su3d-bench report instances runs/a runs/b --methods opensu3d --format parquet --out instances.parquet
+    su3d-bench report instances runs/a runs/b --methods opensu3d --out instances.parquet
     """
     from su3d_bench.analysis.instances import Selection, instance_rows
     from su3d_bench.core.files.atomic import make_folder, write_bytes
@@ -173,10 +170,8 @@ def call_instances(arguments: argparse.Namespace) -> None:
         output.answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
         return
     out = arguments.out
-    form = arguments.format or ("parquet" if out is not None and out.suffix == ".parquet" else "csv")
-    if form == "parquet":
-        if out is None:
-            raise ConfigError("--format parquet: is binary; name a file with --out instances.parquet")
+    is_parquet = out is not None and out.suffix == ".parquet"
+    if is_parquet:
         parquet_of(())  # fail early if it is not installed
     chosen = Selection(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
@@ -185,7 +180,7 @@ def call_instances(arguments: argparse.Namespace) -> None:
     remark(*found.remarks, quiet=arguments.quiet)
     if out is not None:
         make_folder(out.parent)
-        write_bytes(out, parquet_of(found.rows) if form == "parquet" else csv_of(found.rows).encode())
+        write_bytes(out, parquet_of(found.rows) if is_parquet else csv_of(found.rows).encode())
     if output.answer_json(arguments, [asdict(row) for row in found.rows]):
         return
     if out is None:
@@ -200,7 +195,7 @@ def _add_leaderboard(verbs: Verbs) -> None:
     parser = add_verb(verbs, "leaderboard", call_leaderboard)
     parser.option("folder DIR", "folder to search for runs", type=searched_folder)
     parser.shared("--protocols")
-    parser.option("--intervals", "show 95 %% confidence intervals of scores and ranks")
+    parser.option("--intervals", "show 95 %% confidence intervals (of scores and ranks)")
     parser.shared("--format")
     parser.option("--out FILE", "file to write (default: print)", type=output_path)
 
@@ -223,7 +218,7 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
 def _add_attribution(verbs: Verbs) -> None:
     parser = add_verb(verbs, "attribution", call_attribution)
     parser.shared("run")
-    parser.option("--method METHOD", "method to analyse (default: the only one of the run)")
+    parser.option("--method METHOD", "method to use (default: the only one of the run)")
     parser.shared("--protocols")
     parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
     parser.option("--out FIGURE", ".pdf, .png or .svg plot to write")
@@ -253,9 +248,7 @@ def call_attribution(arguments: argparse.Namespace) -> None:
 def _add_power(verbs: Verbs) -> None:
     parser = add_verb(verbs, "power", call_power)
     parser.option("runs RUN...", "finished run, and others that differ only in --seed")
-    parser.option(
-        "--methods", "the two methods to compare (default: the only two)", nargs=2, default=(), metavar=("A", "B")
-    )
+    parser.shared("--methods", help="methods to use (two; default: the only two)", nargs=2, default=())
     parser.option(
         "--points N...",
         "differences to detect, in percentage points (default: 1 2 5)",

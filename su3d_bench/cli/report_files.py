@@ -22,7 +22,7 @@ def add_pages(verbs: Verbs) -> None:
     parser.shared("runs")
     parser.option("--out FILE", "page to write (default: page.html)", type=output_path, default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
-    parser.option("--queries TEXT...", "texts for the similarity view (default: eight built-in texts)")
+    parser.option("--texts TEXT...", "texts to compare with maps (default: eight built-in texts)")
     parser.option("--no-maps", "omit the maps")
     parser.option("--no-errors", "omit the error analysis and the gallery (faster)")
     parser.option("--no-gallery", "omit the gallery of errors")
@@ -50,7 +50,7 @@ def call_html(arguments: argparse.Namespace) -> None:
     """Create a self-contained HTML report: scores, errors, timings, comparisons and 3D maps.
 
     su3d-bench report html runs/my-run --out page.html
-    su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors
+    su3d-bench report html runs/a runs/b --texts "a place to sit" "a plant" --no-errors
     """
     from su3d_bench.analysis.page.contents import QUERIES, PageOptions, page_contents
     from su3d_bench.analysis.page.gallery import summary_of
@@ -59,7 +59,7 @@ def call_html(arguments: argparse.Namespace) -> None:
     if not 0 < arguments.max_size_mb <= 1000:
         raise ConfigError(f"--max-size-mb {arguments.max_size_mb:g}: must be above 0 and at most 1000")
     wishes = PageOptions(
-        queries=QUERIES if arguments.queries is None else tuple(printable(text, 120) for text in arguments.queries),
+        queries=QUERIES if arguments.texts is None else tuple(printable(text, 120) for text in arguments.texts),
         max_bytes=round(arguments.max_size_mb * MEGABYTE),
         with_maps=not arguments.no_maps,
         with_errors=not arguments.no_errors,

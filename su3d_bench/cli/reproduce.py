@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb, output_path
+from su3d_bench.cli.options import EXECUTOR, SHARED, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
@@ -33,20 +33,18 @@ RUN_OPTIONS = (
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "reproduce", call, resumes=True)
     parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
-    parser.option("--table NAME...", "experiments to run (default: all)", default=[])
+    parser.option("--tables TABLE...", "tables of the paper (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)
     parser.shared("--dry-run")
     parser.option("--rehearse", "run on synthetic rooms in the datasets' file layouts, with embedded perception")
     parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
     parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160")
-    parser.option("--predictions METHOD=DIR...", "predictions of methods that are not implemented here", default=[])
     parser.option(
-        "--text-features METHOD=FILE...",
-        "text features for these predictions, as in evaluate",
-        default=[],
+        "--predictions METHOD=PREDICTIONS...", "predictions of several methods (not implemented here)", default=[]
     )
+    parser.option("--text-features METHOD=FILE...", SHARED["--text-features"]["help"], default=[])
     parser.shared("--profile")
-    parser.option("--encoder ENCODER", "encoder of all runs (default: set by the recipe)")
+    parser.option("--encoder ENCODER", "encoder to use (default: set by the recipe)")
     parser.shared("--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR, "--set")
     parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)", type=output_path)
     parser.shared("--format")
@@ -55,15 +53,15 @@ def add_parser(verbs: Verbs) -> None:
 def call(arguments: argparse.Namespace) -> int:
     """Reproduce the experiments of a paper: runs, tables next to the published ones, and an archive.
 
-    su3d-bench reproduce opensu3d --table II III --dry-run
-    su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse
+    su3d-bench reproduce opensu3d --tables II III --dry-run
+    su3d-bench reproduce opensu3d --tables I II III IV V reasoning --rehearse
     """
     from su3d_bench.reproducing.recipe import load_recipe
 
     if arguments.recipe is None:
         return _list_recipes(arguments)
     recipe = load_recipe(arguments.recipe)
-    experiments = recipe.chosen(arguments.table)
+    experiments = recipe.chosen(arguments.tables)
     rehearsal = [name for name in ("rooms", "room_settings") if getattr(arguments, name)]
     if rehearsal and not arguments.rehearse:
         raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: needs --rehearse")

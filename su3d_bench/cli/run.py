@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "run", call_run, resumes=True)
-    parser.option("--methods METHOD...", "methods, variants, file.py:Class, or all (default: opensu3d)")
+    parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
     _add_run_options(parser)
     parser = add_verb(verbs, "ablate", call_ablate, resumes=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
-    parser.option("--method METHOD", "method to vary, or file.py:Class (default: opensu3d)", default="opensu3d")
+    parser.option("--method METHOD", "method to use (or file.py:Class; default: opensu3d)", default="opensu3d")
     parser.option("--also-methods METHOD...", "additional methods to run without variation", default=[])
     parser.option("--grid", "run every combination instead of one setting at a time")
     _add_run_options(parser)
@@ -33,8 +33,8 @@ def add_parser(verbs: Verbs) -> None:
 def _add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
-    parser.option("--scenes SCENE...", "scenes or patterns (default: 'rooms/*')")
-    headline = "protocols to score (default: the dataset's headline protocol)"
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
+    headline = "protocols to use (default: the dataset's headline protocol)"
     parser.option("--protocols PROTOCOL...", headline, action="extend")
     parser.shared("--all-protocols")
     parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
@@ -168,5 +168,7 @@ def call_ablate(arguments: argparse.Namespace) -> int:
     if code == EXIT_DONE and not arguments.dry_run:
         write_rows(plan.folder.path, rows, joins=arguments.extend)
         plan.place.publish()
-        remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
+        remark(
+            f"table: su3d-bench report tables {plan.folder.path} --tables I", quiet=arguments.quiet or arguments.json
+        )
     return code

@@ -41,9 +41,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("runs RUN...", "run folders")
     parser.option("--yes", "do not ask for confirmation")
     parser = add_verb(actions, "refine", call_refine)
-    parser.shared("run")
-    parser.shared("--method")
-    parser.option("--scenes SCENE...", "scenes to refine (default: all)", default=[])
+    parser.shared("run", "--method", "--scenes")
     parser.option(
         "--refiner",
         "vote (sum of scores) or model (language model, as in the paper)",

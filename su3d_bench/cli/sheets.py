@@ -22,7 +22,7 @@ SHOWN_FAULTS = 200  # lines; the total is printed
 def add_parser(verbs: Verbs) -> None:
     """Human evaluation: create annotation sheets, score answers, and draw figures.
 
-    su3d-bench sheets make runs/my-run --kind retrieval --out sheets
+    su3d-bench sheets make runs/my-run --kinds retrieval --out sheets
     su3d-bench sheets score ann.csv bob.xlsx --key sheets-key
     """
     actions = add_group(verbs, "sheets", add_parser)
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
     parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: answers from the ground truth)")
-    parser.option("--key FILE", "key.json of the sheets, or its folder", required=True)
+    parser.option("--key DIR", "folder of the key: which method made what (or its key.json)", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: found near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
     parser.option("--disputed FILE", "write disputed questions to this CSV file, for --exclude-ids", type=output_path)
@@ -160,7 +160,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.shared("run")
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
-    parser.option("--queries TEXT...", "texts, or questions to answer", default=[])
+    parser.option("--texts TEXT...", "texts to compare with maps (or questions to answer)", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
     parser.shared("--scenes", "--methods")
     parser.option("--photo", "add a column with the colours of the scene")
@@ -184,7 +184,7 @@ def _with_maps_to_draw(source: RunSource, arguments: argparse.Namespace) -> RunS
 def call_pictures(arguments: argparse.Namespace) -> None:
     """Draw a figure of a run: similarity to texts, original and refined labels, or answers.
 
-    su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
+    su3d-bench sheets pictures runs/my-run --texts 'plant on shelf' 'place to sit' --out heat.pdf
     su3d-bench sheets pictures runs/my-run --paper-figure schemes --scenes replica/room0 --out schemes.pdf
     """
     from su3d_bench.human_eval.drawing import Figures
@@ -195,14 +195,14 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.finished import read_run
 
     of_figure = () if arguments.paper_figure is None else figure_texts(arguments.paper_figure)
-    texts = [*of_figure, *(query.strip() for query in arguments.queries)]
+    texts = [*of_figure, *(query.strip() for query in arguments.texts)]
     if (arguments.draw == "labels") == bool(texts) or not all(texts):
         what = "labels take none" if arguments.draw == "labels" else f"{arguments.draw} needs at least one, not empty"
-        raise ConfigError(f"--queries: {what}")
+        raise ConfigError(f"--texts: {what}")
     run = read_run(arguments.run)
     scenes = arguments.scenes or run.scenes[:1]
     if len(scenes) * max(1, len(texts)) > MAX_ROWS:
-        raise ConfigError(f"--queries, --scenes: give {len(scenes) * len(texts)} rows; at most {MAX_ROWS} fit a figure")
+        raise ConfigError(f"--texts, --scenes: give {len(scenes) * len(texts)} rows; at most {MAX_ROWS} fit a figure")
     source = RunSource(run, arguments.methods, scenes)
     if not arguments.methods:
         source = _with_maps_to_draw(source, arguments)

@@ -33,15 +33,15 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", call)
-    parser.option("run [RUN]", "run folder (not needed for --kind questions with --scenes)")
+    parser.option("run [RUN]", "run folder (not needed for --kinds questions with --scenes)")
     parser.option(
-        "--kind ...",
+        "--kinds ...",
         "objects found, labels and masks, answers, questions; a folder per kind if several",
         choices=KINDS,
         required=True,
     )
     parser.option("--out DIR", "folder for the sheets", type=output_path, required=True)
-    parser.option("--key DIR", "folder for the key: which method made what (default: <--out>-key)", type=output_path)
+    parser.option("--key DIR", "folder of the key: which method made what (default: <--out>-key)", type=output_path)
     parser.option(
         "--questions FILE",
         "'generated' (default), 'paper' (those of OpenSU3D's paper), or a question file",
@@ -50,14 +50,14 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.shared("--methods")
     parser.option(
-        "--scenes S...",
-        "scenes of RUN (default: all); without RUN: scenes or patterns",
+        "--scenes SCENE...",
+        "scenes or patterns to use (default: all of RUN)",
         default=[],
     )
     parser.shared("--exclude-ids")
     parser.option(
         "--per-kind N",
-        "maximum number of items per kind and scene (default: depends on the kind)",
+        "maximum number per kind and scene (default: depends on the kind)",
         type=count,
     )
     parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
@@ -77,8 +77,8 @@ def add_parser(verbs: Verbs) -> None:
 def call(arguments: argparse.Namespace) -> None:
     """Create annotation sheets for a run or for questions: an offline page, a workbook and a CSV.
 
-    su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
-    su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
+    su3d-bench sheets make runs/my-run --kinds retrieval annotation reasoning --annotators 3 --out sheets
+    su3d-bench sheets make --kinds questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
     """
     from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run
     from su3d_bench.questions.query_files import read_excluded_ids
@@ -86,7 +86,7 @@ def call(arguments: argparse.Namespace) -> None:
 
     _check(arguments)
     left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
-    kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kind))
+    kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kinds))
     origins: dict[SheetKind, Key] = {}
     drafts: dict[SheetKind, list[Draft]] = {}
     drawn: dict[SheetKind, list[bytes]] = {}
@@ -120,18 +120,18 @@ def call(arguments: argparse.Namespace) -> None:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Raise ``ConfigError`` for options that do not fit together."""
-    kinds = set(arguments.kind)
+    kinds = set(arguments.kinds)
     if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
-        raise ConfigError("RUN: name a run folder; only --kind questions works without one, with --scenes")
+        raise ConfigError("RUN: name a run folder; only --kinds questions works without one, with --scenes")
     has_questions = arguments.questions != "generated"
     if kinds == {"annotation"} and (has_questions or arguments.exclude_ids is not None):
         raise ConfigError("--questions, --exclude-ids: not valid for annotation sheets, which have no questions")
     if kinds == {QUESTIONS} and (has_questions or arguments.methods):
         raise ConfigError(
-            "--questions, --methods: not valid for --kind questions, which uses questions from the ground truth"
+            "--questions, --methods: not valid for --kinds questions, which uses questions from the ground truth"
         )
-    if arguments.question_solver == "llm" and "reasoning" not in arguments.kind:
-        raise ConfigError("--question-solver llm: needs --kind reasoning")
+    if arguments.question_solver == "llm" and "reasoning" not in arguments.kinds:
+        raise ConfigError("--question-solver llm: needs --kinds reasoning")
     if arguments.question_solver != "llm" and (given := options.given_language_option(arguments)):
         raise ConfigError(f"{given}: only valid with --question-solver llm")
 

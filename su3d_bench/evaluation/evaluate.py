@@ -27,7 +27,7 @@ from su3d_bench.metrics import compatibility
 from su3d_bench.metrics.protocols.loading import ALL_PROTOCOLS, load_protocol, more_protocols_line, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.predictions.formats import Source, open_sources
+from su3d_bench.predictions.formats import Source, memory_sources, open_sources
 from su3d_bench.predictions.run_predictions import OWN_RUNS
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 
@@ -51,7 +51,11 @@ def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluatio
     # Load.
     _check_values_have_texts(request, is_text=request.ground_truth is not None)
     texts = read_text_features(request.text_features)
-    sources = open_sources(request.predictions, request.format, request.contents)
+    sources = (
+        open_sources(request.predictions, request.format, request.method)
+        if request.contents is None
+        else memory_sources(request.contents)
+    )
 
     # Match to ground truth.
     truths = _open_truths(request, sources)

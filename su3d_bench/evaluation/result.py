@@ -32,7 +32,7 @@ class Request:
     ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
     the values in the files ("file"); None: those in the files for the formats of ScanNet's and MaskClustering's
     scripts, as these do, and the protocol's rule for all others. ``queries``: a file of texts and the objects that they
-    refer to, for ``query-ap``.
+    refer to, for ``query-ap``. ``method``: the one to score of a run folder with several.
     """
 
     predictions: tuple[Path, ...]
@@ -46,6 +46,7 @@ class Request:
     text_features: Path | None = None
     confidences: Confidences | None = None
     queries: Path | None = None
+    method: str | None = None
 
 
 def default_name(out: Path | None) -> str:

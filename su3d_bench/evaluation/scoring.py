@@ -22,8 +22,7 @@ from su3d_bench.metrics.instance.score import (
     named_classes,
     without_labels,
 )
-from su3d_bench.metrics.matching import checks
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import checks, transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, scored_classes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth

@@ -107,11 +107,11 @@ def plan_models(sources: Sources, names: Sequence[str], profile: str | None, roo
     """The plan for the models ``names`` and those of a profile, each with its existing place."""
     if profile is not None and profile not in PROFILE_MODELS:
         known = ", ".join(PROFILE_MODELS)
-        raise ConfigError(f"fetch models --for {profile}: no models for this profile; known: {known}")
+        raise ConfigError(f"models fetch --profile {profile}: no models for this profile; known: {known}")
     wanted = [*names, *(PROFILE_MODELS[profile] if profile is not None else ())]
     wanted += PAPERS_ENCODERS if profile == "paper" else ()
     if not wanted:
-        raise ConfigError("fetch models: no models given; name models, or the profile that needs them: --for paper")
+        raise ConfigError("models fetch: no models given; name models, or the profile that needs them: --profile paper")
     return [_planned_model(sources.named(name, "models"), root) for name in dict.fromkeys(wanted)]
 
 

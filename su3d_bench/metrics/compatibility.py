@@ -191,7 +191,7 @@ def content_incompatibility(rules: ProtocolRules, content: ContentFacts, *, has_
     if rules.class_numbers != "ids" and rules.class_agnostic is None and has_ids:
         return (
             "its files number the classes by their index in the list, these are read as class ids; name the "
-            "format with such numbers with --format"
+            "format with such numbers with --input-format"
         )
     if rules.needs_own_points and not content.has_own_points:
         return "needs a map with its own points, the prediction is over the points of another ground truth"

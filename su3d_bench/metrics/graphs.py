@@ -19,9 +19,10 @@ from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import UP, Float64Array, Floor, GroundTruth, Int64Array, Places, Room
 from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import score_of_masks
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, has_every_label, similarities
-from su3d_bench.metrics.matching.nearest import row_ids, without_crowds
+from su3d_bench.metrics.matching.nearest import without_crowds
+from su3d_bench.metrics.matching.rows import row_ids
 from su3d_bench.metrics.metric import Counts, Metric, SceneScore, axes
 from su3d_bench.metrics.protocols.kinds import OBJECT_RANKS
 from su3d_bench.metrics.protocols.model import ProtocolRules

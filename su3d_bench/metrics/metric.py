@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import n_farther
+from su3d_bench.metrics.matching.transfer import n_farther
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean, ratio
 

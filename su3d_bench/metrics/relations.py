@@ -14,9 +14,10 @@ from su3d_bench.core.maps import Instances, Masks, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import named_classes, score_of_masks
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning
-from su3d_bench.metrics.matching.nearest import Points, nearest, rows_of
+from su3d_bench.metrics.matching.nearest import Points, nearest
+from su3d_bench.metrics.matching.rows import rows_of
 from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, first_row
 from su3d_bench.numerics.relations import RELATIONS, Relation, Relations
 from su3d_bench.numerics.statistics import nan_mean, ratio

@@ -25,7 +25,7 @@ from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.graphs import ObjectMetric, PlaceMetric
 from su3d_bench.metrics.instance.boxes import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.checks import LOW_COVERAGE, check_cloud, map_warnings
 from su3d_bench.metrics.metric import MAX_COUNTED, Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth

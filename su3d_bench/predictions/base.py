@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError, PredictionError, printable, readin
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MAX_MASKS, MAX_POINTS, check_members
-from su3d_bench.metrics.matching.nearest import masks_of_partition
+from su3d_bench.metrics.matching.transfer import masks_of_partition
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 NO_SCORES = "the file has no scores: 1 for every mask"

@@ -23,7 +23,7 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
 from su3d_bench.metrics.protocols.model import ProtocolRules

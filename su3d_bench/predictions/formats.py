@@ -11,13 +11,13 @@ from su3d_bench.formats.torch_files import SparseTensor
 from su3d_bench.predictions import dense, hovsg, masks, objects
 from su3d_bench.predictions import scannet_text as text
 from su3d_bench.predictions.base import Content, Reader, file_format, folder_format
-from su3d_bench.predictions.run_predictions import OWN_RUNS
+from su3d_bench.predictions.run_predictions import OWN_RUNS, of_method
 from su3d_bench.predictions.scannet_text import text_format
 from su3d_bench.store.records import RunRecord, read_record
 
 # How the files of each format are recognized and read, and their origin.
 _ALL = (
-    OWN_RUNS,  # prediction.npz of this program, or a run folder with those of one method
+    OWN_RUNS,  # prediction.npz of this program, or a run folder
     # ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (also Mask3D, Segment3D)
     text_format("scannet-text", text.looks_like_list, text.scannet_masks),
     # ScanNet's semantic submission: <scene>.txt with one class id per line, one line per point
@@ -89,9 +89,9 @@ def recognise(path: Path, format: str | None = None) -> Reader:
     if not fitting:
         file, line = text.first_line(path) or (path, "")
         why = f"; {shown(file)}:1: '{printable(line, 80)}' is neither {text.LIST_FORM} nor a class id" if line else ""
-        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}){why}; name it with --format")
+        raise PredictionError(f"{path}: is in no known format ({', '.join(READERS)}){why}; name it with --input-format")
     reasons = "; ".join(f"{name}: {why}" for name, why in fitting.items())
-    raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --format")
+    raise PredictionError(f"{path}: could be in {len(fitting)} formats ({reasons}); name one with --input-format")
 
 
 @dataclass(frozen=True)
@@ -112,20 +112,20 @@ class Match:
     source: Source
 
 
-def open_sources(
-    paths: Sequence[Path], format: str | None, contents: Mapping[str, Content] | None = None
-) -> list[Source]:
-    """Every path with the reader that recognizes it; for ``contents``, by scene, a source in memory."""
-    if contents is not None:
-        place = Path(IN_MEMORY)
-        places = dict.fromkeys(contents, place)
-        reader = Reader(IN_MEMORY, lambda _: None, lambda _: places, lambda _, scene: (contents[scene], ()))
-        return [Source(place, reader, tuple(contents))]
+def memory_sources(contents: Mapping[str, Content]) -> list[Source]:
+    """The one source of maps in memory, by scene."""
+    places = dict.fromkeys(contents, Path(IN_MEMORY))
+    reader = Reader(IN_MEMORY, lambda _: None, lambda _: places, lambda _, scene: (contents[scene], ()))
+    return [Source(Path(IN_MEMORY), reader, tuple(contents))]
+
+
+def open_sources(paths: Sequence[Path], format: str | None, method: str | None = None) -> list[Source]:
+    """Every path with the reader that recognizes it; ``method``: the one to read of a run with several."""
     if not paths:
         raise ConfigError("evaluate: no predictions given; name a folder or files")
     sources = []
     for path in paths:
-        reader = recognise(path, format)
+        reader = of_method(recognise(path, format), method)
         scenes = tuple(reader.scenes(path))
         if not scenes:
             raise PredictionError(f"{shown(path)}: has no prediction in the format {reader.name}")
@@ -211,7 +211,7 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
     planned: list[str] = []
     for source in sources:
         record_file = source.path / "run.json"
-        if source.reader is not OWN_RUNS or not record_file.is_file():
+        if source.reader.name != OWN_RUNS.name or not record_file.is_file():
             return None
         try:
             record = read_record(RunRecord, record_file, str(source.path))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.formats.arrays import array_of
 from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npz
 from su3d_bench.predictions.base import Content, Numbering, Parsed, Reader, VertexLabels, VertexMasks, named
@@ -124,10 +127,10 @@ def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMask
         return VertexMasks(**values, n_points=None if n_points < 0 else n_points, keys=keys, numbering=numbering)
 
 
-def _files(path: Path) -> dict[str, Path]:
+def _files(path: Path, method: str | None = None) -> dict[str, Path]:
     """The predictions in a run folder, its ``scenes`` or a scene's folder, by address; or the one file.
 
-    Raises ``PredictionError`` if a scene has those of several methods.
+    Raises ``PredictionError`` if there are several methods and ``method`` is none of them.
     """
     if path.is_file():
         return {_scene_of(path): path} if path.suffix == ".npz" else {}
@@ -136,7 +139,9 @@ def _files(path: Path) -> dict[str, Path]:
         ("", sorted(path.glob(FILE))),
     )
     methods = sorted({file.parent.name for file in files})
-    if len(methods) > 1:
+    if len(methods) > 1 and method in methods:
+        files = [file for file in files if file.parent.name == method]
+    elif len(methods) > 1:
         raise PredictionError(
             f"{shown(path)}: contains predictions of {len(methods)} methods ({printable(', '.join(methods), 120)}); "
             f"give the folders of one: {shown(path)}/{above}{printable(methods[0], 60)}"
@@ -153,3 +158,14 @@ def _scene_of(file: Path) -> str:
 
 
 OWN_RUNS = Reader("su3d-bench", looks_like_ours, _files, stored_prediction)
+
+
+def of_method(reader: Reader, method: str | None) -> Reader:
+    """``reader``, which of a run folder with several methods reads that of ``method``."""
+    return replace(reader, scenes=partial(_files, method=method)) if reader is OWN_RUNS else reader
+
+
+def methods_of(path: Path) -> list[str]:
+    """The methods of a run folder with the maps of several, without the ceiling."""
+    methods = {file.parent.name for file in path.glob(f"{JOBS}/*/*/{FILE}")}
+    return sorted(methods - {CEILING_METHOD}) if len(methods) > 1 else []

@@ -321,7 +321,7 @@ def compared_all(experiments: Sequence[Experiment], results: Results) -> dict[st
 
 
 def tables_of(experiment: Experiment, results: Results) -> list[Table]:
-    """The paper's own table of an experiment, as in ``report tables --table``; empty if it has none."""
+    """The paper's own table of an experiment, as in ``report tables --tables``; empty if it has none."""
     if experiment.table is None:
         return []
     results = results.of(experiment)

@@ -168,7 +168,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
-        how = f"su3d-bench models fetch {'--for paper' if name in FETCHED_FOR_PAPER else name}"
+        how = f"su3d-bench models fetch {'--profile paper' if name in FETCHED_FOR_PAPER else name}"
         return Need("model", name, is_available=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_available=True, n_bytes=0.0, remark=str(files.folder))
 

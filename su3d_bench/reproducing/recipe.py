@@ -391,12 +391,12 @@ class GivenPredictions:
 def named_predictions(
     experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
 ) -> dict[str, GivenPredictions]:
-    """The predictions given by ``METHOD=DIR`` and ``METHOD=FILE``, by printed method.
+    """The predictions given by ``METHOD=PREDICTIONS`` and ``METHOD=FILE``, by printed method.
 
     Raises ``ConfigError`` if no experiment accepts predictions of a method, it is named twice, or a path is missing.
     """
     places = _named(
-        "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
+        "--predictions", "PREDICTIONS", dict.fromkeys(name for one in experiments for name in one.predictions), texts
     )
     features = _named("--text-features", "FILE", places, text_features)
     return {method: GivenPredictions(place, features.get(method)) for method, place in places.items()}

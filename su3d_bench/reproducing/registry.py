@@ -337,7 +337,7 @@ def read_registry(folder: Path) -> Registry:
     files = bundle_files(folder)
     if not files and not (folder / BUNDLES).is_dir():
         raise ConfigError(
-            f"{shown(folder)}: contains no bundles; add one with: su3d-bench dev registry add BUNDLE --to DIR"
+            f"{shown(folder)}: contains no bundles; add one with: su3d-bench dev registry add BUNDLE --registry DIR"
         )
     rows: list[Row] = []
     refused: list[Refused] = []
@@ -394,13 +394,13 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
     before = _digest(file)
     rows, refused = rows_of_bundle(file)
     if is_there and name is not None:
-        raise ConfigError(f"--name: {shown(file)} is already in the registry; rename the file itself")
+        raise ConfigError(f"--bundle-name: {shown(file)} is already in the registry; rename the file itself")
     place = file if is_there else _place(registry, file, rows, name)
     found = Added(printable(file.name, 120), printable(str(place), 300), len(rows))
     reasons = [f"{one.what}: {one.reason}" for one in refused]
     reasons = reasons or list(_beside(rows, others, before))
     if not reasons and not is_there and os.path.lexists(place):
-        reasons.append(f"{printable(place.name, 120)} is taken by another bundle; choose another with --name")
+        reasons.append(f"{printable(place.name, 120)} is taken by another bundle; choose another with --bundle-name")
     if reasons:
         return replace(found, reasons=tuple(reasons))
     verified = verify_bundle(file)
@@ -452,7 +452,7 @@ def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) ->
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"'{printable(name, 100)}' is not a valid bundle name (only letters, digits, '.', '_' and '-'); choose one "
-            "with --name"
+            "with --bundle-name"
         )
     folder = registry / BUNDLES if (registry / BUNDLES).is_dir() or not bundle_files(registry) else registry
     return folder / f"{name}{SUFFIX}"

@@ -142,7 +142,10 @@ class RunRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class NumbersRecord:
-    """``result`` of a result: the numbers over the scored scenes as fractions, null if undefined."""
+    """``result`` of a result: the numbers over the scored scenes as fractions, null if undefined.
+
+    ``metrics``: as reported; ``pooled``: from the summed counts; ``scene_mean``: mean over scenes.
+    """
 
     protocol: str = ""
     version: int = 0

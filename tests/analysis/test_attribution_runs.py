@@ -243,6 +243,6 @@ def test_attribution_command_prints_a_table_and_draws_the_plot(capsys: pytest.Ca
     assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "errors.eps"]) == 2
     assert "unknown format of a figure; use a suffix of pdf, svg, png" in capsys.readouterr().err
     capsys.readouterr()
-    assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
+    assert main(["report", "attribution", "dropped", "--protocols", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]

@@ -202,7 +202,7 @@ def test_incomparable_runs_are_an_error_naming_the_field(sides: tuple[str, str],
 
 
 def test_compare_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", "a", "b", "--protocol", "rooms-instance", "--per-class"]) == 0
+    assert main(["compare", "a", "b", "--protocols", "rooms-instance", "--per-class"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| AP "))
     cells = [cell.strip() for cell in row.strip("|").split("|")]

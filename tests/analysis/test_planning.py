@@ -94,7 +94,7 @@ def test_needed_scenes_follow_from_the_pseudo_values_of_the_runs(n_seeds: int) -
 
 def test_power_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["report", "power", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10"]
-    words += ["--protocol", "rooms-instance"]
+    words += ["--protocols", "rooms-instance"]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text

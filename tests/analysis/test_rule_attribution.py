@@ -44,7 +44,7 @@ def test_each_rule_gets_its_share_and_the_reverse_direction_negates_it(made: Pat
 def test_protocols_diff_prints_a_table_draws_a_plot_and_writes_json(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["protocols", "diff", "rooms-instance", "replica-openmask3d", "--prediction", f"{made}:collector"]
+    words = ["protocols", "diff", "rooms-instance", "replica-openmask3d", "--run", f"{made}:collector"]
     assert main([*words, "--jobs", "1", "--out", str(tmp_path / "walk.png")]) == 0
     shown = capsys.readouterr().out
     assert "classes, ignore" in shown and "transfer.evaluation_voxel_m" in shown

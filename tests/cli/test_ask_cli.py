@@ -145,7 +145,7 @@ def test_dry_run_reports_the_cost_and_sends_no_request(
         (f"query ask {SCENE} ' '", "the question is empty"),
         ("query ask rooms/none x", "no run in runs/ has rooms/none by opensu3d"),
         (f"query text {SCENE} x --run runs/made --method opensud", "by opensud; did you mean 'opensu3d'?"),
-        (f"query ask {SCENE} x --names refined", "no labels n'; create them with su3d-bench runs refine"),
+        (f"query ask {SCENE} x --labels refined", "no labels n'; create them with su3d-bench runs refine"),
         (f"query ask {SCENE} x --eye nan 0 0", "expected three finite numbers (metres)"),
         (f"query ask {SCENE} x --question-solver llm --offline", "no stored reply to this ask request"),
         (
@@ -185,7 +185,7 @@ def test_ask_uses_refined_labels_by_vote(job: JobFolder, capsys: pytest.CaptureF
     assert main(["query", "ask", SCENE, "Where is the sofa?", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["object_ids"], result["names"]) == ([10], "labels n' by vote")
-    assert main(["query", "ask", SCENE, "Where is the sofa?", "--names", "label"]) == 0
+    assert main(["query", "ask", SCENE, "Where is the sofa?", "--labels", "label"]) == 0
     assert "I cannot settle this" in capsys.readouterr().out
 
 

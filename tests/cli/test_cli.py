@@ -75,9 +75,33 @@ def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.
     assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")
 
 
+def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
+    meanings: dict[str, dict[tuple[str, str], str]] = {}
+    names: dict[str, set[str]] = {}
+    for words, parser in verbs():
+        for action in parser._actions:
+            if not action.option_strings or action.dest == "help":
+                continue
+            name, text = action.option_strings[0], str(action.help).partition(" (")[0]
+            value = str(action.metavar).rpartition("=")[2]
+            if name != "--out":  # its help says what is written
+                meanings.setdefault(name, {}).setdefault((text, value), " ".join(words))
+                names.setdefault(text, set()).add(name)
+            noun = re.sub(r"ies$", "y", name[2:].removesuffix("s")).replace("-", "_").upper()
+            if action.metavar == noun:
+                assert (action.nargs is not None) == name.endswith("s"), (words, name)
+    assert {name: uses for name, uses in meanings.items() if len(uses) > 1} == {}
+    assert [several for several in names.values() if len(several) > 1] == []
+    for name, uses in meanings.items():
+        plural = meanings.get(f"{name}s", uses)
+        assert {value for _, value in plural} == {value for _, value in uses}, name
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
+        ("run rooms/living0 --method oracle", "run: unknown argument '--method'; did you mean '--methods'?"),
+        ("evaluate p --table-format csv", "evaluate: unknown argument '--table-format'; did you mean '--format'?"),
         ("rum", "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
@@ -96,7 +120,7 @@ def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.
         (f"{TYPED} --config none.toml", "none.toml: cannot read the configuration: No such file or directory"),
         ("protocols shwo", "protocols: unknown action 'shwo'; did you mean 'show'? known: list, show, "),
         ("report runs/demo", "report: unknown action 'runs/demo'; known: tables, timing, html, "),
-        ("report tables r --table VI", "report tables: unknown --table 'VI'; did you mean 'V'? known: I, "),
+        ("report tables r --tables VI", "report tables: unknown --tables 'VI'; did you mean 'V'? known: I, "),
         (
             f"query text {PAINTED}/a x",
             f"no run in runs/ has {PAINTED}/a by opensu3d; create one: su3d-bench run {PAINTED}/a --methods opensu3d",

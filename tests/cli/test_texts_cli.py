@@ -1,4 +1,4 @@
-"""``protocols texts`` and ``protocols show --names``: encoded texts name features exactly as the run does."""
+"""``protocols texts`` and ``protocols show --list-texts``: encoded texts name features exactly as the run does."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def test_mean_over_several_prompts_equals_that_of_the_encoder() -> None:
 
 
 def test_texts_of_a_protocol_are_listed_one_per_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["protocols", "show", TWO_PROMPTS, "--names"]) == 0
+    assert main(["protocols", "show", TWO_PROMPTS, "--list-texts"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == ["background", "There is the background in the scene."]
-    assert main(["protocols", "show", TWO_PROMPTS, "--names", "--json"]) == 0
+    assert main(["protocols", "show", TWO_PROMPTS, "--list-texts", "--json"]) == 0
     value = json.loads(capsys.readouterr().out)
     assert (value["protocol"], value["encoder"]) == (TWO_PROMPTS, "ViT-H-14/laion2b_s32b_b79k")
     assert value["names"][0] == {"name": "background", "texts": lines[:2]}
@@ -95,7 +95,7 @@ def test_queries_are_encoded_from_every_format(name: str, content: str, capsys: 
         assert made["names"].tolist() == ["a place to sit", "something to eat at"]
         expected = EmbeddedEncoder().encode_texts(made["names"].tolist())
         assert np.array_equal(made["features"], expected)
-    assert main(["protocols", "show", "query-ap", "--names", "--queries", name]) == 0
+    assert main(["protocols", "show", "query-ap", "--list-texts", "--queries", name]) == 0
     assert capsys.readouterr().out == "a place to sit\nsomething to eat at\n"
 
 

@@ -67,7 +67,7 @@ def by_library(folder: Path, protocol: str, confidences: Confidences | None = No
 
 
 def by_command(folder: Path, protocol: str, *more: str) -> dict[str, Any]:
-    words = ["evaluate", str(folder / "pred"), "--ground-truth", str(folder / "gt"), "--protocol", protocol]
+    words = ["evaluate", str(folder / "pred"), "--ground-truth", str(folder / "gt"), "--protocols", protocol]
     assert main([*words, "--json", str(folder / "out.json"), "--quiet", *more]) == 0
     document = json.loads((folder / "out.json").read_text())
     assert document["schema"] == 1

@@ -22,7 +22,7 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_scannet_text(Path("pred"), scene([CHAIR, TABLE][:n], [5, 7][:n], [0.9, 0.8][:n], name=name))
 
 
-WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocol", "scannet-instance"]
+WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocols", "scannet-instance"]
 
 
 def test_table_has_values_with_interval_ceiling_and_warnings(capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,16 +57,16 @@ def test_json_file_has_the_documented_form(capsys: pytest.CaptureFixture[str]) -
 
 
 WRONG = {
-    "": "evaluate: no predictions given; name a folder or files, or use --name METHOD=PREDICTIONS",
+    "": "evaluate: no predictions given; name a folder or files, or --predictions METHOD=PREDICTIONS",
     "pred --out runs/mine --name ../up --ground-truth gt": "--name: '../up' is not a valid folder name",
     "prde --ground-truth gt": "prde: no such file or folder; give the folder of the predictions",
     "pred": "evaluate: no ground truth given; name it with --dataset scannet or --ground-truth DIR",
     "pred --ground-truth .": ".: has no .txt file; expected <scene>.txt, one value per point",
-    "pred --ground-truth gt --protocol scannet-instances": "unknown protocol 'scannet-instances'; did you mean",
-    "pred --ground-truth gt --format scanet-text": "unknown format 'scanet-text'; did you mean 'scannet-text'?",
+    "pred --ground-truth gt --protocols scannet-instances": "unknown protocol 'scannet-instances'; did you mean",
+    "pred --ground-truth gt --input-format scanet-text": "unknown format 'scanet-text'; did you mean 'scannet-text'?",
     "pred --ground-truth gt --scenes scene0009_00": "no scene of gt matches 'scene0009_00'; did you mean",
     "pred --ground-truth gt --text-features none.npz": "none.npz: cannot be read: No such file or directory",
-    "pred --ground-truth gt --protocol replica-mesh-ex6": "pred: scene0001_00: replica-mesh-ex6: needs a class for",
+    "pred --ground-truth gt --protocols replica-mesh-ex6": "pred: scene0001_00: replica-mesh-ex6: needs a class for",
 }
 
 

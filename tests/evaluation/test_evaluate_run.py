@@ -50,8 +50,8 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         write_scannet_text(Path("predB"), text)
 
 
-BOTH = ["evaluate", "--name", "mine=predA", "theirs=predB", "--dataset", PAINTED, "--scenes", "[abc]"]
-PROTOCOLS = ["--protocol", "rooms-instance", "rooms-semantic"]
+BOTH = ["evaluate", "--predictions", "mine=predA", "theirs=predB", "--dataset", PAINTED, "--scenes", "[abc]"]
+PROTOCOLS = ["--protocols", "rooms-instance", "rooms-semantic"]
 RUN = "runs/both"
 
 
@@ -115,7 +115,7 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
     answered(capsys, "check", "--build-from", RUN, "--out", "reference.json")
     assert answered(capsys, "check", RUN, "--against", "reference.json").startswith("passed")
     assert "imported predictions have no timings" in answered(capsys, "report", "timing", RUN, code=2)
-    words = ("sheets", "make", RUN, "--kind", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
+    words = ("sheets", "make", RUN, "--kinds", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
     answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
     assert Path("sheets").is_dir()
     ranking = json.loads(
@@ -124,7 +124,7 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
         )
     )
     assert ranking["ranking"][0]["id"] == 1
-    planned = json.loads(answered(capsys, "report", "power", RUN, "--protocol", "rooms-instance", "--json"))
+    planned = json.loads(answered(capsys, "report", "power", RUN, "--protocols", "rooms-instance", "--json"))
     assert planned["remarks"] == [f"mine: {MINE}", f"theirs: {THEIRS}"]
     answered(capsys, "runs", "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
     assert files_of(RUN) == before
@@ -132,6 +132,11 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
     assert main([*again, "--quiet"]) == 0
     found = json.loads(Path("again.json").read_text())["protocols"]["rooms-instance"]["metrics"]["ap"]
     assert found == documents["mine"]["protocols"]["rooms-instance"]["per_scene"]["a"]["ap"]
+    assert main(["evaluate", RUN, "--dataset", PAINTED, *PROTOCOLS, "--json", "every.json", "--quiet"]) == 0
+    every = json.loads(Path("every.json").read_text())["methods"]
+    assert {name: one["protocols"] for name, one in every.items()} == {
+        name: one["protocols"] for name, one in documents.items()
+    }
 
 
 def test_same_evaluation_keeps_the_folder_and_another_one_is_refused(
@@ -143,7 +148,7 @@ def test_same_evaluation_keeps_the_folder_and_another_one_is_refused(
     assert both() == 0
     assert f"run folder: {RUN} (unchanged: has this evaluation already)" in capsys.readouterr().err
     others = (
-        ([*BOTH, "--protocol", "rooms-instance", "--out", RUN], "protocols"),
+        ([*BOTH, "--protocols", "rooms-instance", "--out", RUN], "protocols"),
         (["evaluate", "predA", "--name", "mine", *BOTH[4:], *PROTOCOLS, "--out", RUN], "methods"),
         ([*BOTH[:-1], "a", *PROTOCOLS, "--out", RUN], "scenes"),
     )
@@ -182,7 +187,7 @@ def _texts() -> None:
         write_scannet_text(Path("pred"), scene(masks, [5, 7][:n], [0.9, 0.8][:n], name=name))
 
 
-TEXTS = ["evaluate", "pred", "--ground-truth", "gt", "--protocol", "scannet-instance", "--out", "runs/mine"]
+TEXTS = ["evaluate", "pred", "--ground-truth", "gt", "--protocols", "scannet-instance", "--out", "runs/mine"]
 
 
 @pytest.mark.usefixtures("_texts")
@@ -202,7 +207,7 @@ def test_run_from_text_ground_truth_has_attribution_and_states_gaps(
         capsys, "query", "text", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2
     )
     assert "uses the points of ground-truth files, which have no coordinates" in query
-    sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
+    sheets = answered(capsys, "sheets", "make", "runs/mine", "--kinds", "annotation", "--out", "sheets", code=2)
     assert sheets.count("\n") == 1 and "uses the points of ground-truth files" in sheets
     answered(capsys, "runs", "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
@@ -218,7 +223,7 @@ def test_text_feature_file_names_features_and_is_needed_for_attribution(
     names = [entry.name for entry in load_protocol("rooms-instance").classes]
     features = EmbeddedEncoder().encode_texts(names)
     np.savez("texts.npz", names=np.array(names), features=features, encoder=np.array("theirs/v1"))
-    words = ["evaluate", "predA", "--dataset", PAINTED, "--scenes", "[abc]", "--protocol", "rooms-instance"]
+    words = ["evaluate", "predA", "--dataset", PAINTED, "--scenes", "[abc]", "--protocols", "rooms-instance"]
     assert main([*words, "--text-features", "texts.npz", "--out", "runs/mine"]) == 0
     result = read_run(Path("runs/mine")).results["mine", "rooms-instance"]
     assert result.encoder == "theirs/v1" and result.result is not None

@@ -57,7 +57,7 @@ def test_dry_run_lists_all_facts_without_network_access(
     code, out, _ = called(["models", "fetch", "sam-vit-h", "--dry-run", "--sources", sam(server, tmp_path)], capsys)
     assert code == 0 and not server.asked and not (tmp_path / "models").exists()
     assert f"{server.url}/{SAM}" in out and "licence MIT: https://example.org/licence" in out
-    code, out, _ = called(["models", "fetch", "--for", "paper", "--dry-run", "--json"], capsys)
+    code, out, _ = called(["models", "fetch", "--profile", "paper", "--dry-run", "--json"], capsys)
     rows = {row["name"]: row for row in json.loads(out)}
     assert list(rows) == ["clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus", "clip-vit-l-14-336"]
     assert all(row["licence"]["read_at"] and row["n_bytes"] and row["addresses"] for row in rows.values())

@@ -151,7 +151,7 @@ def test_question_sheets_do_not_depend_on_maps(run: Path, tmp_path: Path) -> Non
     bare = tmp_path / "bare" / run.name
     shutil.copytree(run, bare, ignore=shutil.ignore_patterns("prediction*", ".cache"))
     assert list(run.rglob("prediction*")) and not list(bare.rglob("prediction*"))
-    words = ["--kind", "questions", "--per-kind", "1", "--jobs", "1", "--scenes", SCENE, "--quiet"]
+    words = ["--kinds", "questions", "--per-kind", "1", "--jobs", "1", "--scenes", SCENE, "--quiet"]
     made = []
     for folder in (run, bare):
         out = tmp_path / ("of-run" if folder == run else "of-bare")

@@ -85,7 +85,7 @@ def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource)
 
 
 def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
+    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--annotators", "2", "--overlap", "1", "--out", "out", "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)["sets"]
     sheet, key = read_sheet(Path("out/sheet.json")), read_key(Path("out-key/key.json"))

@@ -48,14 +48,14 @@ def result(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, An
 
 
 def asked(server: ChatServer, *more: str) -> list[str]:
-    words = ["--kind", "reasoning", "--questions", "asked.csv", "--out", "out", "--question-solver", "llm"]
+    words = ["--kinds", "reasoning", "--questions", "asked.csv", "--out", "out", "--question-solver", "llm"]
     return [*words, "--model", "tiny", "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
 
 
 def test_each_kind_has_a_folder_equal_to_a_single_kind_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    both = result(capsys, "--kind", "annotation", "reasoning", "--per-kind", "2", "--out", "all", "--jobs", "1")
+    both = result(capsys, "--kinds", "annotation", "reasoning", "--per-kind", "2", "--out", "all", "--jobs", "1")
     assert [one["kind"] for one in both] == ["annotation", "reasoning"]
-    (alone,) = result(capsys, "--kind", "annotation", "--per-kind", "2", "--out", "alone")
+    (alone,) = result(capsys, "--kinds", "annotation", "--per-kind", "2", "--out", "alone")
     for name in ("sheet.json", "annotator-1/sheet.csv", "annotator-1/sheet.html", "annotator-1/sheet.xlsx"):
         assert (folder / "all" / "annotation" / name).read_bytes() == (folder / "alone" / name).read_bytes()
     assert alone["sheet_id"] == both[0]["sheet_id"] == read_key(folder / "all-key" / "annotation" / "key.json").sheet_id

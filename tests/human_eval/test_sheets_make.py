@@ -145,7 +145,7 @@ def test_sheets_are_created_from_the_command_line(
     monkeypatch.chdir(painted_folder)
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
     see_painted(monkeypatch)
-    words = ["sheets", "make", "run", "--kind", "retrieval", "--out", "out"]
+    words = ["sheets", "make", "run", "--kinds", "retrieval", "--out", "out"]
     assert main([*words, "--questions", "queries.csv", "--annotators", "2", "--json"]) == 0
     (result,) = json.loads(capsys.readouterr().out)["sets"]
     sheet: Sheet = read_sheet(painted_folder / "out" / "sheet.json")
@@ -158,13 +158,13 @@ def test_sheets_are_created_from_the_command_line(
     assert {kind for one in key.items for kind in [one.question_kind]} == {
         "instance", "property", "relative", "affordance"}  # fmt: skip
     assert all((painted_folder / "out" / "pictures" / item.pictures[0]).is_file() for item in sheet.items)
-    assert main(["sheets", "make", "run", "--kind", "annotation", "--out", "labels", "--quiet"]) == 0
+    assert main(["sheets", "make", "run", "--kinds", "annotation", "--out", "labels", "--quiet"]) == 0
     for wrong, line in (
         (words, "painted/a: no ground truth to generate questions from"),
         ([*words, "--questions", "paper"], "no question about a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
         (
-            ["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"],
+            ["sheets", "make", "run", "--kinds", "annotation", "--questions", "paper", "--out", "o"],
             "not valid for annotation",
         ),
     ):

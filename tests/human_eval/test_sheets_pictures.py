@@ -79,7 +79,7 @@ def test_figure_contains_its_words_as_text(
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
     see_painted(monkeypatch)
     words = ["sheets", "pictures", "run", "--methods", "collector", "--photo", "--colours", "cividis"]
-    wanted = [*words, "--queries", "<b>sofa</b> $x_1$", "--out", f"heat.{suffix}"]
+    wanted = [*words, "--texts", "<b>sofa</b> $x_1$", "--out", f"heat.{suffix}"]
     assert main(wanted) == 0
     content = (painted_folder / f"heat.{suffix}").read_bytes()
     assert content.startswith({"pdf": b"%PDF", "png": b"\x89PNG", "svg": b"<?xml"}[suffix])
@@ -89,11 +89,11 @@ def test_figure_contains_its_words_as_text(
         assert main([*words, "--draw", "labels", "--out", "labels.svg"]) == 0
         assert "collector: label n'" in (painted_folder / "labels.svg").read_text()
         question = "How many chairs are there?"
-        assert main([*words, "--draw", "reasoning", "--queries", question, "--out", "answer.svg"]) == 0
+        assert main([*words, "--draw", "reasoning", "--texts", question, "--out", "answer.svg"]) == 0
         assert question in (painted_folder / "answer.svg").read_text()
         assert main([*words, "--paper-figure", "schemes", "--out", "schemes.svg"]) == 0
         assert all(text in (painted_folder / "schemes.svg").read_text() for text in figure_texts("schemes"))
-        assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2
+        assert main([*words, "--texts", "a", "--out", "x.gif"]) == 2
 
 
 def test_scenes_drawn_in_parallel_give_the_pictures_in_order(painted_source: RunSource, painted_folder: Path) -> None:

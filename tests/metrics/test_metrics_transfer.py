@@ -13,17 +13,11 @@ from su3d_bench.core.maps import Masks, Partition
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics import graphs
 from su3d_bench.metrics.matching import labelling, votes
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import nearest as nearest_module
 from su3d_bench.metrics.matching.checks import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import most_similar
-from su3d_bench.metrics.matching.nearest import (
-    MIN_SORTED_CANDIDATES,
-    Candidates,
-    nearest,
-    reduce_to_voxels,
-    transfer_masks,
-    transfer_values,
-)
+from su3d_bench.metrics.matching.nearest import MIN_SORTED_CANDIDATES, Candidates, nearest
+from su3d_bench.metrics.matching.transfer import reduce_to_voxels, transfer_masks, transfer_values
 
 
 def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:
@@ -44,7 +38,7 @@ def test_nearest_equals_brute_force_with_the_lowest_index_on_ties(
         candidates, queries = rng.random((n, 3)), rng.random((50, 3))
     with pytest.MonkeyPatch.context() as patch:
         if is_ordered:  # as for large clouds
-            patch.setattr(transfer, "MIN_SORTED_CANDIDATES", 0)
+            patch.setattr(nearest_module, "MIN_SORTED_CANDIDATES", 0)
         distance, index = nearest(candidates, queries)
         capped = nearest(candidates, queries, cap_m=0.2)[1]
     assert np.array_equal(index, brute_force(candidates, queries))

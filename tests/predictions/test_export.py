@@ -14,7 +14,7 @@ from scored_room import ENCODER, ID, room
 
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.metrics.matching.nearest import masks_of, transfer_masks
+from su3d_bench.metrics.matching.transfer import masks_of, transfer_masks
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions import export

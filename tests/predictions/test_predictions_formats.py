@@ -292,7 +292,9 @@ def test_path_in_no_format_or_in_two_is_an_error(tmp_path: Path) -> None:
             recognise(path)
     made.write_scannet_text(tmp_path, made.TOY)
     made.write_maskclustering(tmp_path, made.TOY)
-    with pytest.raises(PredictionError, match=r"could be in 2 formats \(scannet-text: .*; maskclustering: .*--format"):
+    with pytest.raises(
+        PredictionError, match=r"could be in 2 formats \(scannet-text: .*; maskclustering: .*--input-format"
+    ):
         recognise(tmp_path)
     with pytest.raises(ConfigError, match=r"unknown format 'maskclusterin'; did you mean 'maskclustering'"):
         recognise(tmp_path, "maskclusterin")

@@ -66,7 +66,7 @@ def texts(table: Any) -> dict[str, list[str]]:
 
 
 def test_table_iv_shows_annotators_judgements(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    (table,) = result(capsys, str(folders[0]), "--table", "IV")
+    (table,) = result(capsys, str(folders[0]), "--tables", "IV")
     assert table["columns"] == ["instance", "affordance", "property", "relative"]
     assert texts(table) == {f"{one}, annotators": [f"{RATES[one]:.3f}"] * 4 for one in SCHEMES}
     assert {cell["beside"] for row in table["rows"][:4] for cell in row["cells"]} == {"n=10"}
@@ -87,7 +87,7 @@ def test_best_of_annotators_is_marked_by_the_test_over_items(tmp_path: Path) -> 
 
 
 def test_table_v_has_one_row_per_label(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    (table,) = result(capsys, str(folders[1]), "--table", "V", "--no-published")
+    (table,) = result(capsys, str(folders[1]), "--tables", "V", "--no-published")
     assert table["columns"] == ["label-accuracy", "merge-accuracy"]
     assert texts(table) == {
         "opensu3d: direct label (n), annotators": ["0.250", "0.500"],
@@ -123,7 +123,7 @@ def test_reasoning_table_shows_measured_and_published_scores(
     sheet, key = reasoning_set([("right", "right"), ("right", "wrong"), ("wrong", "wrong"), ("right", "right")])
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
-    (table,) = result(capsys, str(tmp_path), "--table", "reasoning")
+    (table,) = result(capsys, str(tmp_path), "--tables", "reasoning")
     assert table["columns"] == ["reasoning-accuracy", "objects"]
     assert list(texts(table).values()) == [["0.750", "0.500"]]
     reported = [row for row in table["rows"] if row["is_reported"]]

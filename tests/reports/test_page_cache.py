@@ -26,7 +26,7 @@ from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
-WORDS = ["--queries", "chair", "table"]
+WORDS = ["--texts", "chair", "table"]
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def answer(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 def test_tables_of_a_run_have_the_numbers_of_metrics_json(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables = json.loads(answer(capsys, "tables", str(sweep), "--table", "II", "III", "--json"))
+    tables = json.loads(answer(capsys, "tables", str(sweep), "--tables", "II", "III", "--json"))
     record = json.loads((sweep / "metrics.json").read_text())
     expected = {
         (one["method"], name): one["result"]["metrics"][name] for one in record["results"] for name in one["headline"]
@@ -59,7 +59,7 @@ def test_verify_finds_each_modified_cell(
 ) -> None:
     monkeypatch.chdir(sweep.parent.parent)
     paper = tmp_path / "paper.tex"
-    words = ["--format", "latex", "--intervals", "--ceiling", "--scenes-count", "--out", str(paper), "--table"]
+    words = ["--format", "latex", "--intervals", "--ceiling", "--scenes-count", "--out", str(paper), "--tables"]
     answer(capsys, "tables", "runs/a run", *words, "I", "III")
     assert re.search(r"^(\d+) cells checked, 0 differ$", answer(capsys, "verify", str(paper)), re.MULTILINE)
     answer(capsys, "tables", "runs/a run", *words, "II")

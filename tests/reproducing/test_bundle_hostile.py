@@ -90,7 +90,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
 }
 
 
-@pytest.mark.parametrize("verb", [["report", "verify"], ["dev", "registry", "add", "--to", "."]])
+@pytest.mark.parametrize("verb", [["report", "verify"], ["dev", "registry", "add", "--registry", "."]])
 @pytest.mark.parametrize("name", HOSTILE)
 def test_verify_and_add_refuse_the_same_archives(
     name: str, verb: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

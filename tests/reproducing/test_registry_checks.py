@@ -31,8 +31,8 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_valid_bundle_is_added_once_and_unchanged(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["dev", "registry", "add", str(bundle), "--to", str(tmp_path)]
-    assert main([*words, "--name", "opensu3d", "--json"]) == 0
+    words = ["dev", "registry", "add", str(bundle), "--registry", str(tmp_path)]
+    assert main([*words, "--bundle-name", "opensu3d", "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)["bundles"]
     assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (5, 5)
     assert (tmp_path / "bundles" / "opensu3d.zip").read_bytes() == bundle.read_bytes()
@@ -98,7 +98,7 @@ def test_tampered_bundle_is_rejected_with_a_reason(
     files, manifest = read_bundle(bundle)
     tamper(files)
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
-    assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
+    assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--registry", str(tmp_path)]) == 1
     assert "t.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
     assert main(["report", "verify", str(tmp_path / "t.zip")]) == 1
     assert says in capsys.readouterr().out

@@ -78,7 +78,7 @@ def test_rows_with_other_data_or_duplicate_methods_are_rejected(
     (run / "run.json").write_text(json.dumps(record))
     bundle = tmp_path / "dan.zip"
     bundle_runs(bundle, [consistent(run)])
-    assert main(["dev", "registry", "add", str(bundle), "--to", str(registry)]) == 1
+    assert main(["dev", "registry", "add", str(bundle), "--registry", str(registry)]) == 1
     assert "dan.zip: rejected: " in (printed := capsys.readouterr().out) and says in printed
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]
 

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import Su3dError
 from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe, plan_of
 
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
-WORDS = ["reproduce", "opensu3d", "--table", "III", "--rehearse", *ROOM, "--dry-run"]
+WORDS = ["reproduce", "opensu3d", "--tables", "III", "--rehearse", *ROOM, "--dry-run"]
 
 
 @pytest.fixture

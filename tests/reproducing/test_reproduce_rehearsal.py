@@ -14,7 +14,7 @@ from su3d_bench.cli.main import main
 
 TABLES = ["V", "reasoning"]
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=80", "width=160", "height=120", "mesh_spacing_m=0.1"]
-WORDS = ["reproduce", "opensu3d", "--table", *TABLES, "--rehearse", *ROOM, "--jobs", "1", "--quiet"]
+WORDS = ["reproduce", "opensu3d", "--tables", *TABLES, "--rehearse", *ROOM, "--jobs", "1", "--quiet"]
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,8 @@
-"""Pages of the documentation site generated from the code: each protocol, each method, each public name."""
+"""Pages of the documentation site generated from the code: protocols, methods, public names, records of a run."""
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import io
 import json
@@ -31,10 +32,12 @@ from su3d_bench.metrics.protocols.loading import (
 )
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.tables.paper import Figure, figures_of
+from su3d_bench.store import records
 
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"
 API = "reference/api.md"
+RECORDS = "reference/records.md"
 REPORTED = "Values as reported in papers, each in its own set-up; they need not be comparable."
 
 
@@ -51,6 +54,7 @@ def made_pages() -> dict[str, str]:
         f"{METHODS}/index.md": methods_page(methods),
         **{f"{METHODS}/{method['name']}.md": method_page(method) for method in methods},
         API: api_page(),
+        RECORDS: records_page(),
         **command_pages(),
     }
 
@@ -300,3 +304,20 @@ def api_page() -> str:
         "<p>The names of <code>su3d_bench</code> are imported at first use; all other names may change.</p>",
         *parts,
     )
+
+
+def records_page() -> str:
+    """The fields of every record in the files of a run folder, from its class."""
+    parts = []
+    for name, record in vars(records).items():
+        if isinstance(record, type) and dataclasses.is_dataclass(record) and record.__module__ == records.__name__:
+            rows = [(_code(field.name), _code(field.type), _default(field)) for field in dataclasses.fields(record)]
+            described = "".join(f"<p>{prose(part)}</p>" for part in (inspect.getdoc(record) or "").split("\n\n"))
+            parts += [f"## {heading(name)}", described, table(("field", "type", "default"), rows, is_stacked=True)]
+    return _page("Records of a run", f"<p>{prose(inspect.getdoc(records))}</p>", *parts)
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if field.default is not dataclasses.MISSING:
+        return _code(repr(field.default))
+    return "required" if field.default_factory is dataclasses.MISSING else "empty"

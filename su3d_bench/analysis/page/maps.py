@@ -42,7 +42,8 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
-from su3d_bench.metrics.matching.nearest import Candidates, masks_of, nearest, transfer_masks
+from su3d_bench.metrics.matching.nearest import Candidates, nearest
+from su3d_bench.metrics.matching.transfer import masks_of, transfer_masks
 from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature

@@ -27,7 +27,7 @@ from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, CorrectedScene
 from su3d_bench.metrics.attribution.masks import CorrectedCounts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
+from su3d_bench.metrics.matching.transfer import COVERAGE_RADII_M
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, pack_scores, unpack_scores

@@ -29,8 +29,8 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import InstanceMetric, masks_on_truth
-from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
+from su3d_bench.metrics.matching.nearest import Points, nearest
 from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
@@ -251,7 +251,7 @@ class ScoredPoints:
     """
 
     points: LabelledPoints
-    positions: transfer.Points
+    positions: Points
     is_counted: BoolArray
     has_masks: bool
 
@@ -270,7 +270,7 @@ def scored_points(
     # masks are part of the map: only points far from any mask can be nearer to another part of it
     map_distance_m = called.distance_m.copy()
     far = np.flatnonzero(called.is_wanted & (called.distance_m > corrections.NEAR_M))
-    map_distance_m[far], _ = transfer.nearest(prediction.points, called.targets[far], corrections.NEAR_M)
+    map_distance_m[far], _ = nearest(prediction.points, called.targets[far], corrections.NEAR_M)
     points = LabelledPoints(
         true_class=called.true_class,
         predicted=called.predicted,
@@ -303,7 +303,7 @@ class SceneOfMasks:
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
         assert not isinstance(prediction, DenseFeatures)
-        self.points: transfer.Points = truth.points
+        self.points: Points = truth.points
         self.instance = truth.instance.astype(np.int64)
         self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
         self.evaluated = self._values, self._masks, self._scoring
@@ -343,7 +343,7 @@ class SceneOfPoints:
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
         self.scored = scored_points(rules, truth, prediction, encoder)
-        self.points: transfer.Points = self.scored.positions
+        self.points: Points = self.scored.positions
         number = self.scored.points.object_id
         self.instance = np.where(number <= truth.instance.max(initial=0), number, 0)
         self._names = [entry.name for entry in rules.classes]

@@ -14,9 +14,9 @@ from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Arr
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts, resampled_ap
-from su3d_bench.metrics.matching import labelling
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import labelling, transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
+from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, present
 from su3d_bench.metrics.protocols.kinds import AP_NAMES
 from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
@@ -215,7 +215,7 @@ def score_of_masks(
     metric: Metric[C],
     counts: C,
     prediction: Instances | Partition,
-    targets: transfer.Points,
+    targets: Points,
     wanted: BoolArray,
     warnings: Sequence[str | None],
 ) -> SceneScore:

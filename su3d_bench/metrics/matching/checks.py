@@ -11,8 +11,10 @@ from su3d_bench.core.errors import PredictionError, counted, nearest, printable
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, IntArray
 from su3d_bench.metrics.instance.scene_counts import intersections
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.nearest import remembered
+from su3d_bench.metrics.matching import transfer
+from su3d_bench.metrics.matching.memory import remembered
+from su3d_bench.metrics.matching.nearest import are_same_points
+from su3d_bench.metrics.matching.nearest import nearest as nearest_points
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
@@ -140,9 +142,9 @@ def map_warnings(
         return lines or [NOTHING]
     is_whole = rules.names_points or rules.needs_instances or rules.kind == "categories"
     share = 1 - int(score.n_farther[-1]) / score.n_scored if score.n_scored else 1.0
-    if is_whole and share < MIN_COVERED and not transfer.are_same_points(prediction.points, points):
+    if is_whole and share < MIN_COVERED and not are_same_points(prediction.points, points):
         sample = prediction.points[:: 1 + len(prediction.points) // N_SAMPLED]
-        is_near = np.isfinite(transfer.nearest(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
+        is_near = np.isfinite(nearest_points(points, sample, NEAR_M)[0]).mean() >= MIN_NEAR
         why = "the map is incomplete" if is_near else "is it of another scene, rotated, scaled or shifted?"
         return [*lines, f"{LOW_COVERAGE}: {why}"]
     if rules.needs_instances and not score.counts.has_match and isinstance(truth, GroundTruth):

@@ -14,7 +14,8 @@ from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import remembered, rows_of
+from su3d_bench.metrics.matching.memory import remembered
+from su3d_bench.metrics.matching.rows import rows_of
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 

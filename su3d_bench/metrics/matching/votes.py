@@ -14,17 +14,9 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
-from su3d_bench.metrics.matching.nearest import (
-    MAX_TIED,
-    ROUNDING_M,
-    Points,
-    Search,
-    ball_tree,
-    is_remembering,
-    remembered,
-    row_ids,
-    without_crowds,
-)
+from su3d_bench.metrics.matching.memory import is_remembering, remembered
+from su3d_bench.metrics.matching.nearest import MAX_TIED, ROUNDING_M, Points, Search, ball_tree, without_crowds
+from su3d_bench.metrics.matching.rows import row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours in memory at once
 _MAX_KEPT = 12_000_000  # cached neighbours, of 16 bytes each, if they may be needed again

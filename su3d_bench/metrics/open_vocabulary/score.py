@@ -17,8 +17,9 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
-from su3d_bench.metrics.matching import labelling
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import labelling, transfer
+from su3d_bench.metrics.matching.nearest import ball_tree, chosen_tree, nearest_as_found
+from su3d_bench.metrics.matching.rows import first_rows, row_ids, rows_of
 from su3d_bench.metrics.matching.votes import transfer_each_mask
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
 from su3d_bench.metrics.open_vocabulary import openlex3d
@@ -152,14 +153,14 @@ class CategoriesMetric(Metric[ObjectCounts]):
         points, units = _units(prediction, rules.transfer.evaluation_voxel_m)
         is_ranking = rules.metric == "openlex3d-ranking"
         ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
-        object_row = transfer.rows_of(np.array(ids, np.int64), truth.object_of_point)
+        object_row = rows_of(np.array(ids, np.int64), truth.object_of_point)
         scored = object_row >= 0
         cap_m = rules.transfer.cap_m
         reach_m = np.inf if cap_m is None else max(cap_m, *transfer.COVERAGE_RADII_M)
         unit, distance, n_tied = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf), 0
         if len(points):
-            distance[scored], nearest, n_tied = transfer.nearest_as_found(
-                transfer.ball_tree, points, units, truth.points[scored], reach_m
+            distance[scored], nearest, n_tied = nearest_as_found(
+                ball_tree, points, units, truth.points[scored], reach_m
             )
             unit[scored] = np.append(units, -1)[nearest]
         if cap_m is not None:
@@ -167,7 +168,7 @@ class CategoriesMetric(Metric[ObjectCounts]):
         # the units with points, ascending, and each point's index among them, -1 for none
         used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
-        of_point = transfer.rows_of(used, unit)
+        of_point = rows_of(used, unit)
         counts, n_equal = count(rules, truth, prediction, encoder, ids, object_row, used, of_point)
         ties = {"points as near to one object as to another": n_tied, "objects with labels of equal cosine": n_equal}
         warnings = (
@@ -204,7 +205,7 @@ def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64A
     if not len(points) or voxel_m <= 0:
         return points, unit
     means = voxel_means(points, voxel_m)
-    _, nearest, _ = transfer.nearest_as_found(transfer.chosen_tree, points, unit, means)
+    _, nearest, _ = nearest_as_found(chosen_tree, points, unit, means)
     return means, unit[nearest]
 
 
@@ -218,8 +219,8 @@ def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
     >>> voxel_means(np.array([[0.01, 0, 0], [0.03, 0, 0], [0.06, 0, 0]], np.float32), 0.05)[:, 0].tolist()
     [0.019999999552965164, 0.05999999865889549]
     """
-    voxel = transfer.row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
-    voxel = np.argsort(np.argsort(transfer.first_rows(voxel[:, None])))[voxel]
+    voxel = row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
+    voxel = np.argsort(np.argsort(first_rows(voxel[:, None])))[voxel]
     sums = np.zeros((int(voxel.max()) + 1, 3), np.float32)
     np.add.at(sums, voxel, points)
     return sums / np.bincount(voxel).astype(np.float32)[:, None]

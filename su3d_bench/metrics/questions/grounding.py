@@ -19,8 +19,9 @@ from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, LabelSet
 from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import covered_objects, score_of_masks
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
+from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.questions.score import ShareMetric, first_instances, share_counts
@@ -106,7 +107,7 @@ def in_group(groups: Sequence[Sequence[str]], group: str, metric: str) -> BoolAr
     return np.array([not wanted.isdisjoint(of_text) for of_text in groups], bool)
 
 
-def aligned(points: transfer.Points, motion: Float64Array | None) -> transfer.Points:
+def aligned(points: Points, motion: Float64Array | None) -> Points:
     """Points (N, 3) after a rigid transform (4, 4), in float32 as in the original."""
     if motion is None:
         return points

@@ -20,7 +20,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes, score_of_masks
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, places_among_scored
 from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, first_row
 from su3d_bench.metrics.protocols.model import ProtocolRules

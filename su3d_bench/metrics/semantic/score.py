@@ -12,9 +12,10 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
-from su3d_bench.metrics.matching import labelling
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import labelling, transfer
 from su3d_bench.metrics.matching import votes as neighbours
+from su3d_bench.metrics.matching.nearest import Points, are_same_points, ball_tree, kd_tree, nearest
+from su3d_bench.metrics.matching.rows import first_rows
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
 from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
@@ -141,7 +142,7 @@ class PredictedPoints:
     ``classes`` are those of the prediction's objects.
     """
 
-    targets: transfer.Points
+    targets: Points
     source: Int64Array
     true_class: Int64Array
     is_wanted: BoolArray
@@ -165,7 +166,7 @@ def call_points(
     true_class = class_of_label
     if truth.evaluation_points is not None:
         targets = truth.evaluation_points
-        _, source = transfer.nearest(truth.points, targets)
+        _, source = nearest(truth.points, targets)
         true_class = np.where(source >= 0, class_of_label[source], -1)
     # those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
     # because predictions there are false positives
@@ -174,7 +175,7 @@ def call_points(
     classes = with_unnamed(rules, labelling.classes_of_prediction(rules, prediction, encoder, is_present))
     votes_for_masks = rules.transfer.votes == "masks" and not isinstance(prediction, DenseFeatures)
     mask: Int64Array | None = None
-    if votes_for_masks and not transfer.are_same_points(prediction.points, targets):
+    if votes_for_masks and not are_same_points(prediction.points, targets):
         mask, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted, of_masks=True)
     elif rules.transfer.neighbours > 1 and not votes_for_masks:
         predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
@@ -218,7 +219,7 @@ def owners_at(
     rules: ProtocolRules,
     prediction: Prediction,
     takes_part: BoolArray,
-    targets: transfer.Points,
+    targets: Points,
     wanted: BoolArray,
 ) -> tuple[Int64Array, Float64Array]:
     """The object, or row of features, whose point is nearest to each wanted target, -1 for none, and the distance.
@@ -226,7 +227,7 @@ def owners_at(
     Only the objects marked by ``takes_part`` (K,) are considered.
     """
     owner, rank = _point_owners(prediction, takes_part)
-    if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
+    if rules.transfer.evaluation_voxel_m > 0 and not are_same_points(prediction.points, targets):
         rank = _one_per_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
     mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, wanted)
     if rules.transfer.cap_m is not None:
@@ -238,7 +239,7 @@ def transfer_votes(
     rules: ProtocolRules,
     prediction: Prediction,
     classes: Int64Array,
-    targets: transfer.Points,
+    targets: Points,
     wanted: BoolArray,
     *,
     of_masks: bool = False,
@@ -254,7 +255,7 @@ def transfer_votes(
     points, owner = prediction.points[point[votes]], owner[votes]
     cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
     values = owner if of_masks else classes[owner]
-    search = transfer.kd_tree if is_one_cloud else transfer.ball_tree
+    search = kd_tree if is_one_cloud else ball_tree
     return neighbours.transfer_votes(points, values, targets, wanted, rules.transfer.neighbours, cap_m, search)
 
 
@@ -287,11 +288,11 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
     return owner, owner
 
 
-def _one_per_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
+def _one_per_voxel(points: Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
     """``rank`` (N,) if each object keeps its first point per voxel, -1 for all others."""
     taking = np.flatnonzero(rank >= 0)
     voxel = voxel_coordinates(points[taking], voxel_m)
-    first = transfer.first_rows(np.column_stack([owner[taking], voxel]))
+    first = first_rows(np.column_stack([owner[taking], voxel]))
     kept = np.full(len(rank), -1, np.int64)
     kept[taking[first]] = rank[taking[first]]
     return kept

@@ -24,7 +24,8 @@ from places import CASES
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.metrics.compatibility import kind_incompatibility
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import transfer
+from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary import openlex3d, score
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
     ObjectCounts,
@@ -73,7 +74,7 @@ def golden_categories() -> tuple[list[int], np.ndarray, np.ndarray]:
     objects, words = golden_labels(), sorted({word for row in case["pred_labels"] for word in row})
     ids = scored_objects(objects, case["excluded"])
     row = np.array([ids.index(one) if one in ids else -1 for one in case["gt_ids"]])
-    _, unit = transfer.nearest(np.array(case["pred_points"], float), np.array(case["gt_points"], float), 0.05)
+    _, unit = nearest(np.array(case["pred_points"], float), np.array(case["gt_points"], float), 0.05)
     top = np.array([[words.index(word) for word in labels] for labels in case["pred_labels"]])
     return ids, row, point_categories(row, unit, top, category_table(objects, ids, words))
 

@@ -238,7 +238,7 @@ def test_a_run_scores_variants_under_the_protocols_of_questions(
     assert by_name["opensu3d@scheme4", "rooms-reasoning"]["ceiling"]["answer"] > 0.9
     assert "rooms-retrieval" in capsys.readouterr().out
     sides = [f"{tmp_path / 'run'}:opensu3d@scheme{k}" for k in (1, 4)]
-    assert main(["compare", *sides, "--protocol", "rooms-retrieval"]) == 0
+    assert main(["compare", *sides, "--protocols", "rooms-retrieval"]) == 0
     assert "relative" in capsys.readouterr().out
 
 

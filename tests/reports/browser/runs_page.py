@@ -42,7 +42,7 @@ def finished_runs(folder: Path) -> list[str]:
 def page_of_runs(folder: Path) -> Path:
     """The output of ``report html``."""
     page = folder / "page.html"
-    words = ["--out", str(page), "--quiet", "--jobs", "1", "--queries", "chair", "table"]
+    words = ["--out", str(page), "--quiet", "--jobs", "1", "--texts", "chair", "table"]
     runs = finished_runs(folder)
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)

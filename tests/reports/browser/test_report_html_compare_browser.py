@@ -44,7 +44,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_prediction(
         place, Instances.of(stored.points, masks, names=named, features=stored.features[kept], views=views)
     )
-    painted_page(run, folder / "page.html", "--no-errors", "--queries", "chair", "table")
+    painted_page(run, folder / "page.html", "--no-errors", "--texts", "chair", "table")
     return folder / "page.html"
 
 

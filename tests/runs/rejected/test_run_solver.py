@@ -79,7 +79,7 @@ def test_language_model_answers_in_a_run_and_each_reply_is_requested_once(
     assert main(llm(server, "--offline")) == 0
     assert (server.n_asked, (folder / "run" / "metrics.json").read_bytes()) == (n_asked, metrics)
     capsys.readouterr()
-    assert main(["report", "tables", "geometry", "run", "--table", "reasoning", "--format", "markdown"]) == 0
+    assert main(["report", "tables", "geometry", "run", "--tables", "reasoning", "--format", "markdown"]) == 0
     table = capsys.readouterr().out
     assert "answers by the built-in solver, ground truth" in table
     assert "answers by the language model tiny, ground truth" in table
