@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.arguments import check_fields, typed
+from su3d_bench.core.arguments import check_fields
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import (
     BoolArray,
@@ -33,6 +33,15 @@ def starts_of(sizes: Iterable[int]) -> Int64Array:
     return np.cumsum([0, *sizes]).astype(np.int64)
 
 
+@contextmanager
+def _converting(what: str) -> Iterator[None]:
+    """Raise failed conversions of a caller's values in the block as ``PredictionError``."""
+    try:
+        yield
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PredictionError(f"{what}: {error}") from error
+
+
 @dataclass(frozen=True)
 class Masks:
     """K sets of points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``, ascending.
@@ -47,11 +56,11 @@ class Masks:
     indices: Int32Array
 
     @staticmethod
+    @_converting("masks")
     def of_sets(sets: Sequence[IntArray]) -> Masks:
         """The masks of these point indices, each list ascending."""
-        with _converting("masks"):
-            indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
-            return Masks(starts_of(map(len, sets)), indices)
+        indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
+        return Masks(starts_of(map(len, sets)), indices)
 
     def __len__(self) -> int:
         return len(self.indptr) - 1
@@ -172,7 +181,7 @@ class Instances(Masks):
             raise PredictionError(f"instances: an edge names instance {int(edges.max())} of {k} (0..{k - 1})")
 
     @classmethod
-    @typed
+    @_converting("instances")
     def of(
         cls,
         points: Float32Array,
@@ -211,34 +220,24 @@ class Instances(Masks):
             members = points[masks.mask(row)]
             boxes[row] = members.min(axis=0), members.max(axis=0)
             means[row] = members.mean(axis=0, dtype=np.float64)
-        with _converting("instances"):
-            return cls(
-                masks.indptr,
-                masks.indices,
-                points=points,
-                scores=np.ones(k) if scores is None else _scores(scores, k),
-                features=None if features is None else _features(features, k),
-                labels=None if labels is None else tuple(labels),
-                names=("",) * k if names is None else tuple(names),
-                captions=("",) * k if captions is None else tuple(captions),
-                boxes=boxes,
-                centroids=means if centroids is None else centroids,
-                view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
-                views=_views([()] * k if views is None else views, k),
-                ids=_array("ids", ids, (None,), "iu", "integers").astype(np.int64),
-                view_names=view_names,
-                view_scores=view_scores,
-                further_labels=None if further_labels is None else tuple(map(tuple, further_labels)) or None,
-            )
-
-
-@contextmanager
-def _converting(what: str) -> Iterator[None]:
-    """Raise failed conversions of a caller's values in the block as ``PredictionError``."""
-    try:
-        yield
-    except (TypeError, ValueError, OverflowError) as error:
-        raise PredictionError(f"{what}: {error}") from error
+        return cls(
+            masks.indptr,
+            masks.indices,
+            points=points,
+            scores=np.ones(k) if scores is None else _scores(scores, k),
+            features=None if features is None else _features(features, k),
+            labels=None if labels is None else tuple(labels),
+            names=("",) * k if names is None else tuple(names),
+            captions=("",) * k if captions is None else tuple(captions),
+            boxes=boxes,
+            centroids=means if centroids is None else centroids,
+            view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
+            views=_views([()] * k if views is None else views, k),
+            ids=_array("ids", ids, (None,), "iu", "integers").astype(np.int64),
+            view_names=view_names,
+            view_scores=view_scores,
+            further_labels=None if further_labels is None else tuple(map(tuple, further_labels)) or None,
+        )
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...], kinds: str, expected: str) -> NDArray[Any]:

@@ -26,6 +26,7 @@ IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
+MaskKind = Literal["grounded", "class-agnostic", "none"]
 Interval = tuple[float, float]
 UP = 1  # the vertical axis in building graphs, as in Habitat
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -415,7 +416,7 @@ class PerceptionNeeds:
     True
     """
 
-    masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
+    masks: MaskKind = "grounded"
     crop_ratios: tuple[float, ...] = (1.0,)
     crop_padding_px: int = 0
     background_names: tuple[str, ...] = ()
