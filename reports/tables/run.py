@@ -256,7 +256,8 @@ def _details(
     for label, key in (("all confidences 1", "every_confidence_1"), (EVERY_CLASS, "every_mask_every_class")):
         if scored is not None and scored[key] is not None:
             details[label] = {name: scored[key].get(name.lower()) for name in names}
-    return details | result.get("groups", {})
+    groups: dict[str, Mapping[str, Any]] = result.get("groups", {})
+    return details | groups
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:

@@ -196,12 +196,12 @@ class Scoring:
 
     def _keep_headline(self, prediction: ScenePrediction, facts: compatibility.ContentFacts) -> None:
         """If none is named and the headline protocol fits, keep only it and those of the queries."""
-        fitting = [name for name, rules in self.rules.items() if self._fit(rules, prediction, facts)[0] is None]
-        if any(name in fitting for name in self._headlines):
+        reasons = {name: self._fit(rules, prediction, facts)[0] for name, rules in self.rules.items()}
+        if any(reasons.get(name, "absent") is None for name in self._headlines):
             for name, rules in list(self.rules.items()):
                 if name not in self._headlines and rules.ground_truth != QUERY_OBJECTS:
                     del self.rules[name], self.outcomes[name]
-                    self.unfit[name] = NOT_REQUESTED if name in fitting else self._fit(rules, prediction, facts)[0]
+                    self.unfit[name] = reasons[name] or NOT_REQUESTED
 
     def add_missed(self, scenes: Sequence[str]) -> Content:
         """Scenes without a prediction: skipped if the original evaluator skips them, otherwise counted as missed.
