@@ -78,7 +78,7 @@ def several(name: str, value: Any, kind: Any = str) -> tuple[Any, ...]:
     """One value of ``kind`` or several of them, as a tuple; ``ConfigError`` otherwise."""
     found = tuple(value) if is_sequence(value) else (value,)
     for one in found:
-        if not isinstance(one, kind):
+        if not isinstance(one, kind) or (isinstance(one, str) and "\0" in one):
             raise ConfigError(f"{name}: expected one name or several, not {printable(repr(one), 60)}")
     return found
 
