@@ -60,6 +60,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
     """
 
     name = "arkitscenes"
+    headline_protocol = "opensun3d-queries"  # the challenge's
     reader_version = 2
     scene_names = challenge_files.SCENE_NAMES
     places_of_scenes = tuple(f"{base}/{name}" if base else name for base in challenge_files.BASES for name in SETS)

@@ -52,6 +52,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
     """HOV-SG's walks through HM3DSem, with the ground truth created by its tools; read below the data root."""
 
     name = "hm3dsem"
+    headline_protocol = "hm3dsem-objects"  # HOV-SG's semantics of objects
     reader_version = 2
     scene_names = SCENE_NAMES
     places_of_scenes = PLACES

@@ -22,6 +22,7 @@ class Replica(FileDataset[NoOptions]):
     """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
 
     name = "replica"
+    headline_protocol = "replica-conceptgraphs-ex6"  # reported by most papers: reports/tables/published.toml
     reader_version = 4
     reads_made_rooms = True
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # including those of generated rooms

@@ -66,6 +66,7 @@ class ScanNet(FileDataset[ScannetOptions]):
     """ScanNet, recordings and annotated meshes as released or exported; read below the data root."""
 
     name = "scannet"
+    headline_protocol = "scannet200-instance"  # reported by OpenMask3D and its successors
     reader_version = 4
     reads_made_rooms = True
     scene_names = r"scene\d{4}_\d\d"

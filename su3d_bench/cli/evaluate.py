@@ -39,7 +39,7 @@ def add_parser(verbs: Verbs) -> None:
         "values in --ground-truth: class ids, label * 1000 + instance, or object numbers",
         choices=("classes", "instances", "numbers"),
     )
-    parser.shared("--protocols", "--scenes")
+    parser.shared("--protocols", "--all-protocols", "--scenes")
     parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.shared("--text-features")
     parser.option(
@@ -61,7 +61,7 @@ def call(arguments: argparse.Namespace) -> None:
     from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.result import Request
     from su3d_bench.evaluation.run_output import evaluate_methods
-    from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
+    from su3d_bench.reports.tables.run import run_tables
     from su3d_bench.store.records import plain
 
     chosen: dict[str, Any] = {name: getattr(arguments, name) for name in REQUEST_OPTIONS}
@@ -77,11 +77,11 @@ def call(arguments: argparse.Namespace) -> None:
     documents = {method: result.to_json() for method, result in results.items()}
     if len(results) == 1:
         (document,) = documents.values()
-        tables = evaluation_tables(document, per_class=arguments.per_class)
     else:
         document = {"schema": SCHEMA, "methods": documents}
-        tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
-    answer_tables(arguments, document, tables)
+    answer_tables(
+        arguments, document, run_tables(plain(run.metrics), evaluated=documents, per_class=arguments.per_class)
+    )
     for method, result in results.items():
         remark(
             *(f"{method}: {line}" if len(results) > 1 else line for line in warnings_of(result)), quiet=arguments.quiet

@@ -219,6 +219,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--methods METHOD...", "methods to use (default: all)", default=[]),
         option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
         option("--protocols PROTOCOL...", "protocols to use (default: all that fit)", action="extend", default=[]),
+        option("--all-protocols", "score under all that fit", action="append_const", const="all", dest="protocols"),
         option(
             "--set KEY=VALUE...",
             "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data",

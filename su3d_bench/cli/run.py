@@ -34,8 +34,9 @@ def _add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
-    parser.option("--protocols PROTOCOL...", "protocols to use (default: those of the dataset)")
-    parser.shared("--profile", "--device")
+    headline = "protocols to use (default: the dataset's headline protocol)"
+    parser.option("--protocols PROTOCOL...", headline, action="extend")
+    parser.shared("--all-protocols", "--profile", "--device")
     parser.shared("--jobs", help=JOBS)
     parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)

@@ -26,6 +26,7 @@ from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
+from su3d_bench.metrics.protocols.loading import headline_protocols
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.formats import Match, Source, is_known, match_scenes, planned_scenes
@@ -54,10 +55,12 @@ class VertexTruth:
 class SceneTruths(ABC):
     """The ground truth of every scene of an evaluation, and the prediction of each that has one.
 
-    ``where`` is its name in messages; ``has_points``: its points have coordinates.
+    ``where`` is its name in messages; ``has_points``: its points have coordinates; ``headlines``: the protocol that
+    scores it by default, if declared.
     """
 
     has_points = True
+    headlines: tuple[str, ...] = ()
     where: str
     dataset_name: str | None
     scenes: tuple[str, ...]
@@ -104,6 +107,7 @@ class DatasetTruths(SceneTruths):
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         self._target = request.dataset or _dataset_of(sources)
         self._dataset = open_dataset(self._target)
+        self.headlines = headline_protocols(self._dataset)
         self.where = self.dataset_name = name = str(self._dataset.name)
         known = list(self._dataset.scenes())
         requested = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []

@@ -17,6 +17,7 @@ from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
+from su3d_bench.predictions.base import Content
 
 Confidences = Literal["protocol", "file"]
 ValuesForm = Literal["classes", "instances", "numbers"]
@@ -24,10 +25,11 @@ ValuesForm = Literal["classes", "instances", "numbers"]
 
 @dataclass(frozen=True)
 class Request:
-    """What to score: ``predictions`` are folders or files; everything else is optional.
+    """What to score: ``predictions`` are folders or files, ``contents`` maps in memory by scene instead.
 
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
-    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default all that fit.
+    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default the dataset's headline
+    protocol if it fits, otherwise all that fit (as with "all").
     ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
     the values in the files ("file"); None: those in the files for the formats of ScanNet's and MaskClustering's
     scripts, as these do, and the protocol's rule for all others. ``queries``: a file of texts and the objects that they
@@ -35,6 +37,7 @@ class Request:
     """
 
     predictions: tuple[Path, ...]
+    contents: Mapping[str, Content] | None = None
     dataset: str | None = None
     ground_truth: Path | None = None
     ground_truth_values: ValuesForm | None = None

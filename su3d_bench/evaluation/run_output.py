@@ -28,6 +28,7 @@ from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request
 from su3d_bench.evaluation.scoring import map_of, on_vertices, vertices_for
 from su3d_bench.metrics.compatibility import needs_map
 from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import ALL_PROTOCOLS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
@@ -157,6 +158,11 @@ def check_method_name(name: str) -> None:
 
 def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
     evaluations = {one.method: evaluate(one.request, one) for one in kept}
+    scored = {tuple(found.rules.name for found in one.protocols) for one in evaluations.values()}
+    if len(scored) > 1 and not kept[0].request.protocols:  # the headline protocol does not fit every method
+        for one in kept:
+            one.request = replace(one.request, protocols=(ALL_PROTOCOLS,))
+        return _evaluated(kept)
     return EvaluatedRun(evaluations, _metrics(kept, evaluations))
 
 

@@ -32,7 +32,13 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.types import ImageDomain
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
-from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
+from su3d_bench.metrics.protocols.loading import (
+    ALL_PROTOCOLS,
+    headline_protocols,
+    load_protocol,
+    protocol_names,
+    protocols_for,
+)
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.language.client import check_key
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models, default_jobs, resolve_profile
@@ -53,7 +59,6 @@ from su3d_bench.runs.job import (
     Part,
     SceneJob,
     check_same_run,
-    custom_code_key,
     options_model,
     part_of,
 )
@@ -371,10 +376,15 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
 
 
 def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Dataset target -> protocols that score it: the requested ones that fit it, or its own if none is requested."""
+    """Dataset target -> protocols that score it: the requested ones that fit it, by default its headline protocol.
+
+    ``ALL_PROTOCOLS`` requests those of ``usual_protocols``.
+    """
+    usual = {target: usual_protocols(target) for target in targets}
     if not wanted:
-        return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
-    wanted = list(dict.fromkeys(wanted))
+        return {target: headline_protocols(registry.load("dataset", target)) or usual[target] for target in targets}
+    are_all = ALL_PROTOCOLS in wanted
+    wanted = [name for name in dict.fromkeys(wanted) if name != ALL_PROTOCOLS]
     rules = [load_protocol(name) for name in wanted]
     _check_unique_names("--protocols", [(rule.name, rule) for rule in rules])
     truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
@@ -383,25 +393,30 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
         if len(reasons) == len(truths):
             raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(name for name, one in zip(wanted, rules, strict=True) if not truth_incompatibility(one, truth))
+        target: tuple(dict.fromkeys([
+            *(usual[target] if are_all else ()),
+            *(name for name, one in zip(wanted, rules, strict=True) if not truth_incompatibility(one, truth)),
+        ]))
         for target, truth in truths.items()
-    }
+    }  # fmt: skip
 
 
-def _usual_protocols(dataset: Any) -> tuple[str, ...]:
-    """The protocols of a dataset; if no protocol names it, those that fit its ground truth."""
-    if own := protocols_for(dataset.name):
-        return tuple(own)
-    truth = TruthFacts.of_dataset(dataset)
-    known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
-    return tuple(rules.name for rules in known if truth.variants and truth_incompatibility(rules, truth) is None)
+def usual_protocols(target: str) -> tuple[str, ...]:
+    """The protocols of a dataset, its headline first; if no protocol names it, those that fit its ground truth."""
+    dataset = registry.load("dataset", target)
+    own = protocols_for(dataset.name)
+    if not own and dataset.variants:
+        truth = TruthFacts.of_dataset(dataset)
+        known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
+        own = [rules.name for rules in known if truth_incompatibility(rules, truth) is None]
+    return tuple(dict.fromkeys([*headline_protocols(dataset), *own]))
 
 
 def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
     """Notes on which protocols score user-defined datasets, if none was requested."""
     for target, names in protocols.items():
         dataset = registry.load("dataset", target)
-        if wanted or not dataset.variants or protocols_for(dataset.name):
+        if wanted or not dataset.variants or protocols_for(dataset.name) or headline_protocols(dataset):
             continue
         if names:
             yield f"{dataset.name}: scored under all protocols that fit its ground truth; choose with --protocols"
@@ -431,6 +446,6 @@ def asks_language_model(values: Mapping[str, Any]) -> list[str]:
 def _run_name(config: RunConfig, methods: Sequence[Part], datasets: Sequence[Part], perception: str) -> str:
     request = config.model_dump(mode="json", exclude=set(NEUTRAL_SETTINGS))
     options = [part.options for part in (*methods, *datasets)]
-    own = [digest for part in (*methods, *datasets) if (digest := custom_code_key(part.target))]
+    own = [digest for part in (*methods, *datasets) if (digest := registry.code_key(part.target))]
     key = digest_json([request, options, perception, code_digest(), *own])[:8]
     return "-".join([*(part.name for part in datasets), config.profile, key])

@@ -243,7 +243,6 @@ class _Scene:
             tools = interfaces.SceneTools(
                 frames=frame_loop.FirstFrames(frames, n),
                 regions=frame_loop.TimedRegions(inputs.perception.regions(), clock),
-                surface=partial(frame_loop.surface_of, self.dataset, self.job.scene_name),
                 true_proposals=self._true_proposals if method.needs.true_proposals else None,
             )
             with clock.running("start"):
@@ -262,8 +261,10 @@ class _Scene:
             self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)), clock
         )
         try:
+            has_surface = isinstance(self.dataset, interfaces.HasSurface)
+            read_surface = partial(self.dataset.surface, self.job.scene_name) if has_surface else None
             with clock.running("start"):
-                method.start(inputs.info)
+                method.start(replace(inputs.info, read_surface=read_surface))
             with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
                 for share in shares:
                     feeding.feed_until(math.ceil(share * n), ahead, n)
