@@ -76,19 +76,23 @@ lint: $(VENV)/dev
 $(VENV)/core: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 13) else f"Python {v[0]}.{v[1]} found; su3d-bench needs 3.11 or 3.12: make PYTHON=python3.11 ...")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) -e .
+	@echo 'Installing su3d-bench and its dependencies into $(VENV): 2.1 GB on disk, a few minutes'
+	@$(PIP) -e .
 	@touch $@
 
 $(VENV)/docs: $(VENV)/core
-	$(PIP) -e '.[docs]'
+	@echo 'Installing the documentation tools into $(VENV): 0.1 GB on disk, under a minute'
+	@$(PIP) -e '.[docs]'
 	@touch $@
 
 $(VENV)/test: $(VENV)/core
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test]'
+	@echo 'Installing the test dependencies, PyTorch among them, into $(VENV): 1.8 GB on disk, a few minutes'
+	@$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test,dev]'
+	@echo 'Installing the linters into $(VENV): 0.1 GB on disk, under a minute'
+	@$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test,dev]'
 	@touch $@
 
 clean:

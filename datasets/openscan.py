@@ -18,7 +18,6 @@ from pydantic import FailFast, Field
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import LabelSet
 from su3d_bench.formats.json_models import FileModel, WholeNumber, read_json
-from su3d_bench.metrics.protocols.loading import load_protocol
 
 # Protocol name (also of its label space and ground truth) -> name of the aspect in the records.
 KEYS = {
@@ -45,6 +44,8 @@ Attributes = Mapping[int, Mapping[str, str]]  # object id -> aspect's key -> wor
 @cache
 def label_set(variant: str) -> LabelSet:
     """The attributes of an aspect, as listed by its protocol."""
+    from su3d_bench.metrics.protocols.loading import load_protocol  # slow to import
+
     classes = load_protocol(variant).classes
     return LabelSet(variant, tuple(entry.id for entry in classes), tuple(entry.name for entry in classes))
 

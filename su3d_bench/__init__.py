@@ -5,6 +5,7 @@ that ``import su3d_bench`` stays fast.
 """
 
 import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,8 @@ _MODULES = {
     "metrics.scoring": ("combine", "score_scene"),
     "store.predictions": ("read_prediction",),
 }
+if sys.platform == "win32":  # without fcntl
+    raise SystemExit("su3d-bench: needs Linux or macOS; on Windows use WSL")
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_MODULE_OF)
 

@@ -23,7 +23,7 @@ from su3d_bench.baselines.command.process import Finished, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file
-from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
+from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface
 
@@ -178,7 +178,6 @@ class Command:
         self.config = config or CommandConfig()
         if not self.config.words:
             raise ConfigError("method 'command': no program; use --set 'command.command=[\"run.sh\", \"{frames}\"]'")
-        self._tools: SceneTools | None = None
         self._scene: SceneInfo | None = None
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
@@ -204,17 +203,13 @@ class Command:
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
 
-    def receive_tools(self, tools: SceneTools) -> None:
-        self._tools = tools
-
     def start(self, scene: SceneInfo) -> None:
         self.close()
         self._scene, self._surface = scene, None
-        if self._tools is not None:
-            try:
-                self._surface = self._tools.surface()
-            except DataError as error:
-                logger.info("no mesh.ply for the program: %s", error)
+        try:
+            self._surface = scene.surface()
+        except DataError as error:
+            logger.info("no mesh.ply for the program: %s", error)
         self._scratch = TemporaryFolder("su3d-command-")
         self._frames = FrameFolder(self._scratch.path / "frames", scene, self.config.colour, self._surface)
         self._frames.open()

@@ -234,12 +234,12 @@ class OpenMask3D:
         return len(self.proposals)
 
     def receive_tools(self, tools: SceneTools) -> None:
-        """Access to frames for reading again, the mesh, and perception on demand."""
+        """Access to frames for reading again, and perception on demand."""
         self._tools = tools
 
     def start(self, scene: SceneInfo) -> None:
         """Creates or reads the proposals."""
-        self.proposals = make_proposals(self.config, self._tools, scene.dataset, scene.scene)
+        self.proposals = make_proposals(self.config, scene, self._tools.true_proposals)
         self.finish_costs = {}
         self._scene = scene
         self._views = MaskViews(len(self.proposals), self.config.top_k)

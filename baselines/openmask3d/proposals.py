@@ -10,7 +10,7 @@ become masks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,9 +23,8 @@ from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD,
 from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, PredictionError, shown
-from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.maps import Masks, Proposals
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Surface
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, SceneInfo, Surface
 from su3d_bench.metrics.matching.transfer import transfer_masks
 from su3d_bench.predictions.base import VertexMasks
 
@@ -275,14 +274,17 @@ class ProposalConfig(BaseModel):
         return "surface" if self.proposals_folder is None else "files"
 
 
-def make_proposals(config: ProposalConfig, tools: SceneTools, dataset: str, scene: str) -> Proposals:
+def make_proposals(
+    config: ProposalConfig, scene: SceneInfo, true_proposals: Callable[[], Proposals] | None
+) -> Proposals:
     """The proposals of a scene over the vertices of its mesh, including empty masks if files have them."""
-    kind, surface = config.kind, _surface(config, tools, f"{dataset}/{scene}")
+    kind, surface = config.kind, _surface(config, scene)
     if kind == "oracle":
-        return _true_proposals(tools, surface)
+        assert true_proposals is not None, "the runner passes true proposals to methods that need them"
+        return _on_surface(true_proposals(), surface)
     if kind == "files":
         assert config.proposals_folder is not None
-        proposals = read_proposals(config.proposals_folder, scene, surface)
+        proposals = read_proposals(config.proposals_folder, scene.scene, surface)
         return _in_parts(proposals, _segments(surface, config), config) if config.split_parts == "always" else proposals
     segments = _segments(surface, config)
     proposals = surface_proposals(surface, segments, config)
@@ -300,17 +302,16 @@ def _in_parts(proposals: Proposals, segments: Int64Array, config: ProposalConfig
     return voted_by_segments(parts, segments) if config.segment_vote else parts
 
 
-def _surface(config: ProposalConfig, tools: SceneTools, where: str) -> Surface:
+def _surface(config: ProposalConfig, scene: SceneInfo) -> Surface:
+    where = f"{scene.dataset}/{scene.scene}"
     try:
-        return tools.surface()
+        return scene.surface()
     except DataError as error:
         reason = str(error).removeprefix(f"{where}: ")
         raise DataError(f"{where}: proposals '{config.kind}' need the scan's mesh: {reason}") from error
 
 
-def _true_proposals(tools: SceneTools, surface: Surface) -> Proposals:
+def _on_surface(truth: Proposals, surface: Surface) -> Proposals:
     """The ground-truth instances on the vertices of ``surface``: each vertex uses its nearest labelled point."""
-    assert tools.true_proposals is not None, "the runner passes true proposals to methods that need them"
-    truth = tools.true_proposals()
     masks = transfer_masks(truth.points, truth, surface.vertices)
     return replace(truth, points=surface.vertices, indptr=masks.indptr, indices=masks.indices)

@@ -19,7 +19,7 @@ from su3d_bench.baselines.sam3d import overlap
 from su3d_bench.baselines.sam3d.overlap import NO_GROUP, GroupedCloud
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project, valid_depth
-from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
+from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import (
@@ -104,7 +104,6 @@ class SAM3D:
 
     def __init__(self, config: SAM3DConfig | None = None) -> None:
         self.config = config or SAM3DConfig()
-        self._tools: SceneTools | None = None
         self.finish_costs: dict[str, float | int] = {}  # the tree's stages, because it only merges in ``finish``
         self._clear()
 
@@ -148,28 +147,18 @@ class SAM3D:
         parts = [(cloud.points, cloud.group, cloud.view_group, cloud.views) for cloud in self._clouds]
         return sum(array.nbytes for arrays in parts for array in arrays)
 
-    def receive_tools(self, tools: SceneTools) -> None:
-        """Get access to the scan's mesh."""
-        self._tools = tools
-
     def start(self, scene: SceneInfo) -> None:
         """Resets the map, and reads the mesh of the new scene if there is one."""
         self._clear()
         self._scene = f"{scene.dataset}/{scene.scene}"
-        self._surface = self._read_surface()
-
-    def _read_surface(self) -> Surface | None:
-        if self._tools is None:
-            return None
         try:
-            return self._tools.surface()
+            self._surface = scene.surface()
         except DataError as error:
             if self.config.snap_to_segments:
                 raise DataError(
                     f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set snap_to_segments=false"
                 ) from error
             logger.warning("%s: sam3d's groups stay on its own points; no mesh (%s)", self._scene, error)
-            return None
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Add one image; with ``merge_schedule`` incremental it is merged at once, at cost proportional to the map."""

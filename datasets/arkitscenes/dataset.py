@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Frame, GroundTruth, Surface
 from su3d_bench.datasets.arkitscenes import challenge as challenge_files
 from su3d_bench.datasets.arkitscenes import frames
@@ -20,6 +20,7 @@ from su3d_bench.datasets.arkitscenes.frames import PhoneRecording
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
+from su3d_bench.datasets.recordings.source import missing_parts
 
 DEVELOPMENT = "ChallengeDevelopmentSet"
 # What download_data_opensun3d.py (OpenSun3D/cvpr24-challenge at 59db30f) and download_data.py (apple/ARKitScenes at
@@ -59,6 +60,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
     """
 
     name = "arkitscenes"
+    headline_protocol = "opensun3d-queries"  # the challenge's
     reader_version = 2
     scene_names = challenge_files.SCENE_NAMES
     places_of_scenes = tuple(f"{base}/{name}" if base else name for base in challenge_files.BASES for name in SETS)
@@ -91,14 +93,16 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         """One-line summary of the scene from a quick look: images, query, ground truth."""
         try:
             words = f"{len(self.recording(scene).images)} images"
-        except FramesMissing:
-            words = "no images"
+        except DataError as error:
+            words = str(error).partition(": ")[2]
         try:
             text = self.challenge.query(scene)
         except GroundTruthMissing:
             return f"{words}, no query"
-        has_truth = any(path.suffix == ".txt" for path in self.challenge.files(scene))
-        return f"{words}, query '{text}', {'ground truth' if has_truth else 'no ground truth'}"
+        missing = missing_parts(self.folder(scene), mesh_name(scene))
+        has_truth = any(path.suffix == ".txt" for path in self.challenge.files(scene)) and not missing
+        truth = "ground truth" if has_truth else f"no ground truth{missing and f' ({missing})'}"
+        return f"{words}, query '{text}', {truth}"
 
     def n_frames(self, scene: str, stride: int) -> int:
         return len(self.frames(scene, stride))
@@ -122,6 +126,8 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
         """The vertices that answer the scene's query, each with the number of its object."""
+        if missing := missing_parts(self.folder(scene), mesh_name(scene)):
+            raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing} in {self.folder(scene)}")
         return self.challenge.ground_truth(scene, self.surface(scene).vertices)
 
     def asked_text(self, scene: str) -> str:

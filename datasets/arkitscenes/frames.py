@@ -146,8 +146,9 @@ def open_recording(folder: Path, scene: str, images: Images, min_confidence: int
         fine = times_in(folder / FINE_DEPTH, scene, ".png") if images == "wide" else {}
         cameras = times_in(folder / camera_folder(colour_folder), scene, ".pincam")
         sure = times_in(folder / CONFIDENCE, scene, ".png") if min_confidence else {}
-    if not colours and not depths:
-        raise FramesMissing(f"{where}: no images in {folder / colour_folder} and none in {DEPTH}; {ADVICE}")
+    kinds = {colour_folder: colours, DEPTH: depths or fine, camera_folder(colour_folder): cameras}
+    if empty := [name for name, files in kinds.items() if not files]:
+        raise FramesMissing(f"{where}: no files of the scene in {' and '.join(empty)} of {folder}; {ADVICE}")
     if min_confidence and not sure:
         raise DataError(
             f"{where}: option min_confidence needs {CONFIDENCE}/, which is missing; the challenge does not download "
@@ -176,7 +177,7 @@ def open_recording(folder: Path, scene: str, images: Images, min_confidence: int
     no_pose = f"images have no pose nearer than 0.3 s in {TRAJECTORY_NAME}"
     remarks += recorded_frames.left_out(where, unposed, no_pose, len(found))
     if not found:
-        raise DataError(remarks[0] if remarks else f"{where}: no images in {colour_folder}; {ADVICE}")
+        raise DataError(remarks[0])
     return PhoneRecording(where, folder, tuple(found), tuple(rows), trajectory, tuple(remarks))
 
 

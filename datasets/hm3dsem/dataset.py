@@ -19,7 +19,7 @@ from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float64Array, GroundTruth, WorldUp
 from su3d_bench.datasets.hm3dsem import truth
 from su3d_bench.datasets.openlex3d import release as openlex3d
-from su3d_bench.datasets.recordings import recorded_frames
+from su3d_bench.datasets.recordings import recorded_frames, source
 from su3d_bench.datasets.recordings.file_dataset import NoOptions, RecordedDataset, faults_of, keeps_last
 from su3d_bench.datasets.recordings.recorded_frames import RecordedFrame, Recording
 from su3d_bench.datasets.recordings.source import by_number, check_complete, list_folder, read_matrix, read_size
@@ -52,6 +52,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
     """HOV-SG's walks through HM3DSem, with the ground truth created by its tools; read below the data root."""
 
     name = "hm3dsem"
+    headline_protocol = "hm3dsem-objects"  # HOV-SG's semantics of objects
     reader_version = 2
     scene_names = SCENE_NAMES
     places_of_scenes = PLACES
@@ -80,7 +81,7 @@ class Hm3dSem(RecordedDataset[NoOptions]):
         with recorded_frames.reading(self.where(scene)):
             n = sum(1 for _ in (folder / POSE).glob("*.txt")) if (folder / POSE).is_dir() else 0
         missing = "" if (folder / truth.INFO_NAME).is_file() else f"no ground truth ({truth.INFO_NAME} is missing)"
-        return f"{counted(n, 'frame')}, {missing or 'ground truth'}"
+        return f"{source.missing_parts(folder, *ENDINGS) or counted(n, 'frame')}, {missing or 'ground truth'}"
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
         folder = self.folder(scene)

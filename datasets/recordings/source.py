@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, FramesMissing
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
@@ -320,7 +320,19 @@ def list_folder(folder: Path, name: str, where: str) -> list[str]:
     try:
         return sorted(entry.name for entry in os.scandir(folder / name) if not entry.name.startswith("."))
     except OSError as error:
+        if isinstance(error, FileNotFoundError):
+            raise FramesMissing(f"{where}: {name}/ is missing; {EXPORT_AGAIN}") from error
         raise DataError(f"{where}: {name}/ cannot be read: {error.strerror}; {EXPORT_AGAIN}") from error
+
+
+def missing_parts(folder: Path, *names: str) -> str:
+    """A clause on the files and folders that ``folder`` lacks; '' if none. A name may have an alternative: ``a or b``.
+
+    >>> missing_parts(Path("nowhere"), "rgb or rgb.mkv", "depth")
+    'rgb or rgb.mkv, depth are missing'
+    """
+    absent = [name for name in names if not any((folder / one).exists() for one in name.split(" or "))]
+    return f"{', '.join(absent)} {'is' if len(absent) == 1 else 'are'} missing" if absent else ""
 
 
 def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:

@@ -8,18 +8,21 @@ from functools import cached_property
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
-from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
+from su3d_bench.datasets.recordings.source import missing_parts
 from su3d_bench.datasets.replica import checks, folders, frames, scene_graphs, truth
+
+CAMERA = "cam_params.json"
 
 
 class Replica(FileDataset[NoOptions]):
     """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
 
     name = "replica"
+    headline_protocol = "replica-conceptgraphs-ex6"  # reported by most papers: reports/tables/published.toml
     reader_version = 4
     reads_made_rooms = True
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # including those of generated rooms
@@ -55,11 +58,10 @@ class Replica(FileDataset[NoOptions]):
         """One-line summary of the scene from a quick look: poses, ground truth; ``info`` checks that files exist."""
         n_frames = "no frames"
         if self._is_rendered(scene):
-            try:
-                n_poses = file_bytes(self.folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
-            except OSError:
-                return "traj.txt is missing"
-            n_frames = counted(n_poses, "frame")
+            folder = self.folder(scene)
+            if fault := missing_parts(folder, "traj.txt", "results") or missing_parts(folder.parent, CAMERA):
+                return fault
+            n_frames = counted(len(frames.trajectory_lines(folder / "traj.txt", self.where(scene))), "frame")
         try:
             words = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:
@@ -93,7 +95,7 @@ class Replica(FileDataset[NoOptions]):
                 f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
                 f"{folders.FETCH_FRAMES}; to view the available files: su3d-bench datasets show {where}"
             )
-        camera = frames.read_camera(self.rendered.folder / "cam_params.json", where)
+        camera = frames.read_camera(self.rendered.folder / CAMERA, where)
         poses = frames.read_trajectory(folder / "traj.txt", where)
         frames.check_frames_complete(folder, len(poses), where)
         return frames.ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
@@ -104,12 +106,12 @@ class Replica(FileDataset[NoOptions]):
             return ()
         n_poses = len(frames.read_trajectory(folder / "traj.txt", self.where(scene)))
         images = [folder / name(index) for index in range(n_poses) for name in (frames.colour_name, frames.depth_name)]
-        return (self.rendered.folder / "cam_params.json", folder / "traj.txt", *images)
+        return (self.rendered.folder / CAMERA, folder / "traj.txt", *images)
 
     def recording_key(self, scene: str) -> str:
         """A key of the content of every file; see ``image_key`` for what it does not detect in an image."""
         folder = self.folder(scene)
-        files = (self.rendered.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
+        files = (self.rendered.folder / CAMERA, folder / "traj.txt") if self._is_rendered(scene) else ()
         return checks.digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:

@@ -133,7 +133,8 @@ def no_render_tree(root: Path) -> ScenesMissing:
         root,
         " or in its folder Replica (a scene is a folder such as room0 with traj.txt and results/); download "
         f"them with {FETCH_FRAMES}, set SU3D_DATA to their folder, "
-        f"or create rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}",
+        "or create a room in this layout: su3d-bench datasets make rooms --layout replica --scenes bathroom0 "
+        f"--set n_frames=120 --out {root}",
     )
 
 

@@ -66,6 +66,7 @@ class ScanNet(FileDataset[ScannetOptions]):
     """ScanNet, recordings and annotated meshes as released or exported; read below the data root."""
 
     name = "scannet"
+    headline_protocol = "scannet200-instance"  # reported by OpenMask3D and its successors
     reader_version = 4
     reads_made_rooms = True
     scene_names = r"scene\d{4}_\d\d"
@@ -73,8 +74,8 @@ class ScanNet(FileDataset[ScannetOptions]):
     how_to_get = (
         " or in its folders scans, scannet, scannet/scans (a scan is a folder such as scene0000_00 with "
         "scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet explains how to get it from "
-        "http://www.scan-net.org; or set SU3D_DATA to its folder, or create rooms in this layout: su3d-bench datasets "
-        "make rooms --layout scannet --out DIR"
+        "http://www.scan-net.org; or set SU3D_DATA to its folder, or create a room in this layout: su3d-bench datasets "
+        "make rooms --layout scannet --scenes bathroom0 --set n_frames=120 --out DIR"
     )
     label_space = "scannet"
     variants = ("nyu40-vertices", "scannet200-vertices")

@@ -12,14 +12,14 @@ import hashlib
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from su3d_bench.core.digests import digest_bytes, digest_file
-from su3d_bench.core.errors import DataError, counted
+from su3d_bench.core.errors import DataError, FramesMissing, counted
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
@@ -61,7 +61,7 @@ PYTHON_LAYOUTS = (
 def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto") -> sensors.RgbdSource:
     """The recording in a scan's folder; if there are several, the ``.sens`` file, then the Python reader's export.
 
-    Exports may be in the folder itself, in ``exported/`` or in a folder named after the scene. A ``DataError``
+    Exports may be in the folder itself, in ``exported/`` or in a folder named after the scene. ``FramesMissing``
     lists everything that was looked for if there is none.
     """
     with reading(where):
@@ -77,7 +77,7 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
     }
     wanted = [text for name, text in looked_for.items() if kind in ("auto", name)]
     places = f"exports also in exported/ and {scene}/"
-    raise DataError(f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}; {places}")
+    raise FramesMissing(f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}; {places}")
 
 
 def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path] | None:
@@ -256,9 +256,11 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
     """The number of frames, including lost ones, from a header or a list of names only."""
     form, place = _find(folder, scene, kind) or (None, folder)
     if form is None:
-        return "no recording"
+        return "no recording" + (f" ({scene}.sens is missing)" if kind in ("auto", "sens") else "")
     layout = python_layout(place)
     path = place / layout.pose if form == "python" and layout is not None else place
+    if path != place and layout and (missing := sensors.missing_parts(place, *astuple(layout))):
+        return missing
     with reading(where):
         if form == "sens":
             with opened(path) as stream:

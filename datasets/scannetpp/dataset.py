@@ -49,6 +49,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     """
 
     name = "scannetpp"
+    headline_protocol = "scannetpp-instance"  # the benchmark's own
     reader_version = 2
     scene_names = SCENE_NAMES
     places_of_scenes = tuple(f"{base}/data" if base else "data" for base in truth.BASES)

@@ -16,10 +16,10 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, counted
+from su3d_bench.core.errors import DataError, FramesMissing, counted
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, colour_at, depth_m_of_values, nearest_at
-from su3d_bench.datasets.recordings.source import list_folder, read_size
+from su3d_bench.datasets.recordings.source import list_folder, missing_parts, read_size
 from su3d_bench.datasets.scannetpp import images, poses
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes, sized
 
@@ -44,6 +44,8 @@ def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
 
 def describe_recording(folder: Path, kind: PoseSource) -> str:
     """One-line summary of the frames from a quick look at the iPhone's ``folder``."""
+    if folder.is_dir() and (missing := missing_parts(folder, "rgb or rgb.mkv", "depth or depth.bin")):
+        return missing
     source = pose_source(folder, kind)
     path = folder / poses.COLMAP / poses.IMAGES_NAME if source == "colmap" else folder / poses.TRACKING_NAME
     if not path.is_file():
@@ -90,7 +92,7 @@ class IphoneRecording:
 def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> IphoneRecording:
     """The recording in the ``iphone`` folder of a scene."""
     if not folder.is_dir():
-        raise DataError(f"{where}: no iphone/ folder; only the iPhone's frames are used, the DSLR's have no depth")
+        raise FramesMissing(f"{where}: no iphone/ folder; only the iPhone's frames are used, the DSLR's have no depth")
     colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, images.VIDEO_NAME, where)
     depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, images.DEPTH_NAME, where)
     if pose_source(folder, kind) == "colmap":
@@ -123,7 +125,7 @@ def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, whe
     """The extracted files by frame number; None if the ``packed`` file is to be read."""
     if not (folder / name).is_dir():
         if not os.path.lexists(folder / packed):
-            raise DataError(f"{where}: neither {name}/ nor {packed} is in {folder}; copy one of them there")
+            raise FramesMissing(f"{where}: neither {name}/ nor {packed} is in {folder}; copy one of them there")
         return None
     file_of: dict[int, str] = {}
     for file in list_folder(folder, name, where):

@@ -73,7 +73,8 @@ class Tum(RecordedDataset[TumOptions]):
     Options = TumOptions
 
     def is_scene(self, folder: Path) -> bool:
-        return not folder.name.startswith(".") and all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
+        n = sum((folder / name).is_file() for name in ("rgb.txt", "depth.txt", "groundtruth.txt"))
+        return not folder.name.startswith(".") and n > 1  # if one is missing, the reader names it
 
     @keeps_last
     def recording(self, scene: str) -> recorded_frames.Recording:

@@ -6,12 +6,15 @@ import base64
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.digests import digest_bytes, git_state
+from su3d_bench.core.errors import printable
 from su3d_bench.core.safe_output import escaped_json, plain_value
 from su3d_bench.core.system.files import file_text
+from su3d_bench.core.version import __version__
 from su3d_bench.formats.tables.table import Prose, Table
 from su3d_bench.reports.tables.formats import html_tables
 
@@ -35,8 +38,12 @@ def page_html(
     scenes: Sequence[Mapping[str, Any]],
     maps: Sequence[str],
     galleries: Sequence[Mapping[str, Any]] = (),
+    command: str = "",
 ) -> str:
-    """Return the HTML report. ``maps`` are in base64, in the order of ``numbers``; all else is plain values."""
+    """Return the HTML report. ``maps`` are in base64, in the order of ``numbers``; all else is plain values.
+
+    ``command``, the date, and version and commit of the program are at its top.
+    """
     script = (
         "(() => {\n'use strict';\n"
         + "\n".join(file_text(HERE / f"scripts/{name}.js") for name in SCRIPTS)
@@ -46,11 +53,20 @@ def page_html(
         HERE,
         script,
         title=title,
+        created=_creation(command),
         data=embedded_json(numbers),
         scenes=[embedded_json(scene) for scene in scenes],
         maps=maps,
         galleries=[embedded_json(gallery) for gallery in galleries],
     )
+
+
+def _creation(command: str) -> dict[str, str]:
+    """Return date, version and commit of the program, and the command that creates a page."""
+    git = git_state() or {}
+    commit = str(git.get("commit", ""))[:8] + (", modified" if git.get("is_dirty") else "")
+    date = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    return {"date": date, "version": __version__, "commit": commit, "command": printable(command, 2000)}
 
 
 def registry_page_html(

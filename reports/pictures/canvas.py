@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import itertools
+import textwrap
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,17 +21,37 @@ from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.protocols.loading import class_names
 
-DPI = 100
+Width = Literal["8cm", "17cm"]
+WIDTHS_IN: dict[Width, float] = {"8cm": 8 / 2.54, "17cm": 17 / 2.54}  # of one and of two columns of a paper
+DPI, SCREEN_DPI = 300, 100
+GAP_IN = 0.06  # between pictures
+POINTS = 8  # type size of every figure at its printed width
+LINE_IN, LETTERS_PER_INCH = 0.15, 14.0  # height of a line of text, and characters per inch of it
 DARK, GREY = "#222222", "#666666"
-# Fonts are embedded as TrueType, text in an SVG stays text, and a fixed salt makes it reproducible.
-FONTS: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench"}
+# Of every figure. Fonts are embedded as TrueType, text in an SVG stays text, and a fixed salt makes it reproducible.
+STYLE: Any = {
+    **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "legend.fontsize"), POINTS),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), POINTS),
+    **dict.fromkeys(("axes.linewidth", "grid.linewidth", "hatch.linewidth", "patch.linewidth"), 0.6),
+    **{"lines.linewidth": 1.0, "lines.markersize": 4, "grid.color": "0.85", "text.parse_math": False},
+    **{"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench"},
+}
 METADATA = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}  # without dates
 
 
-class Canvas:
-    """A page of ``width`` by ``height`` units, ``per_inch`` units per inch; by default, units are pixels."""
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Draw in the style of every figure; also a decorator."""
+    from matplotlib import rc_context
 
-    def __init__(self, width: float, height: float, *, per_inch: float = DPI, dpi: int = DPI) -> None:
+    with rc_context(STYLE):
+        yield
+
+
+class Canvas:
+    """A page of ``width`` by ``height`` units, ``per_inch`` units per inch; by default, units are pixels of screens."""
+
+    def __init__(self, width: float, height: float, *, per_inch: float = SCREEN_DPI, dpi: int = SCREEN_DPI) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -37,7 +59,7 @@ class Canvas:
         self.figure = Figure(figsize=(width / per_inch, height / per_inch), dpi=dpi, facecolor="white")
         FigureCanvasAgg(self.figure)
 
-    def text(self, x: float, y: float, text: str, size: float, *, colour: str = DARK, **more: Any) -> None:
+    def text(self, x: float, y: float, text: str, size: float = POINTS, *, colour: str = DARK, **more: Any) -> None:
         """Write ``text``, without math mode, with its upper left corner at this position."""
         style: dict[str, Any] = {"va": "top", "fontsize": size, "color": colour, "parse_math": False} | more
         self.figure.text(x / self.width, 1 - y / self.height, drawable(text), **style)
@@ -57,14 +79,36 @@ class Canvas:
         axes.set_ylim(pixels.shape[0] - 0.5, -0.5)
         return axes
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path, caption: str = "") -> None:
         """Write the page as PDF, PNG or SVG by the suffix of ``path``, with its folder."""
-        write_figure(self.figure, path)
+        write_figure(self.figure, path, caption)
 
 
-def write_figure(figure: Any, path: Path, dpi: float | None = None) -> None:
-    """Write a figure as PDF, PNG or SVG by the suffix of ``path``, with its folder; ``ConfigError`` for others."""
-    content = figure_bytes(figure, figure_format(path), dpi)
+class Panels:
+    """A page of ``n`` pictures of this aspect ratio (height / width), each with a line of text above; in inches."""
+
+    def __init__(self, width: Width, columns: int, n: int, aspect: float, below_in: float = 0.0) -> None:
+        self.page_width = WIDTHS_IN[width]
+        self.width = (self.page_width - GAP_IN * (columns - 1)) / columns
+        self.height = self.width * aspect
+        row_in = LINE_IN + self.height + GAP_IN
+        self.places = [(k % columns * (self.width + GAP_IN), k // columns * row_in) for k in range(n)]
+        self.bottom = row_in * -(-n // columns)
+        self.page = Canvas(self.page_width, self.bottom + below_in, per_inch=1, dpi=DPI)
+
+    def draw(self, k: int, title: str, pixels: UInt8Array) -> Any:
+        """Return the axes of the ``k``-th picture, in units of its pixels."""
+        left, upper = self.places[k]
+        self.page.text(left, upper + 0.01, title)
+        return self.page.picture(left, upper + LINE_IN, self.width, self.height, pixels)
+
+
+def write_figure(figure: Any, path: Path, caption: str = "") -> None:
+    """Write a figure as PDF, PNG or SVG by the suffix of ``path``, with its folder; ``ConfigError`` for others.
+
+    ``caption`` is only in the metadata of the file: a figure has no title, as its caption belongs to the paper.
+    """
+    content = figure_bytes(figure, figure_format(path), caption)
     make_folder(path.parent)
     write_bytes(path, content)
 
@@ -78,14 +122,18 @@ def figure_format(path: Path) -> str:
     return kind
 
 
-def figure_bytes(figure: Any, kind: str, dpi: float | None = None) -> bytes:
+def figure_bytes(figure: Any, kind: str, caption: str = "") -> bytes:
     """Return the file of a figure: the same bytes for the same figure."""
-    from matplotlib import rc_context
-
     buffer = io.BytesIO()
-    with rc_context(FONTS):
-        figure.savefig(buffer, format=kind, dpi=dpi or "figure", metadata=METADATA[kind])
+    title = {"Title": printable(caption, 1000)} if caption else {}
+    with figure_style():
+        figure.savefig(buffer, format=kind, dpi="figure", metadata=METADATA[kind] | title)
     return buffer.getvalue()
+
+
+def fitted(text: str, inches: float) -> str:
+    """Return ``text`` in lines that fit this width."""
+    return textwrap.fill(drawable(printable(text)), max(8, int(inches * LETTERS_PER_INCH)))
 
 
 def drawable(text: str) -> str:

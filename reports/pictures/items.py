@@ -17,7 +17,7 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.reports.pictures.canvas import BACKGROUND, drawable
+from su3d_bench.reports.pictures.canvas import drawable
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
@@ -29,8 +29,7 @@ OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink not in any heat scale,
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
 ROOM_COLUMNS, ROOM_GAP = 3, 6  # room photos per row, pixels between them
 ZOOM_GROWTH = 1.7  # size of the zoomed part relative to the object
-PNG_COLOURS = 160  # palette size; more enlarge the file without visible gain
-PALETTE_WIDTH, COMMON_COLOURS = 160, 96  # size of pictures from which a palette is chosen; its frequent colours
+JPEG_QUALITY = 92  # with full colour resolution
 
 
 @dataclass(frozen=True)
@@ -188,58 +187,16 @@ def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[f
     cv2.circle(shown, centre, radius, OUTLINE, 3, cv2.LINE_AA)
 
 
-def palette_of(pictures: Sequence[UInt8Array], shades: Sequence[tuple[int, int, int]]) -> UInt8Array:
-    """Return a palette (n, 3) of at most 256 colours for items with photos and views like ``pictures`` (h, w, 3).
+def jpeg_bytes(picture: UInt8Array) -> bytes:
+    """Return a JPEG with the colours of ``picture`` (h, w, 3); no block of 8 x 8 pixels depends on others.
 
-    It also contains the colours of texts and outlines, and ``shades`` from light to dark.
-    """
-    from PIL import Image
-
-    strips = [fitted(picture, (PALETTE_WIDTH, PALETTE_WIDTH)) for picture in pictures]
-    image = Image.fromarray(np.concatenate(strips or [np.full((1, 1, 3), 255, np.uint8)]))
-    common = image.quantize(COMMON_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette()
-    found = _with_rare(np.array(common, np.uint8).reshape(-1, 3)[:COMMON_COLOURS], np.asarray(image).reshape(-1, 3))
-    own = [PANEL, BACKGROUND]
-    own += [mixed(one, PAPER, k / 8) for one in (INK, GREY, OUTLINE, *shades) for k in range(8)]
-    own += [mixed(one, (0, 0, 0), k / 8) for one in shades for k in range(1, 5)]
-    return np.concatenate([found, np.array([PAPER, *own], np.uint8)])
-
-
-def _with_rare(common: UInt8Array, pixels: UInt8Array) -> UInt8Array:
-    """Extend ``common`` by the colours of ``pixels`` farthest from it: rare, but questions may be about them."""
-    _, first = np.unique(pixels >> 3, axis=0, return_index=True)
-    left = pixels[first].astype(np.float64)
-    distance = np.min([((left - one) ** 2).sum(axis=1) for one in common.astype(np.float64)], axis=0)
-    found = [*common]
-    for _ in range(PNG_COLOURS - len(common)):
-        rare = left[int(distance.argmax())]
-        found.append(rare.astype(np.uint8))
-        distance = np.minimum(distance, ((left - rare) ** 2).sum(axis=1))
-    return np.array(found, np.uint8)
-
-
-def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> tuple[int, int, int]:
-    """Blend two colours; ``share`` is the weight of ``other``."""
-    red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(one, other, strict=True))
-    return red, green, blue
-
-
-def png_bytes(picture: UInt8Array, *, palette: UInt8Array | None = None) -> bytes:
-    """Return a PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
-
-    ``palette`` (n, 3): use these colours instead, each pixel independently in the nearest one.
+    Measured on ``rooms/living0``: 0.20 MB and an error of at most 1 of 255 in flat beige areas. A palette of 256
+    colours per scene: 0.13 MB and 15, beige turns pink; a PNG: 0.62 MB and 0.
     """
     from PIL import Image
 
     buffer = io.BytesIO()
-    whole = Image.fromarray(picture)
-    if palette is not None:
-        of_palette = Image.new("P", (1, 1))
-        of_palette.putpalette(palette.tobytes())
-        image = whole.quantize(palette=of_palette, dither=Image.Dither.NONE)
-    else:
-        image = whole.quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    image.save(buffer, format="PNG", compress_level=6)  # level 9: 5 % smaller in four times the time
+    Image.fromarray(picture).save(buffer, format="JPEG", quality=JPEG_QUALITY, subsampling=0, optimize=True)
     return buffer.getvalue()
 
 

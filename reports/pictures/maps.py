@@ -16,7 +16,7 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.reports.pictures import canvas
-from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
+from su3d_bench.reports.pictures.items import OUTLINE, draw_outline, png_bytes
 
 PALE_GREY = 232
 RENDERED = 1.5  # render scale; a room fills only a part of a corner view
@@ -128,13 +128,15 @@ def pale(colours: UInt8Array, share: float) -> UInt8Array:
 
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
+THUMBNAIL = (240, 180)  # pixels
 DRAWN_SPACING_M = 0.015  # one point per cell of this size is drawn
 SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps between surface points up to two cells apart
 LEGEND_STEP, COLUMN_WIDTH, MAX_COLUMNS = 22, 250, 10  # pixels; layout of the legend
 MAX_NAME = 26  # characters per name in the legend
-HEAT_WIDTH, BAR_HEIGHT = 290, 16  # of the colour bar next to a heat map
-MAX_RANKS = 20  # drawn on instances; more would hide them
-RANK_RADIUS, SMALL_PIXELS = 12, 2500  # a rank would hide an instance with fewer pixels
+CELLS_PER_ROW: dict[canvas.Width, int] = {"8cm": 2, "17cm": 4}  # three views and the ranking; a cell is 4 cm wide
+BAR_IN = 0.1
+MAX_RANKS = 10  # drawn on instances; more would hide them
+RANK_RADIUS, SMALL_PIXELS = 36, 20_000  # a rank would hide an instance with fewer pixels
 PALE = "#555555"
 VIEW_TITLES = ("from above", "from one corner", "from the other corner")
 
@@ -181,7 +183,23 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     return [instances, classes]
 
 
-def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, title: str, top: Sequence[str]) -> None:
+def thumbnail(prediction: Prediction) -> bytes | None:
+    """Return a small PNG of a map from one corner, in the colours of its classes; None without instances."""
+    if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
+        return None
+    cloud, names = thinned(map_cloud(prediction)), names_of(prediction)
+    camera = canvas.view_cameras(canvas.room_bounds(cloud.points), *THUMBNAIL)[1]
+    palette = canvas.class_colours(names)
+    colours = [palette[name] for name in names] if any(names) else canvas.instance_colours(names)
+    (picture,) = _paint([canvas.render(cloud.points, SQUARE_M, camera)], cloud, colours)
+    return png_bytes(picture)
+
+
+@canvas.figure_style()
+def draw_heat_map(
+    instances: Instances, similarity: Float64Array, path: Path, caption: str, top: Sequence[str],
+    width: canvas.Width = "17cm",
+) -> None:  # fmt: skip
     """Write the heat map of a query: each instance in the colour of its similarity, the best one outlined.
 
     ``top``: texts of the most similar instances, best first; their ranks are drawn on them.
@@ -192,16 +210,13 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
     pictures = _paint(views, cloud, canvas.heat_colours(similarity))
     owner_of = np.append(cloud.owner, np.int32(-1))  # per pixel (h, w) the instance shown, -1 for none
     seen: list[Int32Array] = [owner_of[view.point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]] for view in views]
-    for picture, owners in zip(pictures, seen, strict=True):
+    panels = canvas.Panels(width, CELLS_PER_ROW[width], 4, VIEW_HEIGHT / VIEW_WIDTH)
+    for k, (picture, owners) in enumerate(zip(pictures, seen, strict=True)):
         for best in order[:1]:
-            draw_outline(picture, owners == best, 3)
-    header = 46
-    page = canvas.Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
-    page.text(14, 16, printable(title, 110), 14, fontweight="bold")
-    for axes, owners in zip(_place_views(page, header, "", pictures), seen, strict=True):
-        _write_ranks(axes, owners, order[:MAX_RANKS])
-    _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
-    page.write(path)
+            draw_outline(picture, owners == best, 4)
+        _write_ranks(panels.draw(k, VIEW_TITLES[k], picture), owners, order[:MAX_RANKS])
+    _write_ranking(panels, similarity, top)
+    panels.page.write(path, caption)
 
 
 def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
@@ -216,10 +231,10 @@ def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
         at = _free_place(middle, taken, is_beside=len(places) < SMALL_PIXELS)
         taken.append(at)
         if not np.array_equal(at, middle):
-            axes.plot(*np.stack([middle, at]).T, color=canvas.DARK, linewidth=0.8)
+            axes.plot(*np.stack([middle, at]).T, color=canvas.DARK, linewidth=0.6)
         shade = canvas.hex_of(OUTLINE) if rank == 1 else canvas.DARK
-        axes.text(*at, str(rank), fontsize=8.5, color=canvas.DARK, ha="center", va="center", fontweight="bold",
-                  bbox=canvas.paper(shade, 0.25, 0.92, linewidth=1.6 if rank == 1 else 0.6))  # fmt: skip
+        axes.text(*at, str(rank), color=canvas.DARK, ha="center", va="center", fontweight="bold",
+                  bbox=canvas.paper(shade, 0.15, 0.92, linewidth=1.2 if rank == 1 else 0.6))  # fmt: skip
 
 
 def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_beside: bool) -> Float64Array:
@@ -237,32 +252,28 @@ def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_besid
     return wanted
 
 
-def _write_ranking(
-    page: canvas.Canvas, left: float, top: float, similarity: Float64Array, lines: Sequence[str]
-) -> None:
+def _write_ranking(panels: canvas.Panels, similarity: Float64Array, lines: Sequence[str]) -> None:
     """Draw the colour bar of similarity with its range, and the list of the most similar instances below."""
-    wide = HEAT_WIDTH - 40
-    page.text(left, top, "similarity to the text (cosine)", 10, colour=canvas.GREY)
+    page, (left, upper), wide = panels.page, panels.places[-1], panels.width - 0.12
+    left += 0.08
+    page.text(left, upper, "cosine similarity")
     if len(similarity):
         low, high = float(similarity.min()), float(similarity.max())
         is_one = high == low
         colours = np.array(canvas.heat_colours(similarity[:1]), np.uint8) if is_one else canvas.scale_stops("paper")
-        page.axes(left, top + 22, wide, BAR_HEIGHT).imshow(colours[None], aspect="auto")
-        numbers = top + 26 + BAR_HEIGHT
-        page.text(left, numbers, f"{low:.3f}", 10)
+        page.axes(left, upper + canvas.LINE_IN, wide, BAR_IN).imshow(colours[None], aspect="auto")
+        numbers = upper + canvas.LINE_IN + BAR_IN + 0.02
+        page.text(left, numbers, f"{low:.3f}")
         if not is_one:
-            page.text(left + wide / 2, numbers, f"{(low + high) / 2:.3f}", 10, ha="center")
-            page.text(left + wide, numbers, f"{high:.3f}", 10, ha="right")
-    page.text(left, top + 62, "grey: no instance", 9, colour=canvas.GREY)
-    first = top + 90
-    room = int((VIEW_HEIGHT - 118) / LEGEND_STEP)
-    for k, line in enumerate(lines[:room]):
+            page.text(left + wide, numbers, f"{high:.3f}", ha="right")
+    first = upper + 2 * canvas.LINE_IN + BAR_IN + 0.08
+    room = int((page.height - first) / canvas.LINE_IN)
+    if len(lines) > room:
+        lines = [*lines[: room - 1], f"and {len(lines) - room + 1} more"]
+    for k, line in enumerate(lines):
         weight = "bold" if k == 0 else "normal"
-        page.text(left, first + LEGEND_STEP * k, printable(line, 36), 10, fontweight=weight)
-    note = f"and {len(lines) - room} more; " if len(lines) > room else ""
-    page.text(
-        left, first + LEGEND_STEP * min(len(lines), room) + 8, f"{note}the best is outlined", 10, colour=canvas.GREY
-    )
+        shown = printable(line, int(wide * canvas.LETTERS_PER_INCH))
+        page.text(left, first + canvas.LINE_IN * k, shown, fontweight=weight)
 
 
 def names_of(prediction: Prediction) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, printable
 from su3d_bench.core.geometry import back_project, turn_to_z, valid_depth
-from su3d_bench.core.interfaces import Dataset, ProvidesUpAxis
+from su3d_bench.core.interfaces import Dataset, HasSurface, ProvidesUpAxis
 from su3d_bench.core.types import (
     BoolArray,
     Float32Array,
@@ -38,9 +37,10 @@ class SceneView:
     """The data for the picture of a scene.
 
     ``poses`` (n, 4, 4): camera-to-world of the frames read, of ``n_frames`` in the scene; ``seen`` (m, 3): observed
-    points in metres in the world frame, z up, and ``seen_rgb`` (m, 3) their colours; ``shown``: some of the frames;
-    ``depth_m``: minimum and maximum depth; ``truth``, or the reason why it is missing; ``up``: for datasets without a
-    fixed up axis; if it is only estimated, the world of the picture is rotated and that of the frames is not.
+    points in metres in the world frame, z up, and ``seen_rgb`` (m, 3) their colours, or the vertices of the scan's mesh
+    if there are neither frames nor ground truth; ``shown``: some of the frames; ``depth_m``: minimum and maximum depth;
+    ``truth``, or the reason why it is missing, as for the frames; ``up``: for datasets without a fixed up axis; if it
+    is only estimated, the world of the picture is rotated and that of the frames is not.
     """
 
     scene: str
@@ -52,6 +52,7 @@ class SceneView:
     depth_m: tuple[float, float]
     truth: GroundTruth | None
     no_truth: str
+    no_frames: str = ""
     up: WorldUp | None = None
 
     @property
@@ -68,22 +69,27 @@ def look_at(
 ) -> SceneView:
     """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its ground truth.
 
-    A ``DataError`` for corrupted frames or ground truth, or if both are missing; one of them may be missing.
+    A ``DataError`` for corrupted frames or ground truth, or if both and the scan's mesh are missing.
     """
     frames: Sequence[Frame] = ()
-    n_frames = 0
+    n_frames, no_frames, mesh = 0, "", np.zeros((0, 3), np.float32)
     truth, reason = _truth(dataset, scene)
     try:
         frames, n_frames = dataset.frames(scene, stride or 1), dataset.info(scene, 1).n_frames
         if not len(frames):
             raise DataError(f"{dataset.name}/{scene}: has no frames to show")
-    except FramesMissing as error:
+    except DataError as error:
+        if not isinstance(error, FramesMissing) and not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        no_frames = str(error)
         if truth is None:
-            raise DataError(reason) from error
+            if not isinstance(dataset, HasSurface):
+                raise DataError(f"{no_frames}; {reason}") from error
+            mesh = dataset.surface(scene).vertices
     positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
     is_shown = set(evenly(len(positions), SHOWN_FRAMES))
     poses, shown, ranges = list[Float64Array](), list[Frame](), list[float]()
-    points, colours = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+    points, colours = [mesh], [np.full((len(mesh), 3), UNSEEN, np.uint8)]
     for k, position in enumerate(positions):
         progress(k, len(positions))
         frame = frames[position]
@@ -103,7 +109,7 @@ def look_at(
     seen = (np.concatenate(points) @ turn.T).astype(np.float32)
     depth_m = (float(min(ranges, default=0.0)), float(max(ranges, default=0.0)))
     about = (f"{dataset.name}/{scene}", n_frames, drawn, seen, np.concatenate(colours), tuple(shown), depth_m)
-    return SceneView(*about, truth, reason, up)
+    return SceneView(*about, truth, reason, no_frames, up)
 
 
 def evenly(n: int, most: int) -> Sequence[int]:
@@ -157,20 +163,18 @@ def _truth(dataset: Dataset, scene: str) -> tuple[GroundTruth | None, str]:
     return None, reason or f"{dataset.name} has no ground truth"
 
 
-WIDTH = 1920
-MARGIN, HEADER, CAPTION = 16, 76, 26
-PANEL_WIDTH, PANEL_HEIGHT = (WIDTH - 4 * MARGIN) // 3, 520
-LEGEND_COLUMNS, LEGEND_STEP = 6, 21  # class legend below the panels
-LEGEND_WIDTH = (WIDTH - 2 * MARGIN) // LEGEND_COLUMNS
+PANEL_WIDTH, PANEL_HEIGHT = 620, 520  # pixels
+PANELS_PER_ROW: dict[canvas.Width, int] = {"8cm": 2, "17cm": 3}
+FRAMES_SHOWN: dict[canvas.Width, int] = {"8cm": 3, "17cm": SHOWN_FRAMES}
+GAP_IN, SCALE_IN = canvas.GAP_IN, 0.45  # of the depth scale
+LEGEND_COLUMNS: dict[canvas.Width, int] = {"8cm": 2, "17cm": 3}  # class legend below the panels
+NUMBER_IN, WITH_POINTS_IN = 0.5, 2.0  # a column of numbers; a narrower legend has no numbers of points
 MAX_CLASSES = 600  # in the legend; three times the largest label space
-REASON_LINES = 6
-FRAME_COLUMNS, SCALE_WIDTH = 6, 74
-FRAME_WIDTH = (WIDTH - 2 * MARGIN - SCALE_WIDTH) // FRAME_COLUMNS
+REASON_LINES = 4
 SEEN_WITHIN_M = 0.12  # a ground-truth point takes the colour of an observed point within this distance
 MIN_DRAWN_M = 0.012
 UNSEEN = (214, 214, 210)
 SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-WALK_TITLE, NO_WALK_TITLE = "trajectory over the ground truth in frame colours", "ground truth, without frames"
 WALK, START, END = "#d6246e", "#1a9850", "#111111"
 # Trajectories may extend this far beyond the ground truth; longer ones would leave no space for the scene.
 MAX_BEYOND_M = 10.0
@@ -179,41 +183,40 @@ MAX_BEYOND_M = 10.0
 Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, camera of a top view
 
 
-def draw_scene_picture(look: SceneView, path: Path) -> None:
-    """Write the picture of ``look`` as a PNG, ``WIDTH`` pixels wide."""
-    frame_height = 0
-    if look.shown:
-        rows, columns = look.shown[0].rgb.shape[:2]
-        frame_height = int(np.clip(round((FRAME_WIDTH - 4) * rows / columns), 60, 420))
-    legend_top = HEADER + CAPTION + PANEL_HEIGHT + MARGIN
-    n_rows = REASON_LINES if look.truth is None else 1 + _legend_rows(len(_classes(look.truth)))
-    below = legend_top + LEGEND_STEP * n_rows + MARGIN
-    height = below + (2 * (CAPTION + frame_height) + MARGIN if look.shown else 0)
-    page = canvas.Canvas(WIDTH, height)
-    page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
-    page.text(MARGIN, 46, facts_line(look), size=11, colour=canvas.GREY)
-    for column, (caption, pixels, camera) in enumerate(_panels(look)):
-        left = MARGIN + column * (PANEL_WIDTH + MARGIN)
-        page.text(left, HEADER, caption, size=11)
-        axes = page.picture(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT, pixels)
+@canvas.figure_style()
+def draw_scene_picture(look: SceneView, path: Path, width: canvas.Width = "17cm") -> None:
+    """Write the picture of ``look`` as PDF, PNG or SVG by the suffix of ``path``."""
+    width_in = canvas.WIDTHS_IN[width]
+    reason = canvas.fitted(f"no ground truth: {look.no_truth}", width_in).splitlines()[:REASON_LINES]
+    classes = [] if look.truth is None else _classes(look.truth)[:MAX_CLASSES]
+    n_rows = -(-len(classes) // LEGEND_COLUMNS[width])
+    legend_in = canvas.LINE_IN * (len(reason) if look.truth is None else 1 + n_rows) + 2 * GAP_IN
+    frames = [look.shown[place] for place in evenly(len(look.shown), FRAMES_SHOWN[width])]
+    frame_in, frame_height = (width_in - SCALE_IN) / FRAMES_SHOWN[width], 0.0
+    if frames:
+        rows, wide = frames[0].rgb.shape[:2]
+        frame_height = min(2 * frame_in, (frame_in - GAP_IN) * rows / wide)
+    below_in = legend_in + (2 * (canvas.LINE_IN + frame_height + GAP_IN) if frames else 0)
+    panels = canvas.Panels(width, PANELS_PER_ROW[width], 3, PANEL_HEIGHT / PANEL_WIDTH, below_in)
+    page, legend_top = panels.page, panels.bottom
+    for k, (title, pixels, camera) in enumerate(_panels(look)):
+        axes = panels.draw(k, title, pixels)
         if camera is not None:
             _draw_scale(axes, camera)
-            if column == 0 and look.shown:
+            if k == 0 and look.shown:
                 _draw_walk(axes, camera, look.poses)
     if look.truth is not None:
-        _draw_legend(page, look.truth, legend_top)
-    else:
-        page.text(MARGIN, legend_top, "no ground truth", size=11)
-        for k, line in enumerate(textwrap.wrap(printable(look.no_truth), 190)[: REASON_LINES - 1]):
-            page.text(MARGIN, legend_top + CAPTION + 18 * k, line, size=10, colour=canvas.GREY)
-    if look.shown:
-        _draw_frames(page, look, below, frame_height)
-    page.write(path)
+        _draw_legend(page, classes, n_rows, (legend_top, width_in / LEGEND_COLUMNS[width]))
+    for k, line in enumerate(reason if look.truth is None else ()):
+        page.text(0, legend_top + canvas.LINE_IN * k, line, colour=canvas.GREY)
+    if frames:
+        _draw_frames(page, frames, look.depth_m[1], (legend_top + legend_in, frame_in, frame_height))
+    page.write(path, f"{look.scene}: {facts_line(look)}")
 
 
 def facts_line(look: SceneView) -> str:
     """Return the facts about the scene in one line."""
-    words = ["no frames"]
+    words = ["no frames", *([f"mesh of {len(look.seen):,} vertices"] if len(look.seen) else [])]
     if look.shown:
         height, width = look.shown[0].rgb.shape[:2]
         words = [
@@ -240,8 +243,8 @@ def _panels(look: SceneView) -> tuple[Panel, ...]:
         size_m = _drawn_size(points)
         pictures = [canvas.colour(canvas.render(points, size_m, camera), colours) for camera in cameras]
         return (
-            (f"trajectory over the points of {len(look.poses)} frames, from above", pictures[0], cameras[0]),
-            ("the same points, from one corner", pictures[1], None),
+            ("trajectory" if look.shown else "mesh", pictures[0], cameras[0]),
+            ("from one corner", pictures[1], None),
             ("from the other corner", pictures[2], None),
         )
     rows = thinned_rows(look.truth.points)
@@ -249,9 +252,9 @@ def _panels(look: SceneView) -> tuple[Panel, ...]:
     view = canvas.render(points, _drawn_size(points), above)
     by_class, by_instance = _class_palette(look.truth)[rows], _instance_palette(look.truth)[rows]
     return (
-        (WALK_TITLE if look.shown else NO_WALK_TITLE, canvas.colour(view, _seen_colours(look, points)), above),
-        ("ground truth by class", canvas.colour(view, by_class), above),
-        ("ground truth by instance", canvas.colour(view, by_instance), above),
+        ("trajectory" if look.shown else "ground truth", canvas.colour(view, _seen_colours(look, points)), above),
+        ("by class", canvas.colour(view, by_class), above),
+        ("by instance", canvas.colour(view, by_instance), above),
     )
 
 
@@ -319,48 +322,48 @@ def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
     return [(truth.labels.names[row], int(n_objects[row]), int(n_points[row])) for row in order]
 
 
-def _legend_rows(n_classes: int) -> int:
-    return -(-min(n_classes, MAX_CLASSES) // LEGEND_COLUMNS)
-
-
-def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
+def _draw_legend(
+    page: canvas.Canvas, classes: Sequence[tuple[str, int, int]], n_rows: int, place: tuple[float, float]
+) -> None:
     """Draw every class with its numbers of objects and points, column by column, largest first."""
-    classes = _classes(truth)
-    n_rows = _legend_rows(len(classes))
+    top, wide = place
     palette: dict[str, canvas.Colour] = canvas.class_colours([name for name, _, _ in classes])
-    for k, (name, n_objects, n_points) in enumerate(classes[:MAX_CLASSES]):
+    has_points = wide > WITH_POINTS_IN
+    for k, (name, n_objects, n_points) in enumerate(classes):
         column, row = divmod(k, n_rows)
-        left = MARGIN + column * LEGEND_WIDTH
-        objects, points = left + LEGEND_WIDTH - 84, left + LEGEND_WIDTH - 24
+        left, right = column * wide, (column + 1) * wide - 0.15
+        objects = right - NUMBER_IN if has_points else right
         if row == 0:
-            page.text(left, top, "class", size=10, colour=canvas.GREY)
-            page.text(objects, top, "objects", size=10, colour=canvas.GREY, ha="right")
-            page.text(points, top, "points", size=10, colour=canvas.GREY, ha="right")
-        y = top + LEGEND_STEP * (row + 1.5)
-        page.text(left, y, "\u25a0", size=15, colour=canvas.hex_of(palette[name]), va="center")
-        page.text(left + 23, y, _shortened(name, 21), size=10, va="center")
-        page.text(objects, y, f"{n_objects}", size=10, va="center", ha="right")
-        page.text(points, y, _thousands(n_points), size=10, va="center", ha="right")
+            page.text(left, top, "class", colour=canvas.GREY)
+            page.text(objects, top, "objects", colour=canvas.GREY, ha="right")
+        y = top + canvas.LINE_IN * (row + 1.5)
+        page.text(left, y, "\u25a0", colour=canvas.hex_of(palette[name]), va="center", fontsize=12)
+        most = int((objects - left - 0.45) * canvas.LETTERS_PER_INCH)
+        page.text(left + 0.15, y, _shortened(name, most), va="center")
+        page.text(objects, y, f"{n_objects}", va="center", ha="right")
+        if has_points:
+            if row == 0:
+                page.text(right, top, "points", colour=canvas.GREY, ha="right")
+            page.text(right, y, _thousands(n_points), va="center", ha="right")
 
 
 def _draw_walk(axes: Any, camera: canvas.Camera, poses: Float64Array) -> None:
     """Draw the trajectory with viewing directions, start and end."""
     x, y = canvas.project(camera, poses[:, :3, 3]).T
     ahead_x, ahead_y = canvas.project(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2]).T
-    axes.plot(x, y, color="white", linewidth=4.0, solid_capstyle="round")
-    axes.plot(np.stack([x, ahead_x]), np.stack([y, ahead_y]), color=WALK, linewidth=1.3)
-    axes.plot(x, y, color=WALK, linewidth=2.0, solid_capstyle="round")
+    axes.plot(x, y, color="white", linewidth=2.4, solid_capstyle="round")
+    axes.plot(np.stack([x, ahead_x]), np.stack([y, ahead_y]), color=WALK, linewidth=0.6)
+    axes.plot(x, y, color=WALK, linewidth=1.2, solid_capstyle="round")
     for k, name, shade, marker in ((0, "start", START, "o"), (-1, "end", END, "s")):
-        axes.plot(x[k], y[k], marker, color=shade, markersize=10, markeredgecolor="white", markeredgewidth=1.5)
-        is_right = x[k] > PANEL_WIDTH - 60
+        axes.plot(x[k], y[k], marker, color=shade, markersize=5, markeredgecolor="white", markeredgewidth=0.8)
+        is_right = x[k] > PANEL_WIDTH - 130
         axes.annotate(
             name,
-            (float(np.clip(x[k], 0, PANEL_WIDTH)), float(np.clip(y[k], 12, PANEL_HEIGHT - 12))),
-            xytext=(-9 if is_right else 9, 7 if k == 0 else -7),
+            (float(np.clip(x[k], 0, PANEL_WIDTH)), float(np.clip(y[k], 30, PANEL_HEIGHT - 30))),
+            xytext=(-5 if is_right else 5, 5 if k == 0 else -5),
             textcoords="offset points",
             ha="right" if is_right else "left",
             va="center",
-            fontsize=10,
             color=shade,
             fontweight="bold",
             bbox=canvas.paper(),
@@ -370,37 +373,38 @@ def _draw_walk(axes: Any, camera: canvas.Camera, poses: Float64Array) -> None:
 def _draw_scale(axes: Any, camera: canvas.Camera) -> None:
     """Draw a scale bar of a round length in the lower left corner."""
     pixels_a_metre = camera.focal / canvas.OVERSAMPLING
-    length_m = max((length for length in SCALE_LENGTHS_M if length * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
+    length_m = max((length for length in SCALE_LENGTHS_M if length * pixels_a_metre < 0.25 * PANEL_WIDTH), default=0.1)
     left, row = 14, PANEL_HEIGHT - 12
-    axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=6, solid_capstyle="butt")
+    axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=3, solid_capstyle="butt")
     axes.plot(
-        [left, left + length_m * pixels_a_metre], [row, row], color=canvas.DARK, linewidth=3, solid_capstyle="butt"
+        [left, left + length_m * pixels_a_metre], [row, row], color=canvas.DARK, linewidth=1.5, solid_capstyle="butt"
     )
-    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=canvas.DARK, va="bottom", bbox=canvas.paper())
+    axes.text(left, row - 12, f"{length_m:g} m", color=canvas.DARK, va="bottom", bbox=canvas.paper())
 
 
-def _draw_frames(page: canvas.Canvas, look: SceneView, top: int, height: int) -> None:
+def _draw_frames(
+    page: canvas.Canvas, frames: Sequence[Frame], most_m: float, place: tuple[float, float, float]
+) -> None:
     """Draw colour above depth images, with the depth scale on the right."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    scale = ScalarMappable(Normalize(0.0, max(look.depth_m[1], 1e-3)), colormaps["turbo"].with_extremes(bad="#b8b8b8"))
-    below = top + CAPTION + height
-    for column, frame in enumerate(look.shown):
-        left = MARGIN + column * FRAME_WIDTH
-        page.text(left, top + 8, f"frame {frame.index}", size=10)
-        page.axes(left, top + CAPTION, FRAME_WIDTH - 4, height).imshow(frame.rgb)
+    top, wide, height = place
+    scale = ScalarMappable(Normalize(0.0, max(most_m, 1e-3)), colormaps["viridis"].with_extremes(bad="#b8b8b8"))
+    below = top + canvas.LINE_IN + height + GAP_IN
+    for column, frame in enumerate(frames):
+        left = column * wide
+        page.text(left, top, f"frame {frame.index}")
+        page.axes(left, top + canvas.LINE_IN, wide - GAP_IN, height).imshow(frame.rgb)
         depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
-        page.axes(left, below + CAPTION, FRAME_WIDTH - 4, height).imshow(
+        page.axes(left, below + canvas.LINE_IN, wide - GAP_IN, height).imshow(
             scale.to_rgba(np.ma.masked_invalid(depth)), interpolation="nearest"
         )
-    page.text(MARGIN, below + 8, "depth (grey: none)", size=10)
-    bar = page.axes(WIDTH - MARGIN - SCALE_WIDTH + 10, below + CAPTION, 14, height)
+    page.text(0, below, "depth in m (grey: none)")
+    bar = page.axes(page.width - SCALE_IN, below + canvas.LINE_IN, 0.1, height)
     bar.set_axis_on()
     page.figure.colorbar(scale, cax=bar)
-    page.text(WIDTH - MARGIN - SCALE_WIDTH + 10, below + 8, "depth (m)", size=10)
-    bar.tick_params(labelsize=9)
 
 
 def _thousands(n: int) -> str:

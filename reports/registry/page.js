@@ -25,6 +25,10 @@ const shortHardware = (row) => row.hardware.replace(/ \(cpu family[^)]*\)/, '');
 const ranksText = (row) => (!row.ranks ? '–'
   : row.ranks[0] === row.ranks[1] ? String(row.ranks[0]) : `${row.ranks[0]} to ${row.ranks[1]}`);
 
+const RANK = { num: true, isOnlyShown: true, value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null),
+  show: ranksText, hidden: [0, 1].map((end) => (
+    { label: `rank ${end ? 'to' : 'from'}`, value: (row) => (row.ranks ? row.ranks[end] : null) })) };
+
 function bundleText({ bundle }) {
   const name = bundle.address ? h('a', { href: bundle.address, rel: 'noreferrer' }, bundle.file) : bundle.file;
   return [name, ` (${megabytes(bundle.n_bytes)}) SHA-256 `, hash(bundle.sha256)];
@@ -42,6 +46,10 @@ function bestOf(rows, value) {
   return numbers.some((one) => one < most) ? most : null;
 }
 
+const pictureOf = (row) => (!row.picture ? null : h('img', { class: 'map', width: 120, height: 90, alt: `Map of ${row.method}`,
+  src: `data:image/png;base64,${DATA.pictures[row.picture]}` }));
+const authorsOf = (row) => (row.link
+  ? h('a', { href: row.link, rel: 'noreferrer', 'aria-label': `${row.method}: ${row.authors}` }, row.authors) : row.authors);
 const words = (label, value, more = {}) => ({ label, value, words: true, ...more });
 
 function headlineColumns(board, valueOf, withIntervals) {
@@ -54,8 +62,8 @@ function headlineColumns(board, valueOf, withIntervals) {
 }
 
 // A dataTable whose text columns may wrap.
-function table(caption, columns, rows) {
-  const made = dataTable({ caption, columns, rows });
+function table(file, caption, columns, rows) {
+  const made = dataTable({ file, caption, columns, rows, hidden: columns.flatMap((column) => column.hidden || []) });
   const mark = () => made.querySelectorAll('tbody tr').forEach((line) => columns.forEach((column, k) => {
     if (column.words) line.children[k].classList.add('words');
   }));
@@ -66,14 +74,15 @@ function table(caption, columns, rows) {
 
 function boardTable(board, rows) {
   const metrics = headlineColumns(board, (row, k) => row.values[k], true);
-  return table(`${scenesText(board)}; per cent with the 95 % confidence interval over scenes, best in bold`, [
-    { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
-    { label: 'Rank', title: 'Simultaneous 95 % rank interval', num: true,
-      value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null), show: ranksText },
+  return table(`${board.protocol} ranking`, `${scenesText(board)}; per cent with the 95 % confidence interval over scenes, best in bold`, [
+    { label: 'Method', value: (row) => row.method, show: (row) => [pictureOf(row), link(row.page, row.method)] },
+    { ...RANK, label: 'Rank', title: 'Simultaneous 95 % rank interval' },
     ...metrics,
     { label: 'Time per frame, as submitted', title: 'Median time per processed frame, not measured again; in brackets without perception', num: true,
       value: (row) => row.update_s,
       show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
+    words('Authors', (row) => row.authors, { show: authorsOf }),
+    { label: 'Date', num: true, value: (row) => row.date || null, show: (row) => row.date || '–' },
     words('Hardware', (row) => shortHardware(row)),
     words('Weights trained on', (row) => row.trained_on),
     { label: 'Perception profile', value: (row) => row.profile },
@@ -128,7 +137,7 @@ function indexPage() {
     return { made, place };
   });
   const says = (row, board) => [board.protocol, board.summary, ...board.scenes, row.method, row.hardware, row.trained_on,
-    row.profile, row.encoder, row.command, row.bundle.file, row.bundle.sha256, row.caveat].join('\n').toLowerCase();
+    row.profile, row.encoder, row.authors, row.command, row.bundle.file, row.bundle.sha256, row.caveat].join('\n').toLowerCase();
   function draw() {
     let n = 0;
     DATA.boards.forEach((board, k) => {
@@ -168,7 +177,8 @@ function methodPage() {
     section(id, board.protocol,
       intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
       h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),
-      facts([
+      pictureOf(row), facts([
+        ['Authors', authorsOf(row)], ['Date', row.date],
         ['Time per frame, as submitted', isNumber(row.update_s)
           ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception (median of ${plural(row.n_updates, 'frame')}, `
             + 'excluding the first of each scene)' : 'not measured'],
@@ -189,7 +199,7 @@ function methodPage() {
 
 function scenesTable(board, row) {
   const rows = Object.entries(row.of_scenes).map(([scene, values]) => ({ scene, values }));
-  return table('Per scene, in per cent', [
+  return table(`${row.method} ${board.protocol} scenes`, 'Per scene, in per cent', [
     { label: 'Scene', value: (one) => one.scene, show: (one) => link(DATA.scene_pages[one.scene], one.scene) },
     ...board.headline.map((metric, k) => ({ label: metric, num: true, value: (one) => one.values[k],
       show: (one) => valueCell(metric, one.values[k]) })),
@@ -204,11 +214,10 @@ function scenePage() {
   DATA.boards.forEach((board, k) => {
     const id = `board-${k}`, valueOf = (row, j) => row.of_scenes[DATA.name][j];
     section(id, board.protocol, intro(`Version ${board.version}: ${board.summary}. Ranked over ${scenesText(board)}.`),
-      table('This scene, in per cent; best in bold', [
+      table(`${DATA.name} ${board.protocol}`, 'This scene, in per cent; best in bold', [
         { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
         ...headlineColumns(board, valueOf, false),
-        { label: 'Rank over all scenes', num: true, value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null),
-          show: ranksText },
+        { ...RANK, label: 'Rank over all scenes' },
         { label: 'Perception profile', value: (row) => row.profile },
         words('Bundle', (row) => row.bundle.file),
       ], board.rows));

@@ -4,9 +4,13 @@
   const byId = (id) => document.getElementById(id);
   const asks = new Map(sheet.asks.map((ask) => [ask.name, ask]));
   const place = `su3d-bench sheet ${sheet.id} ${sheet.annotator}`;
+  const [LONGEST_S, MAX_PACE, MIN_PACE] = [120, 30, 5]; // longer is a pause; answers in the mean, and needed for it
   const nTotal = sheet.items.reduce((n, item) => n + item.asks.length, 0);
   let answers = {}; // item id -> ask -> choice
-  let history = []; // [item id, ask, choice before or null]
+  let comments = {}; // item id -> text
+  let history = []; // [item id, {ask: choice before or null}]
+  let pace = []; // seconds per answer, without pauses
+  let since = Date.now(); // last answer
   let at = 0;
   let canSave = true;
   let isExported = true;
@@ -20,6 +24,7 @@
       const kept = JSON.parse(localStorage.getItem(place) || "null");
       if (!kept || typeof kept !== "object") return;
       for (const item of sheet.items) {
+        if (typeof kept.comments?.[item.id] === "string") comments[item.id] = kept.comments[item.id];
         const saved = kept.answers && kept.answers[item.id];
         if (!saved) continue;
         for (const name of item.asks) {
@@ -30,8 +35,10 @@
       }
       if (Array.isArray(kept.history)) {
         const known = new Map(sheet.items.map((item) => [item.id, item]));
-        history = kept.history.filter((one) => Array.isArray(one) && known.get(one[0])?.asks.includes(one[1]));
+        const isKnown = ([id, before]) => before && Object.keys(before).every((name) => known.get(id)?.asks.includes(name));
+        history = kept.history.filter((one) => Array.isArray(one) && isKnown(one));
       }
+      if (Array.isArray(kept.pace)) pace = kept.pace.filter(Number.isFinite);
       if (Number.isInteger(kept.at)) at = Math.min(Math.max(kept.at, 0), sheet.items.length - 1);
     } catch {
       canSave = false;
@@ -41,31 +48,38 @@
   function save() {
     isExported = false;
     try {
-      localStorage.setItem(place, JSON.stringify({ answers, history, at }));
+      localStorage.setItem(place, JSON.stringify({ answers, comments, history, pace, at }));
       canSave = true;
     } catch {
       canSave = false;
     }
   }
 
-  function choose(name, choice) {
+  function choose(choices) {
     const item = sheet.items[at];
-    const before = Object.hasOwn(of(item), name) ? of(item)[name] : null;
-    history.push([item.id, name, before]);
-    (answers[item.id] ||= {})[name] = choice;
-    if (!openAsk(item) && before === null) {
-      at = Math.min(at + 1, sheet.items.length - 1);
-    }
+    const wasOpen = openAsk(item);
+    history.push([item.id, Object.fromEntries(Object.keys(choices).map((name) => [name, of(item)[name] ?? null]))]);
+    Object.assign((answers[item.id] ||= {}), choices);
+    const seconds = (Date.now() - since) / 1000;
+    const n = Object.keys(choices).length;
+    if (seconds >= 0 && seconds < LONGEST_S) pace = [...pace, ...Array(n).fill(seconds / n)].slice(-MAX_PACE);
+    since = Date.now();
+    if (wasOpen && !openAsk(item)) at = Math.min(at + 1, sheet.items.length - 1);
     save();
     show();
   }
 
+  // The first choice of every question is the favourable one.
+  const allRight = () => choose(Object.fromEntries(sheet.items[at].asks.map((name) => [name, asks.get(name).choices[0]])));
+
   function undo() {
     const last = history.pop();
     if (!last) return;
-    const [id, name, before] = last;
-    if (before === null) delete answers[id][name];
-    else answers[id][name] = before;
+    const [id, before] = last;
+    for (const [name, choice] of Object.entries(before)) {
+      if (choice === null) delete answers[id][name];
+      else answers[id][name] = choice;
+    }
     at = sheet.items.findIndex((item) => item.id === id);
     save();
     show();
@@ -94,14 +108,18 @@
     byId("image").setAttribute("aria-pressed", String(isSo));
   }
 
+  // On one line, and marked so that a spreadsheet does not read it as a formula.
+  const commentOf = (item) =>
+    (comments[item.id] || "").replace(/[\s\p{Cc}\p{Cs}]+/gu, " ").trim().replace(/^[=+\-@\uff1d\uff0b\uff0d\uff20]/u, "'$&");
   const cell = (text) => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
 
   function csv() {
     const rows = [sheet.columns];
     for (const item of sheet.items) {
-      for (const name of item.asks) {
-        rows.push([sheet.id, item.id, sheet.annotator, name, Object.hasOwn(of(item), name) ? of(item)[name] : "", item.check]);
-      }
+      item.asks.forEach((name, k) => {
+        const comment = k === 0 ? commentOf(item) : "";
+        rows.push([sheet.id, item.id, sheet.annotator, name, of(item)[name] ?? "", item.check, comment]);
+      });
     }
     return rows.map((row) => row.map(cell).join(",")).join("\n") + "\n";
   }
@@ -137,7 +155,7 @@
       button.append(element("span", choice));
       if (ask.meanings[k]) button.append(element("small", ask.meanings[k]));
       button.setAttribute("aria-pressed", String(of(item)[name] === choice));
-      button.addEventListener("click", () => choose(name, choice));
+      button.addEventListener("click", () => choose({ [name]: choice }));
       row.append(button);
     });
     field.append(row);
@@ -162,17 +180,27 @@
     const done = nDone();
     byId("progress").max = nTotal;
     byId("progress").value = done;
+    const minutes = (pace.reduce((a, b) => a + b, 0) / pace.length / 60) * (nTotal - done);
+    const isTimed = pace.length >= MIN_PACE && done < nTotal;
+    byId("left").textContent = isTimed ? `about ${Math.max(1, Math.round(minutes))} min left (estimate)` : "";
     byId("count").textContent = `${done} of ${nTotal} answered, item ${at + 1} of ${sheet.items.length}`;
     const image = byId("image");
+    const [panel, fields] = [byId("panel"), byId("asks")];
+    const hasFocus = fields.contains(document.activeElement);
     if (image.dataset.item !== item.id) {
       image.dataset.item = item.id;
-      image.src = `data:image/png;base64,${item.picture}`;
+      image.src = `data:image/jpeg;base64,${item.picture}`;
       enlarge(false);
       byId("picture").scrollTo(0, 0);
+      panel.scrollTo(0, 0);
+      byId("comment").value = comments[item.id] || "";
     }
     image.alt = `Picture of ${item.id}`;
     byId("text").textContent = item.text;
-    byId("asks").replaceChildren(...item.asks.map((name) => fieldOf(item, name, currentAsk(item))));
+    fields.replaceChildren(...item.asks.map((name) => fieldOf(item, name, currentAsk(item))));
+    const current = fields.querySelector(".now");
+    if (hasFocus) current.querySelector("button").focus({ preventScroll: true });
+    if (panel.scrollHeight > panel.clientHeight) current.scrollIntoView({ block: "nearest" }); // beside the picture
     byId("back").disabled = at === 0;
     byId("next").disabled = at === sheet.items.length - 1;
     byId("undo").disabled = history.length === 0;
@@ -189,6 +217,11 @@
   byId("next").addEventListener("click", () => go(1));
   byId("open").addEventListener("click", goToOpen);
   byId("undo").addEventListener("click", undo);
+  byId("right").addEventListener("click", allRight);
+  byId("comment").addEventListener("input", () => {
+    comments[sheet.items[at].id] = byId("comment").value;
+    save();
+  });
   byId("export").addEventListener("click", exportAnswers);
   byId("image").addEventListener("click", () => enlarge(!isLarge()));
   byId("image").addEventListener("keydown", (event) => {
@@ -199,11 +232,14 @@
     if (!event.key.startsWith("Arrow")) event.preventDefault();
   });
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+    if (event.target === byId("comment") && event.key === "Escape") event.target.blur();
+    if (event.target === byId("comment") || event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
     const item = sheet.items[at];
     const name = currentAsk(item);
     const choice = asks.get(name).choices[Number(event.key) - 1];
-    if (choice !== undefined) choose(name, choice);
+    if (choice !== undefined) choose({ [name]: choice });
+    else if (event.key === "a" || event.key === "A") allRight();
+    else if (event.key === "c" || event.key === "C") byId("comment").focus();
     else if (event.key === "ArrowLeft") go(-1);
     else if (event.key === "ArrowRight") go(1);
     else if (event.key === "u" || event.key === "U") undo();

@@ -234,8 +234,13 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
     # methods share items, so that a sum would count judgements several times
     unclear = max((c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people"), default=0)
     subject, question = SUBJECTS[scores["kind"]]
-    people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
+    assigned = {name: scores["assigned"].get(name, n) for name, n in scores["annotators"].items()}
+    is_partial = assigned != scores["annotators"]
+    people = ", ".join(
+        f"{name} {n}" + (f" of {assigned[name]}" if is_partial else "") for name, n in scores["annotators"].items()
+    )
     judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
+    judged += "; unanswered questions are excluded" if is_partial else ""
     judged = judged if people else f"not judged by annotators; {scores['n_items']} items"
     origin = f" of run {scores['run']}" if scores["run"] else ""
     return Table(
@@ -306,18 +311,24 @@ def _disagree(test: Mapping[str, Any]) -> bool:
 
 def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
+    is_ordered = any(question["agreement"]["ordinal_alpha"] is not None for question in agreements)
     for question in agreements:
         of = question["agreement"]
         share = f"{of['n_equal']}/{of['n_items']}"
         beside = bracketed(of["interval"], "{:.2f}".format)
         fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
         cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
-        rows.append(TableRow(question["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
+        ordinal = (Cell(_coefficient(of["ordinal_alpha"])),) if is_ordered else ()
+        last = (Cell(_coefficient(of["fleiss"]), fleiss), Cell(_coefficient(of["ac1"])))
+        rows.append(TableRow(question["ask"], (*cells, *ordinal, *last)))
     return Table(
         name="agreement",
         caption="Agreement of annotators.",
         head="question",
-        columns=("annotators", "all equal", "Krippendorff's alpha", "Fleiss' kappa"),
+        columns=(
+            *("annotators", "all equal", "Krippendorff's alpha", *(["ordinal alpha"] if is_ordered else [])),
+            *("Fleiss' kappa", "Gwet's AC1"),
+        ),
         rows=tuple(rows),
         notes=(
             "1: full agreement, 0: chance level; over items with at least two answers; 'cannot tell' is an answer; in "

@@ -14,13 +14,11 @@ def few_scenes(n_scenes: int) -> str | None:
     """Return the warning for intervals over few scenes; None for a single scene (no interval) or enough scenes.
 
     >>> few_scenes(4)
-    'intervals from fewer than 10 scenes are unreliable (here: 4): docs/numbers/statistics.md'
+    'intervals from fewer than 10 scenes are unreliable (here: 4)'
     """
     if not 1 < n_scenes < FEW_SCENES:
         return None
-    return (
-        f"intervals from fewer than {FEW_SCENES} scenes are unreliable (here: {n_scenes}): docs/numbers/statistics.md"
-    )
+    return f"intervals from fewer than {FEW_SCENES} scenes are unreliable (here: {n_scenes})"
 
 
 REFINED_LABELS = "label n: the name given while mapping; n': the name chosen afterwards from the instance's best views"

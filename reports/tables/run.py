@@ -9,7 +9,8 @@ from typing import Any
 
 from su3d_bench.core.english import is_countable, plural
 from su3d_bench.core.errors import counted, printable, some
-from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, is_count, percent, text_table, with_interval
+from su3d_bench.metrics.scoring import EVERY_SCENE
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
 from su3d_bench.store.records import UnscoredRecord
@@ -151,6 +152,12 @@ def _kind(reason: UnscoredRecord) -> tuple[str, ...]:
 
 
 MAX_SCENES = 20  # named per line
+MAX_NOTES = 12  # printed warnings of a method; the file has all
+MEAN, POOLED, EVERY_CLASS = "mean over scenes", "all scenes pooled", "each mask under each class"
+NOTE_OF_MEAN = (
+    "values over all scenes pool their counts (for AP, the detections of all scenes are ranked together); the mean "
+    "over scenes weights each scene equally and averages over the classes in it, so the two differ"
+)
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}  # prefix of metric names -> row label
 
 
@@ -159,11 +166,17 @@ def markdown_table(metrics: Mapping[str, Any]) -> str:
     return markdown(run_tables(metrics))
 
 
-def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[Table | Prose]:
-    """Return one table per protocol with scores or failures: one row per method, notes below.
+def run_tables(
+    metrics: Mapping[str, Any],
+    found: Sequence[Found] = (),
+    evaluated: Mapping[str, Mapping[str, Any]] | None = None,
+    *,
+    per_class: bool = False,
+) -> list[Table | Prose]:
+    """Return one table per protocol with scores or failures: one row per method, details and notes below.
 
-    ``metrics``: content of ``metrics.json``; ``found``: maps without scores. Numbers are percentages with their 95 %
-    confidence interval over scenes.
+    ``metrics``: content of ``metrics.json``; ``found``: maps without scores; ``evaluated``: by method, the JSON of an
+    evaluation of external predictions. Numbers are percentages with their 95 % confidence interval over scenes.
     """
     rows_of: dict[str, list[Mapping[str, Any]]] = {}
     for result in metrics["results"]:
@@ -171,7 +184,10 @@ def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[
     results = metrics["results"]
     with_results = [rows for rows in rows_of.values() if any(row["result"] or row["failed"] for row in rows)]
     if any(row["result"] for row in results):
-        parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in with_results]
+        parts: list[Table | Prose] = []
+        for rows in with_results:
+            parts.append(_protocol_table(rows, metrics, evaluated or {}))
+            parts += [part for row in rows if per_class and row["result"] for part in _classes(row)]
     else:  # one list instead of empty tables
         failed = {f"{row['method']} failed on {', '.join(row['failed'])}" for row in results if row["failed"]}
         parts = [Prose(tuple(sorted(failed)) or ("no protocol applies to these scenes",), is_list=bool(failed))]
@@ -189,16 +205,33 @@ def headline(result: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any]) -> Table:
+def _protocol_table(
+    rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any], evaluated: Mapping[str, Mapping[str, Any]]
+) -> Table:
     first = rows[0]
     names = list(first["headline"])
     title = f"{first['protocol']} (version {first['version']})"
     if metrics["is_partial"]:
         title += f": PARTIAL, only the first {counted(int(metrics['limit']), 'frame')} of each scene"
     header = ["method", *names, f"GT ceiling ({' / '.join(names)})", "scenes", "coverage @ 2.5 / 5 / 10 cm"]
-    body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
+    scored = {
+        str(row["method"]): document["protocols"].get(first["protocol"])
+        for row in rows
+        if (document := evaluated.get(row["method"]))
+    }
+    body, notes = [], []
+    for row in rows:
+        body.append([row["method"], *(_value_text(row, name) for name in names), *_context(row, names)])
+        details = _details(row, names, scored.get(row["method"]))
+        for label, values in details.items():
+            shares = [f"{row['method']}: {label}", *(percent(values.get(name)) for name in names)]
+            body.append([*shares, *[NOT_MEASURED] * (len(header) - len(shares))])
+        notes += [NOTE_OF_MEAN] if {MEAN, POOLED} & details.keys() and NOTE_OF_MEAN not in notes else []
     body += _cheap_rows(rows, names, len(header))
-    notes = [line for row in rows for line in _notes(row)]
+    notes += [line for row in rows for line in _notes(row)]
+    for method, one in scored.items():
+        whose = f"{method}: " if len(rows) > 1 else ""
+        notes += [f"{whose}{line}" for line in (_facts_of_files(one) if one else ())]
     notes += confidence_notes({str(row["method"]): row.get("confidences") for row in rows})
     own = [row for row in rows if not is_ceiling(str(row["method"]), row["caveat"])]
     notes += label_count_notes({str(row["method"]): row.get("labels") for row in own})
@@ -206,6 +239,25 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     notes += label_notes(names)
     notes += [line for line in (few_scenes(min(n_scenes, default=0)),) if line]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
+
+
+def _details(
+    row: Mapping[str, Any], names: Sequence[str], scored: Mapping[str, Any] | None
+) -> dict[str, Mapping[str, Any]]:
+    """Return further values of a method by their label: mean over scenes, bounds, and groups of classes."""
+    result = row["result"]
+    if result is None or is_ceiling(str(row["method"]), row["caveat"]):
+        return {}
+    details: dict[str, Mapping[str, Any]] = {}
+    mean, pooled = result.get("scene_mean"), result.get("pooled")
+    if result["n_scenes"] > 1 and mean and pooled:
+        is_pooled = all(result["metrics"].get(name) == pooled.get(name) for name in names)
+        details = {MEAN: mean} if is_pooled else {POOLED: pooled}
+    for label, key in (("all confidences 1", "every_confidence_1"), (EVERY_CLASS, "every_mask_every_class")):
+        if scored is not None and scored[key] is not None:
+            details[label] = {name: scored[key].get(name.lower()) for name in names}
+    groups: dict[str, Mapping[str, Any]] = result.get("groups", {})
+    return details | groups
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:
@@ -249,62 +301,16 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
     if row["caveat"]:
         yield f"{method}: {row['caveat']}"
     warnings = [] if row["result"] is None else [str(line) for line in row["result"]["warnings"]]
-    for said, scenes in summed(warnings, {line.partition(": ")[0] for line in warnings if ": " in line}):
-        yield f"{method}: {said}" + (f" ({some(scenes, 3)})" if scenes else "")
+    lines = summed(warnings, {line.partition(": ")[0] for line in warnings if ": " in line})
+    for said, scenes in lines[:MAX_NOTES]:
+        where = [EVERY_SCENE] if EVERY_SCENE in scenes else scenes
+        yield f"{method}: {said}" + (f" ({some(where, 3)})" if where else "")
+    if len(lines) > MAX_NOTES:
+        yield f"{method}: and {len(lines) - MAX_NOTES} more warnings, all in --json"
 
 
-NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
-NAMES |= {f"top_{k}_{key}": f"top-{k} {name}" for k in range(1, 10) for key, name in NAMES.items()}
-MAX_NOTES = 12  # printed warnings; the file has all
-
-
-def evaluation_tables(document: Mapping[str, Any], *, per_class: bool = False) -> list[Table | Prose]:
-    """Return one table per protocol: numbers in per cent, context rows, warnings; on request one per class."""
-    parts: list[Table | Prose] = []
-    for name, scored in document["protocols"].items():
-        caption = f" (version {scored['version']}), {_scenes(scored)}"
-        parts.append(text_table(name, _numbers(scored), heading=name, caption=caption, notes=_beneath(scored)))
-        parts += _classes(name, scored) if per_class else []
-    return parts
-
-
-def side_by_side_tables(
-    metrics: Mapping[str, Any], documents: Mapping[str, Mapping[str, Any]], *, per_class: bool = False
-) -> list[Table | Prose]:
-    """Return the tables of a run of several methods; on request with the classes of each."""
-    parts = run_tables(metrics)
-    for method, document in documents.items() if per_class else ():
-        for name, scored in document["protocols"].items():
-            parts.append(Prose((f"{printable(method, 80)}, {name}",)))
-            parts += _classes(name, scored)
-    return parts
-
-
-def _scenes(scored: Mapping[str, Any]) -> str:
-    text = counted(int(scored["n_scenes"]), "scene")
-    n_missed, n_skipped = len(scored["missed_scenes"]), len(scored["skipped_scenes"])
-    text += f", {n_missed} without a prediction" if n_missed else ""
-    return text + (f"; {n_skipped} EXCLUDED" if n_skipped else "")
-
-
-def _numbers(scored: Mapping[str, Any]) -> list[list[str]]:
-    metrics, intervals = scored["metrics"], scored["intervals"]
-    names = list(metrics)
-    is_pooled = metrics == {name: scored["pooled"].get(name) for name in names}
-    rows = [["", *(NAMES.get(name, name) for name in names)]]
-    rows.append(["result", *(with_interval(metrics[name], intervals.get(name)) for name in names)])
-    other = ("mean over scenes", scored["scene_mean"]) if is_pooled else ("scenes pooled", scored["pooled"])
-    others = [other, ("GT ceiling", scored["ceiling"])]
-    others.append(("each mask under each class", scored["every_mask_every_class"]))
-    others.insert(1, ("all confidences 1", scored["every_confidence_1"]))
-    others += list(scored["groups"].items())
-    for title, values in others:
-        if values is not None:
-            rows.append([title, *(percent(values.get(name)) for name in names)])
-    return rows
-
-
-def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
+def _facts_of_files(scored: Mapping[str, Any]) -> Iterable[str]:
+    """Yield what an evaluation knows of the files of predictions."""
     counts = list(scored["n_predictions"].values())
     if counts and scored["confidences"] is not None:
         spread = f" ({min(counts)} to {max(counts)})" if min(counts) < max(counts) else ""
@@ -320,30 +326,18 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
         yield f"points in several masks: {percent(scored['contested_points'])} % of the points in masks"
     if scored["coverage"] is None:
         yield "coverage: unknown because the ground truth has no coordinates"
-    else:
-        shares = " / ".join(percent(share) for share in scored["coverage"].values())
-        yield f"coverage @ 2.5 / 5 / 10 cm: {shares} %"
-    if any(scored["intervals"].values()) and (line := few_scenes(int(scored["n_scenes"]))):
-        yield line
-    warnings = [
-        f"{said}, in {len(scenes)} scenes ({some(scenes, 3)})" if len(scenes) > 1 else ": ".join([*scenes, said])
-        for said, scenes in summed(scored["warnings"], scored["per_scene"])
-    ]
-    yield from (f"WARNING: {printable(line)}" for line in warnings[:MAX_NOTES])
-    if len(warnings) > MAX_NOTES:
-        yield f"and {len(warnings) - MAX_NOTES} more warnings, all in the --json file"
 
 
-def _classes(protocol: str, scored: Mapping[str, Any]) -> list[Table | Prose]:
-    """Return one row per class; classes without any value are named below."""
-    classes = {
-        name: values for name, values in scored["per_class"].items() if any(v is not None for v in values.values())
-    }
+def _classes(row: Mapping[str, Any]) -> list[Table | Prose]:
+    """Return one row per class of a method; classes without any value are named below."""
+    all_classes = row["result"]["per_class"]
+    classes = {name: values for name, values in all_classes.items() if any(v is not None for v in values.values())}
+    heading = f"{row['protocol']}, classes of {printable(str(row['method']), 80)}"
     if not classes:
-        return [Prose(("no class has a value",))]
-    columns = list(next(iter(classes.values())))
-    rows = [["class", *(NAMES.get(column, column) for column in columns)]]
+        return [Prose((f"{heading}: none has a value",))]
+    columns = [name for name in next(iter(classes.values())) if not is_count(name)]
+    rows = [["class", *columns]]
     rows += [[name, *(percent(values[column]) for column in columns)] for name, values in classes.items()]
-    without = [name for name in scored["per_class"] if name not in classes]
-    note = [Prose((f"no value ({NOT_MEASURED}): {', '.join(without)}",))] if without else []
-    return [text_table(f"{protocol}-classes", rows), *note]
+    without = [name for name in all_classes if name not in classes]
+    note = [f"no value ({NOT_MEASURED}): {', '.join(without)}"] if without else []
+    return [text_table(f"{row['protocol']}-classes", rows, heading=heading, notes=note)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Self
@@ -366,7 +366,13 @@ HIGHER_IS_BETTER = frozenset(
 )  # fmt: skip
 
 
-def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) -> Verdict:
+def check(
+    run: FinishedRun,
+    reference: Reference,
+    *,
+    recompute: bool = False,
+    progress: Callable[[str, int, int], None] = lambda scene, n_done, n_all: None,
+) -> Verdict:
     """Everything in which the counts of ``run`` differ from ``reference``, both failures and improvements.
 
     ``recompute``: also score its maps again and compare these scores with its counts.
@@ -377,7 +383,7 @@ def check(run: FinishedRun, reference: Reference, *, recompute: bool = False) ->
     if faults:  # whatever such records say is not compared
         return Verdict(run.name, tuple(findings), 0, (), ())
     if recompute:
-        findings += [Finding("changed", "maps", fault) for _, _, fault in rescored(run) if fault is not None]
+        findings += [Finding("changed", "maps", fault) for _, _, fault in rescored(run, progress) if fault is not None]
     table = run.results
     across = None if is_same_machine else reference.machine_tolerance
     numbers: list[Compared] = []

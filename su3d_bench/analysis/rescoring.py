@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,10 +29,14 @@ TOLERANCE = 1e-9  # of a value computed on another machine
 LOCAL = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}
 
 
-def rescored(run: FinishedRun) -> Iterator[tuple[int, bool, str | None]]:
+def rescored(
+    run: FinishedRun, progress: Callable[[str, int, int], None] = lambda scene, n_done, n_all: None
+) -> Iterator[tuple[int, bool, str | None]]:
     """Number of scores, whether they are identical, and the fault, of every map of ``run`` scored again here."""
     is_same_machine = run.record.processor == processor_digest()
-    for scene, method, scores in _of_predictions(run) if run.record.predictions else _of_maps(run):
+    n_all = len(run.scenes) * len(run.methods)
+    for k, (scene, method, scores) in enumerate(_of_predictions(run) if run.record.predictions else _of_maps(run), 1):
+        progress(scene, k, n_all)
         counts = read_arrays(io.BytesIO(file_bytes(run.folder.job(scene, method).counts)))
         ours = read_arrays(io.BytesIO(pack_scores(scores)))
         fault = difference(counts, ours, to_the_bit=is_same_machine)

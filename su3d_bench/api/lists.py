@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, frame
-from su3d_bench.api.tables import Names, several
+from su3d_bench.api.tables import Names
+from su3d_bench.core.arguments import several
 
 if TYPE_CHECKING:
     import pandas
@@ -26,7 +27,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     from su3d_bench.runs.scenes import data_root
 
     rows: list[tuple[object, ...]] = []
-    for one in known_datasets(several(names), data_root()):
+    for one in known_datasets(several("names", names), data_root()):
         rows += [(one["name"], scene["scene"], scene["status"], one["summary"], True) for scene in one["scenes"]]
         if not one["scenes"]:
             rows.append((one["name"], "", one["error"] or "has no scene", one["summary"], False))

@@ -6,22 +6,36 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
 
-from su3d_bench.api.tables import Names, Place, Run, Scores, several
-from su3d_bench.core.errors import ConfigError, RunIncomplete, counted, suggest
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.api.tables import Names, Place, Run, Scores
+from su3d_bench.core import registry
+from su3d_bench.core.arguments import several, typed
+from su3d_bench.core.errors import ConfigError, PredictionError, RunIncomplete, counted
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.evaluation.result import Confidences, Request, ValuesForm, default_name
+from su3d_bench.runs.existing import Into
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.result import Confidences, Request, ValuesForm
+    from su3d_bench.predictions.base import Content
     from su3d_bench.runs.executors import Event, Report
-    from su3d_bench.runs.existing import Into
 
 Predictions = Place | Sequence[Place]
+Methods = str | type | Sequence[str | type]
+# One scene's map: as a method returns it; masks (N, M), or (masks, scores, classes), over the N ground-truth points;
+# or the dict of pred_masks, pred_scores and pred_classes of ScanNet's and OpenMask3D's evaluators.
+SceneMap = Prediction | NDArray[Any] | tuple[NDArray[Any] | None, ...] | Mapping[str, NDArray[Any]]
+
+Given = Predictions | Mapping[str, Predictions | SceneMap | Mapping[str, SceneMap]]
 
 
+@typed
 def run(
     scenes: Names,
-    methods: Names = "opensu3d",
+    methods: Methods = "opensu3d",
     *,
     protocols: Names | None = None,
     profile: str | None = None,
@@ -34,17 +48,18 @@ def run(
     settings: Mapping[str, Any] | None = None,
     config: Place | None = None,
     out: Place | None = None,
-    into: Literal["own", "extend", "replace"] = "own",
+    into: Into = "own",
     report: Report | None = None,
     **more: Any,
 ) -> Run:
     """Run methods over scenes, score their maps, and return the finished run, as ``su3d-bench run``.
 
-    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``), ``settings``
-    are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as
-    ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
-    call resumes a run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend``
-    or ``--replace``. ``report`` is called with every ``Event``, to show progress.
+    The keywords are its options, None is the default: ``scenes`` are addresses or patterns (``rooms/*``),
+    ``methods`` names or classes, which run in this process with ``jobs=1``, ``settings`` are those of ``--set``
+    such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such as ``executor`` or
+    ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same call resumes a
+    run in it; another request is an error, unless ``into`` is ``extend`` or ``replace``, as ``--extend`` or
+    ``--replace``. ``report`` is called with every ``Event``, to show progress.
 
     Raises ``ConfigError`` for an invalid request, before any work; ``DataError`` or ``ModelMissing`` for missing data
     or models; ``StoreError`` for a folder with another run; ``RunIncomplete`` if scenes failed: the folder then
@@ -64,13 +79,16 @@ def run(
     from su3d_bench.runs.plan import asked_settings, make_plan
     from su3d_bench.runs.runner import run_plan
 
-    chosen: tuple[Into, ...] = ("own", "extend", "replace")
-    if into not in chosen:
-        raise ConfigError(f"run(into={into!r}): expected one of {', '.join(chosen)}")
+    given = several("methods", methods, str | type)
+    targets = [registry.target_of("method", one) if isinstance(one, type) else one for one in given]
+    if any(isinstance(one, type) and one.__module__.partition(".")[0] != "su3d_bench" for one in given):
+        if jobs not in (None, 1) or more.get("executor", "inline") not in ("auto", "inline"):
+            raise ConfigError("run: a class runs in this process; use jobs=1, or save it and pass 'file.py:Class'")
+        jobs = 1
     values = {
-        "scenes": list(several(scenes)),
-        "methods": list(several(methods)),
-        "protocols": None if protocols is None else list(several(protocols)),
+        "scenes": list(several("scenes", scenes)),
+        "methods": targets,
+        "protocols": None if protocols is None else list(several("protocols", protocols)),
         "profile": profile,
         "stride": stride,
         "seed": seed,
@@ -121,42 +139,29 @@ def _script_kept_out_of_workers() -> Iterator[None]:
         main.__file__ = file
 
 
-@overload
-def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
-    *,
-    dataset: str | None = ...,
-    ground_truth: Place | None = ...,
-    ground_truth_values: ValuesForm | None = ...,
-    protocols: Names = ...,
-    scenes: Names = ...,
-    format: str | None = ...,
-    text_features: Place | None = ...,
-    confidences: Confidences | None = ...,
-    queries: Place | None = ...,
-    out: None = ...,
-) -> Scores: ...
+class _Options(TypedDict, total=False):
+    dataset: str | None
+    ground_truth: Place | None
+    ground_truth_values: ValuesForm | None
+    protocols: Names
+    scenes: Names
+    input_format: str | None
+    text_features: Place | None
+    confidences: Confidences | None
+    queries: Place | None
 
 
 @overload
-def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
-    *,
-    dataset: str | None = ...,
-    ground_truth: Place | None = ...,
-    ground_truth_values: ValuesForm | None = ...,
-    protocols: Names = ...,
-    scenes: Names = ...,
-    format: str | None = ...,
-    text_features: Place | None = ...,
-    confidences: Confidences | None = ...,
-    queries: Place | None = ...,
-    out: Place,
-) -> Run: ...
+def evaluate(predictions: Given, *, out: None = ..., **options: Unpack[_Options]) -> Scores: ...
 
 
+@overload
+def evaluate(predictions: Given, *, out: Place, **options: Unpack[_Options]) -> Run: ...
+
+
+@typed
 def evaluate(
-    predictions: Predictions | Mapping[str, Predictions],
+    predictions: Given,
     *,
     dataset: str | None = None,
     ground_truth: Place | None = None,
@@ -169,11 +174,14 @@ def evaluate(
     queries: Place | None = None,
     out: Place | None = None,
 ) -> Scores | Run:
-    """Score existing predictions with every protocol that fits, as ``su3d-bench evaluate``.
+    """Score existing predictions with the dataset's headline protocol if that fits, otherwise or with
+    ``protocols="all"`` with all that fit, as ``su3d-bench evaluate``.
 
-    ``predictions`` is a folder, a file or several of them, or for several methods a mapping
-    ``{"mine": folder, "theirs": folder}``. The keywords are the options of the command. Returns the numbers; with
-    ``out`` they are written there and returned as a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
+    ``predictions`` is a folder, a file or several of them; or for each scene its map, ``{"scene0011_00": map}``: as a
+    method returns it, or ``(masks, scores, classes)`` with masks (N, M) over the N ground-truth points, M scores and M
+    class ids. For several methods it is a mapping, ``{"mine": folder, "theirs": folder}``. The keywords are the
+    options of the command. Returns the numbers; with ``out`` they are written there and returned as a ``Run``, which
+    also has ``instances``, ``errors`` and ``compare``.
 
     Raises ``PredictionError`` for predictions that cannot be scored, ``DataError`` for missing ground truth,
     ``ConfigError`` for an invalid request, ``StoreError`` if ``out`` contains another run.
@@ -187,30 +195,32 @@ def evaluate(
     su3d_bench.core.errors.ConfigError: unknown protocol 'scanet-instance'; did you mean 'scannet-instance'? ...
     """
     from su3d_bench.evaluation.evaluate import warnings_of
-    from su3d_bench.evaluation.result import Request, default_name
     from su3d_bench.evaluation.run_output import evaluate_methods
+    from su3d_bench.predictions.formats import IN_MEMORY
 
-    _check_known("ground_truth_values", ground_truth_values, ("classes", "instances", "numbers"))
-    _check_known("confidences", confidences, ("protocol", "file"))
     place = None if out is None else Path(out)
-    named = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
+    named: Mapping[Any, Any] = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
     if not named:
-        raise ConfigError("evaluate: no predictions; pass a folder, files, or a mapping of methods")
-    requests: dict[str, Request] = {
-        str(method): Request(
-            tuple(map(Path, [paths] if isinstance(paths, str | Path) else paths)),
+        raise ConfigError("evaluate: no predictions; pass a folder, files, maps by scene, or a mapping of methods")
+    if all(map(_is_map, named.values())):
+        named = {default_name(place): named}
+    requests: dict[str, Request] = {}
+    for method, given in named.items():
+        contents = {str(scene): _content(scene, one) for scene, one in given.items()} if _are_maps(given) else None
+        paths = (IN_MEMORY,) if contents else several(f"predictions of {method}", given, str | Path)
+        requests[str(method)] = Request(
+            tuple(map(Path, paths)),
+            contents=contents,
             dataset=dataset,
             ground_truth=_path(ground_truth),
             ground_truth_values=ground_truth_values,
-            protocols=several(protocols),
-            scenes=several(scenes),
+            protocols=several("protocols", protocols),
+            scenes=several("scenes", scenes) or tuple(contents or ()),
             format=input_format,
             text_features=_path(text_features),
             confidences=confidences,
             queries=_path(queries),
         )
-        for method, paths in named.items()
-    }
     evaluated = evaluate_methods(requests, place)
     remarks = [
         f"{method}: {line}" if len(requests) > 1 else line
@@ -220,10 +230,37 @@ def evaluate(
     return Scores(evaluated.metrics, remarks) if place is None else Run(place, remarks)
 
 
+def _is_map(value: Any) -> bool:
+    """Whether a value is the map of one scene, in a form of ``SceneMap``."""
+    if isinstance(value, Mapping):
+        return "pred_masks" in value
+    is_array = isinstance(value, np.ndarray) or (
+        isinstance(value, tuple) and any(isinstance(one, np.ndarray) for one in value)
+    )
+    return is_array or isinstance(value, Instances | Partition | DenseFeatures)
+
+
+def _are_maps(value: Any) -> bool:
+    return isinstance(value, Mapping) and bool(value) and all(map(_is_map, value.values()))
+
+
+def _content(scene: str, value: Any) -> Content:
+    """The checked map of a scene; ``PredictionError`` if it cannot be scored."""
+    from su3d_bench.predictions.masks import matrix_masks
+    from su3d_bench.runs.plugins import in_stored_form, validation_error
+
+    if isinstance(value, Mapping):
+        value = tuple(value.get(key) for key in ("pred_masks", "pred_scores", "pred_classes"))
+    if isinstance(value, np.ndarray | tuple):
+        arrays = value if isinstance(value, tuple) else (value,)
+        if len(arrays) > 3:
+            raise PredictionError(f"{scene}: {len(arrays)} arrays; expected (masks, scores, classes)")
+        return matrix_masks(scene, arrays[0], *(None if one is None else np.asarray(one) for one in arrays[1:]))
+    found = in_stored_form(value)
+    if fault := validation_error(found):
+        raise PredictionError(f"{scene}: {fault}")
+    return found
+
+
 def _path(place: Place | None) -> Path | None:
     return None if place is None else Path(place)
-
-
-def _check_known(name: str, value: str | None, known: Sequence[str]) -> None:
-    if value is not None and value not in known:
-        raise ConfigError(f"evaluate({name}={value!r}): unknown value{suggest(value, known)}")

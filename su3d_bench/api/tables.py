@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.api import frames
+from su3d_bench.core.arguments import several, typed
 from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.core.safe_output import terminal_width
 
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 MAX_NAMED = 4  # methods and protocols in one line
 Place = str | Path
 Names = str | Sequence[str]
-
-
-def several(names: Names) -> tuple[str, ...]:
-    """One name or several, as a tuple."""
-    return (names,) if isinstance(names, str) else tuple(map(str, names))
 
 
 class Printable(ABC):
@@ -148,6 +144,7 @@ class Run(Scores):
     (('rooms/bathroom7',), ('opensu3d', 'oracle'), True)
     """
 
+    @typed
     def __init__(self, path: Place, remarks: Sequence[str] = ()) -> None:
         from su3d_bench.runs.verify import read_checked
         from su3d_bench.store.records import MetricsRecord
@@ -199,6 +196,7 @@ class Run(Scores):
     def _all_instance_rows(self) -> Any:
         return self._instance_rows()
 
+    @typed
     def select_instances(self, *, methods: Names = (), protocols: Names = (), scenes: Names = ()) -> pandas.DataFrame:
         """The instances of some methods, protocols and scenes: the rows of ``su3d-bench report instances``.
 
@@ -211,7 +209,8 @@ class Run(Scores):
         >>> found["kind"].unique().tolist()
         ['predicted', 'true']
         """
-        return frames.instances_frame(self._instance_rows(several(methods), several(protocols), several(scenes)))
+        chosen = {"methods": methods, "protocols": protocols, "scenes": scenes}
+        return frames.instances_frame(self._instance_rows(*(several(name, some) for name, some in chosen.items())))
 
     def _instance_rows(self, *chosen: tuple[str, ...]) -> Any:
         from su3d_bench.analysis.instances import Selection, instance_rows
@@ -251,6 +250,7 @@ class Run(Scores):
         }
         return [attribute(self.path, method=method, protocols=names) for method, names in wanted.items() if names]
 
+    @typed
     def prediction(self, scene: str, method: str | None = None) -> Prediction:
         """The map of a scene (``Instances``, ``Partition`` or ``DenseFeatures``), points in metres.
 
@@ -268,6 +268,7 @@ class Run(Scores):
             raise ConfigError(f"{self._run.name}: has the methods {', '.join(self.methods)}; name one of them")
         return map_of_scene(scene, method or self.methods[0], self.path)[2]
 
+    @typed
     def compare(
         self,
         other: Run | Place,
@@ -295,7 +296,7 @@ class Run(Scores):
             str(folder) if name is None else f"{folder}:{name}"
             for folder, name in ((self.path, method), (place, other_method or method))
         ]
-        return Comparison(compare(*sides, protocols=several(protocols), per_class=per_class).to_json())
+        return Comparison(compare(*sides, protocols=several("protocols", protocols), per_class=per_class).to_json())
 
     def _line(self) -> str:
         state = "complete" if self.is_complete else self._run.record.status
@@ -353,6 +354,7 @@ def _state_of(run: FinishedRun) -> list[str]:
     return lines
 
 
+@typed
 def load_run(path: Place) -> Run:
     """The finished run in the folder ``path``, which is not changed.
 

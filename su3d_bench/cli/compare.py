@@ -19,7 +19,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--protocols")
     parser.option("--per-class", "also show each class")
     parser.shared("--format")
-    parser = add_verb(verbs, "check", call_check)
+    parser = add_verb(verbs, "check", call_check, data=True)
     parser.option("runs [RUN...]", "run to check")
     parser.option("--against FILE", "reference file")
     parser.option("--recompute", "also score the maps again (slower)")
@@ -111,7 +111,9 @@ def _check(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.tables.formats import plain
     from su3d_bench.runs.finished import read_run
 
-    verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against), recompute=arguments.recompute)
+    run, reference = read_run(arguments.runs[0]), read_reference(arguments.against)
+    with output.steps("check", is_quiet=arguments.quiet) as step:
+        verdict = check(run, reference, recompute=arguments.recompute, progress=step)
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
         if path is not None:
             output.written(path, text(verdict))

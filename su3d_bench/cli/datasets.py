@@ -24,15 +24,16 @@ def add_parser(verbs: Verbs) -> None:
     su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data
     """
     actions = add_group(verbs, "datasets", add_parser, lists=True)
-    parser = add_verb(actions, "list", call_list)
+    parser = add_verb(actions, "list", call_list, data=True)
     parser.option("names [DATASET...]", "datasets to list (default: all)")
-    parser = add_verb(actions, "check", call_check)
+    parser = add_verb(actions, "check", call_check, data=True)
     parser.option("scenes SCENE...", "scenes or patterns, such as 'replica/*'")
     parser.option("--quick", "read only 20 evenly spaced frames of each scene")
     parser.shared("--jobs", "--set")
-    parser = add_verb(actions, "show", call_show)
+    parser = add_verb(actions, "show", call_show, data=True)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
+    parser.shared("--width")
     parser.option("--stride N", "use every Nth frame (default: 48 frames in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, resumes=True)
@@ -76,7 +77,7 @@ def call_make(arguments: argparse.Namespace) -> None:
     """Generate scenes on disk; the same command resumes after an interruption.
 
     su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'
-    su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200
+    su3d-bench datasets make rooms --layout scannet --out small --scenes bathroom0 --set n_frames=120
     """
     from su3d_bench.cli import make_scenes
 

@@ -28,7 +28,8 @@ def add_parser(verbs: Verbs) -> None:
     """
     actions = add_group(verbs, "dev", add_parser)
     _add_cache(actions)
-    add_verb(actions, "doctor", doctor.call, uses_all_cores=True)  # computes nothing, and shows the thread settings
+    # computes nothing, and shows the thread settings
+    add_verb(actions, "doctor", doctor.call, data=True).set_defaults(uses_all_cores=True)
     parser = add_verb(actions, "completion", call_completion)
     parser.option("shell", "shell to complete for", choices=SHELLS)
     _add_registry(actions)
@@ -134,7 +135,7 @@ def _add_registry(verbs: Verbs) -> None:
     su3d-bench dev registry build my-registry --out site
     """
     actions = add_group(verbs, "registry", _add_registry)
-    parser = add_verb(actions, "add", call_registry_add)
+    parser = add_verb(actions, "add", call_registry_add, data=True)
     parser.option("bundles BUNDLE...", "archives written by report bundle or reproduce")
     parser.option("--registry DIR", "registry folder (default: the current folder)", type=output_path, default=Path())
     parser.option("--bundle-name NAME", "name of the bundle in the registry (default: from its file or recipe)")
@@ -177,7 +178,7 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.registry import read_registry
     from su3d_bench.reproducing.registry_site import TITLE, write_site
 
-    registry = read_registry(arguments.folder)
+    registry = read_registry(arguments.folder, with_pictures=True)
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
     pages = write_site(registry, arguments.out, title, arguments.bundle_url)
     refused = [f"excluded: {one.run}, {one.what}: {one.reason}" for one in registry.refused]

@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, counted, printable, shown
+from su3d_bench.core.version import documentation
 
 PROGRAM = "su3d-bench"
 PATIENCE_S = 180.0  # per import, from a cold disk
@@ -129,7 +130,7 @@ def _abilities(found: dict[str, Any]) -> str:
     if "gpus" not in found:
         return ""
     built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPU only"
-    return f"; {', '.join(found['gpus']) or f'no GPU ({built}), see docs/running/gpu.md'}"
+    return f"; {', '.join(found['gpus']) or f'no GPU ({built}), see ' + documentation('running/gpu')}"
 
 
 def loaded(package: str) -> tuple[dict[str, Any], str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.options import Verbs, add_verb, output_path
-from su3d_bench.cli.output import answer_tables, remark
+from su3d_bench.cli.output import answer_tables, remark, steps
 from su3d_bench.core.errors import ConfigError
 
 SCHEMA = 1  # version of the JSON for several methods
@@ -24,7 +24,7 @@ REQUEST_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "evaluate", call)
+    parser = add_verb(verbs, "evaluate", call, data=True)
     parser.option("paths [PREDICTIONS...]", "folder of predictions, run folder, or files", type=Path)
     parser.option("--name NAME", "name of the method (default: name of --out)")
     parser.option("--predictions METHOD=PREDICTIONS...", "predictions of several methods", action="extend", default=[])
@@ -39,7 +39,7 @@ def add_parser(verbs: Verbs) -> None:
         "values in --ground-truth: class ids, label * 1000 + instance, or object numbers",
         choices=("classes", "instances", "numbers"),
     )
-    parser.shared("--protocols", "--scenes")
+    parser.shared("--protocols", "--all-protocols", "--scenes")
     parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.shared("--text-features")
     parser.option(
@@ -61,7 +61,7 @@ def call(arguments: argparse.Namespace) -> None:
     from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.result import Request
     from su3d_bench.evaluation.run_output import evaluate_methods
-    from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
+    from su3d_bench.reports.tables.run import run_tables
     from su3d_bench.store.records import plain
 
     chosen: dict[str, Any] = {name: getattr(arguments, name) for name in REQUEST_OPTIONS}
@@ -71,16 +71,17 @@ def call(arguments: argparse.Namespace) -> None:
         "scenes": tuple(arguments.scenes),
     }
     requests = {method: Request(tuple(paths), method=method, **chosen) for method, paths in _named(arguments).items()}
-    run = evaluate_methods(requests, arguments.out)
+    with steps("evaluate", is_quiet=arguments.quiet) as step:
+        run = evaluate_methods(requests, arguments.out, step)
     results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
     if len(results) == 1:
         (document,) = documents.values()
-        tables = evaluation_tables(document, per_class=arguments.per_class)
     else:
         document = {"schema": SCHEMA, "methods": documents}
-        tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
-    answer_tables(arguments, document, tables)
+    answer_tables(
+        arguments, document, run_tables(plain(run.metrics), evaluated=documents, per_class=arguments.per_class)
+    )
     for method, result in results.items():
         remark(
             *(f"{method}: {line}" if len(results) > 1 else line for line in warnings_of(result)), quiet=arguments.quiet

@@ -24,21 +24,15 @@ QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "export", call)
+    parser = add_verb(verbs, "export", call, data=True)
     parser.option("path RUN_OR_PREDICTION", "run folder, or files of predictions", type=Path)
-    parser.option(
-        "--to",
-        "format to write (of these evaluators)",
-        required=True,
-        choices=TARGETS,
-    )
+    parser.option("--to", "format to write (of these evaluators)", required=True, choices=TARGETS)
     parser.option("--out DIR", "new folder for the files", type=output_path, required=True)
     parser.option("--method METHOD", "method to use (default: the only one of the run)")
     parser.shared("--scenes")
     parser.option("--input-format FORMAT", "format of the predictions (default: detected)")
     parser.option(
-        "--protocol PROTOCOL",
-        "protocol to use (for the classes of scannet and scannetpp; default: the only one)",
+        "--protocol PROTOCOL", "protocol to use (for the classes of scannet and scannetpp; default: the only one)"
     )
     parser.shared("--text-features")
 

@@ -40,10 +40,7 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
             action="extend",
             default=[],
         )
-        parser.option(
-            "--sources FILE",
-            "TOML file of sources that override the built-in ones",
-        )
+        parser.option("--sources FILE", "TOML file of sources that override the built-in ones")
 
 
 def retries_of(arguments: argparse.Namespace) -> int:
@@ -197,11 +194,11 @@ def add_data(verbs: Verbs) -> None:
     su3d-bench datasets fetch scannet --dry-run
     """
     actions = add_group(verbs, "fetch", add_data)
-    parser = add_verb(actions, "replica", call_replica, resumes=True)
+    parser = add_verb(actions, "replica", call_replica, resumes=True, data=True)
     parser.option("parts [PART...]", "frames or meshes (default: both)")
     parser.option("--keep-archives", "keep the archives, in .fetched")
     _add_fetch_options(parser)
-    parser = add_verb(actions, "scannet", call_scannet, resumes=True)
+    parser = add_verb(actions, "scannet", call_scannet, resumes=True, data=True)
     parser.option("scans [SCAN...]", "scans or splits: scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
     parser.option("--script FILE", "your official download script", given)

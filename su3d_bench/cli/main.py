@@ -14,7 +14,7 @@ from su3d_bench.cli.options import Parser
 from su3d_bench.cli.output import remark
 from su3d_bench.cli.paths import check_outputs
 from su3d_bench.core import errors
-from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
+from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, printable
 from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
 from su3d_bench.core.version import __version__
@@ -79,13 +79,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def complete(parser: Parser) -> None:
-    """Print completions for the shell and exit."""
-    import argcomplete
-
-    argcomplete.autocomplete(parser)
-
-
 def _exit_code(words: Sequence[str]) -> int:
     """Run the command; an error is one line on stderr, after its traceback with ``--debug``."""
     arguments = argparse.Namespace()
@@ -93,13 +86,20 @@ def _exit_code(words: Sequence[str]) -> int:
         words = [*words[1:], "--help"]
     try:
         parser = build_parser(words[0] if words else None)
-        if "_ARGCOMPLETE" in os.environ:  # shell completion; see su3d-bench dev completion
+        if "_ARGCOMPLETE" in os.environ:
+            from su3d_bench.cli.completion import complete
+
             complete(parser)
         arguments = parser.parse_args(words)
         if "call" not in arguments:  # a group of commands without a command
             arguments = parser.parse_args([*words, arguments.without_command])
+        arguments.words = words
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
+        if data := getattr(arguments, "data", None):
+            if "://" not in data and not os.path.isdir(data):
+                raise ConfigError(f"--data {data}: no such folder; name the one that contains the datasets")
+            os.environ["SU3D_DATA"] = data if "://" in data else os.path.abspath(data)  # workers inherit it
         check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported
@@ -120,7 +120,7 @@ def _exit_code(words: Sequence[str]) -> int:
 
             traceback.print_exc()
         if isinstance(error, Su3dError):
-            remark(f"su3d-bench: {error}")
+            remark(f"su3d-bench: {error}", *(f"  {note}" for note in getattr(error, "__notes__", ())))
             return error.exit_code
         if errors.user_code_line(error) or errors.is_unusable_path(error):  # of user-defined code, or a path
             remark(f"su3d-bench: {errors.error_line(error)}")

@@ -68,7 +68,7 @@ def make(arguments: argparse.Namespace) -> None:
     ]
     lines = [f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows]
     answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, *lines)
-    remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
+    remark(f"to use them: su3d-bench run --data {out} --scenes '{reader}/*'", quiet=arguments.quiet)
 
 
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:

@@ -53,6 +53,9 @@ class Parser(argparse.ArgumentParser):
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             if isinstance(action, argparse._SubParsersAction):
                 name = action.dest
+                if value == "help":
+                    self.print_help()
+                    self.exit()
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
     def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:
@@ -113,18 +116,20 @@ def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
 
 
 def add_verb(
-    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, resumes: bool = False
+    verbs: Verbs, name: str, call: Call, about: str = "", *, data: bool = False, resumes: bool = False
 ) -> Parser:
     """Add a command with ``--json``, ``--quiet`` and ``--debug``; its help is ``about`` or the docstring of ``call``.
 
-    Numerical libraries use one thread unless it ``uses_all_cores``. ``resumes``: the command continues after an
-    interruption; others start again.
+    ``resumes``: the command continues after an interruption; others start again. ``data``: it reads datasets, and has
+    ``--data``, which replaces ``SU3D_DATA``. Numerical libraries use one thread unless its default ``uses_all_cores``.
     """
     parser = _parser(verbs, name, about or call.__doc__)
-    parser.set_defaults(call=call, parser=parser, uses_all_cores=uses_all_cores, resumes=resumes, json_file=None)
+    parser.set_defaults(call=call, parser=parser, uses_all_cores=False, resumes=resumes, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print JSON, or write it to FILE.json")
     parser.option("--quiet", "show no progress and no warnings")
     parser.option("--debug", "show the traceback of an error")
+    if data:
+        parser.option("--data DIR", "data root (default: $SU3D_DATA)", type=str)
     return parser
 
 
@@ -214,6 +219,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--methods METHOD...", "methods to use (default: all)", default=[]),
         option("--scenes SCENE...", "scenes or patterns to use (default: all)", default=[]),
         option("--protocols PROTOCOL...", "protocols to use (default: all that fit)", action="extend", default=[]),
+        option("--all-protocols", "score under all that fit", action="append_const", const="all", dest="protocols"),
         option(
             "--set KEY=VALUE...",
             "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data",
@@ -229,6 +235,12 @@ SHARED: dict[str, dict[str, Any]] = dict(
             dest="table_format",
             choices=TABLE_FORMATS,
         ),
+        option(
+            "--width",
+            "printed width of the figure, with 8 pt type: one or two columns of a paper (default: 17cm)",
+            choices=("8cm", "17cm"),
+            default="17cm",
+        ),
         option("--seed N", "random seed (default: 0)", type=index, default=0),
         option("--limit N", "process only the first N frames of each scene (results are marked partial)", type=int),
         option(
@@ -239,6 +251,11 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "--question-solver",
             "how to answer questions: built-in (geometry) or llm (default: built-in)",
             choices=("built-in", "llm"),
+        ),
+        option(
+            "--refiner",
+            "labels n' by vote (sum of scores) or model (language model, as in the paper; default: vote)",
+            choices=("vote", "model"),
         ),
         option("--exclude-ids FILE", "CSV file with ids of questions to exclude"),
         option(
@@ -261,6 +278,8 @@ SHARED: dict[str, dict[str, Any]] = dict(
         option("--dry-run", "show what would be done and what it needs, and exit"),
     ]
 )
+# Of commands that run methods.
+JOBS = "number of parallel jobs (default: one per CPU core, with foundation models on GPUs at most 2 per GPU)"
 # Where scenes run; see docs/running/clusters.md.
 EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
 
@@ -290,7 +309,7 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
     return resolve(settings, ("perception",), PerceptionConfig)
 
 
-def add_language_options(parser: Parser, default: str = "the paper's gpt-4-1106-preview") -> None:
+def add_language_options(parser: Parser, default: str = "perception.language.text_model") -> None:
     """Add the options of commands that use a language model."""
     parser.option("--model NAME", f"language model (default: {default})")
     parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI)")

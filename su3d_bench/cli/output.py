@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 MAX_UNSEEN = 8  # listed words
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: wide enough for a long bar, and for both bars
 MAX_BAR_LABEL = 80  # characters of the label
+LINE_EVERY_S = 10.0  # between lines of progress where there is no terminal
 
 
 def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
@@ -228,13 +229,16 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
 
 
 @contextmanager
-def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[int], None], Report]]:
+def overall_progress(
+    what: str, *, is_quiet: bool, every_s: float = 0.0
+) -> Iterator[tuple[Callable[[int], None], Report]]:
     """Progress over the steps of all units: a function to set their number, and a ``Report``.
 
-    On a terminal it is one bar with the time left, elsewhere one line per unit that is done.
+    On a terminal it is one bar with the time left, elsewhere one line per unit that is done, or every ``every_s``.
     """
     n_done: dict[str, int] = {}
     n_all, started = 0, time.monotonic()
+    last = started
     with drawn_bars(is_quiet=is_quiet) as bars:
         task = None if bars is None else bars.add_task(what, total=None, remark="")
 
@@ -245,15 +249,42 @@ def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[i
                 bars.update(task, total=n_steps)
 
         def report(event: Event) -> None:
+            nonlocal last
             n_done[event.unit] = event.done
             n = sum(n_done.values())
             if bars is not None and task is not None:
                 bars.update(task, completed=n, description=f"{event.unit}: {event.label}")
-            elif event.done == event.total and n:
-                left = _time_left(started, n, n_all)
-                remark(f"{what}: {event.unit} done, {n} of {n_all} steps{left}", quiet=is_quiet)
+            elif n and (time.monotonic() - last >= every_s if every_s else event.done == event.total):
+                last, left = time.monotonic(), _time_left(started, n, n_all)
+                done = event.label if every_s else event.unit
+                remark(f"{what}: {done} done, {n} of {n_all} steps{left}", quiet=is_quiet)
 
         yield begin, report
+
+
+@contextmanager
+def steps(what: str, *, is_quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress of steps that are usually fast: a function of the step's name, the number done and the number of all.
+
+    On a terminal it is one bar with the time left, elsewhere a line every 10 s.
+    """
+    from su3d_bench.runs.executors import Event
+
+    with overall_progress(what, is_quiet=is_quiet, every_s=LINE_EVERY_S) as (begin, report):
+
+        def step(name: str, n_done: int, n_all: int) -> None:
+            begin(n_all)
+            report(Event(what, name, n_done, n_all))
+
+        yield step
+
+
+def stepped(names: Sequence[str], what: str, *, is_quiet: bool) -> Iterator[str]:
+    """Iterate over ``names`` with the progress of ``steps``."""
+    with steps(what, is_quiet=is_quiet) as step:
+        for n_done, name in enumerate(names, 1):
+            yield name
+            step(name, n_done, len(names))
 
 
 class _Board:

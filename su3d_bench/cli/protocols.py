@@ -32,12 +32,12 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("--list-texts", "print the texts that are encoded, one per line")
     parser.shared("--queries")
-    parser = add_verb(actions, "diff", call_diff)
-    parser.option("name A", "protocol, or .toml file")
-    parser.option("other B", "protocol to compare with")
+    parser = add_verb(actions, "diff", call_diff, data=True)
+    parser.option("name PROTOCOL", "protocol, or .toml file")
+    parser.option("other PROTOCOL", "protocol to compare with")
     parser.option("--run RUN", "run folder (or RUN:METHOD; scored under both, for the effect of each rule)", type=str)
     parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --run)")
-    parser.shared("--jobs", "--format")
+    parser.shared("--width", "--jobs", "--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol PROTOCOL", "protocol to use (or .toml file)", required=True)
     parser.option("--encoder ENCODER", "encoder to use (embedded, or from models list; default: the protocol's)")
@@ -119,7 +119,7 @@ def call_diff(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot is slower than the tables
-        draw_walk(value, arguments.out)
+        draw_walk(value, arguments.out, arguments.width)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 

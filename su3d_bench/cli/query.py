@@ -35,6 +35,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--top N", "number of instances to list (default: 10)", type=count, default=10)
     parser.shared("--device")
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write (default: next to the map)")
+    parser.shared("--width")
     parser = add_verb(actions, "ask", call_ask)
     parser.option("scene SCENE", "scene, such as rooms/living0")
     parser.option("question", "question in English")
@@ -56,6 +57,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar=("X", "Y", "Z"),
     )
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write (default: next to the map)")
+    parser.shared("--width")
     options.add_language_options(parser)
     questions.add_parser(actions)
 
@@ -99,8 +101,9 @@ def call_text(arguments: argparse.Namespace) -> None:
             scored = f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}"
             output.answer(f"{scored}  {place:<22}  {row['name']}")
         output.show()  # the picture is slower than the answer
-    lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
-    draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
+    lines = [f"{row['rank']}. {row['similarity']:.3f} {row['name']}" for row in rows]
+    caption = f'{arguments.scene}: "{arguments.text}"; the most similar instance is outlined'
+    draw_heat_map(prediction, ranking.similarity, picture, caption, lines, arguments.width)
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
     if not output.answer_json(arguments, value):
         remark(f"heat map: {picture}", quiet=arguments.quiet)
@@ -204,6 +207,6 @@ def _draw_ask(
     names = [""] * len(instances)
     for thing in scene.objects:
         names[thing.row] = thing.shown
-    title = f"{arguments.scene}: {arguments.question}"
-    draw_reasoning(instances, AnswerRows(*rows), names, picture, title, (reply.text, *reply.notes))
+    caption = f"{arguments.scene}: {arguments.question} {reply.text}"
+    draw_reasoning(instances, AnswerRows(*rows), names, picture, caption, arguments.width)
     return picture

@@ -26,7 +26,7 @@ MAX_CHARACTERS = 80
 
 def add_parser(verbs: Verbs) -> None:
     scenes = "--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')"
-    parser = add_verb(verbs, "make", _make)
+    parser = add_verb(verbs, "make", _make, data=True)
     parser.option(*scenes, required=True)
     parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
@@ -37,7 +37,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option(
         "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
     )
-    parser = add_verb(verbs, "audit", _audit)
+    parser = add_verb(verbs, "audit", _audit, data=True)
     parser.option(*scenes)
     parser.option("--out DIR", "folder for page, pictures and table", type=output_path)
     parser.option("--n-questions N", "number of questions (default: 200)", type=count, default=200)

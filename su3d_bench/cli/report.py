@@ -14,6 +14,7 @@ from su3d_bench.core.errors import ConfigError, counted
 if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Table
 
+QUERY_KINDS = ("instance", "affordance", "property", "relative")
 PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
@@ -28,6 +29,7 @@ def add_parser(verbs: Verbs) -> None:
     _add_timing(actions)
     report_files.add_pages(actions)
     _add_instances(actions)
+    _add_claims(actions)
     _add_leaderboard(actions)
     _add_attribution(actions)
     _add_power(actions)
@@ -101,7 +103,7 @@ def _add_timing(verbs: Verbs) -> None:
     parser.option("--warm-up N", "first updates of a scene to exclude as warm-up (default: 3)", type=index, default=3)
     parser.option("--camera-rate HZ", "frame rate, for the real-time factor (default: 30)", type=positive, default=30.0)
     parser.option("--out DIR", "folder for timing.md, timing.csv, methods.csv and plots", type=output_path)
-    parser.shared("--format")
+    parser.shared("--width", "--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> None:
@@ -139,13 +141,13 @@ def call_timing(arguments: argparse.Namespace) -> None:
     write_text(arguments.out / "timing.md", markdown(tables))
     write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
     write_text(arguments.out / "methods.csv", methods_csv(summaries, hardware, arguments.camera_rate))
-    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out)
+    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
     files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
     remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
 
 def _add_instances(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "instances", call_instances)
+    parser = add_verb(verbs, "instances", call_instances, data=True)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
     parser.option("--out FILE", ".csv or .parquet file to write (default: print CSV)", type=output_path)
@@ -191,6 +193,29 @@ def call_instances(arguments: argparse.Namespace) -> None:
         output.answer(f"{out}: {counted(n_predicted, 'predicted instance')}, {n_true} ground-truth")
 
 
+def _add_claims(verbs: Verbs) -> None:
+    parser = add_verb(verbs, "claims", call_claims)
+    parser.shared("runs", "--methods", "--device", "--format")
+    parser.option("--kinds KIND...", "kinds of text queries (default: all)", choices=QUERY_KINDS, default=QUERY_KINDS)
+    parser.option("--out FILE", "file to write (default: print)", type=output_path)
+
+
+def call_claims(arguments: argparse.Namespace) -> None:
+    """Measure what the OpenSU3D paper claims in words: spread of similarities, largest instance, labels, sizes.
+
+    su3d-bench report claims runs/my-run
+    su3d-bench report claims runs/my-run --kinds relative --format latex --out claims.tex
+    """
+    from su3d_bench.analysis.claims import claims_of, claims_table
+    from su3d_bench.runs.verify import read_checked
+
+    runs = [read_checked(path) for path in arguments.runs]
+    with output.progress(sum(len(run.scenes) for run in runs), is_quiet=arguments.quiet) as report:
+        chosen = arguments.methods, arguments.kinds, arguments.device or "cpu"
+        found = [claims for run in runs for claims in claims_of(run, *chosen, report)]
+    output.answer_or_write(arguments, [{**vars(one), "means": one.means} for one in found], [claims_table(found)])
+
+
 def _add_leaderboard(verbs: Verbs) -> None:
     parser = add_verb(verbs, "leaderboard", call_leaderboard)
     parser.option("folder DIR", "folder to search for runs", type=searched_folder)
@@ -216,13 +241,13 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
 
 
 def _add_attribution(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "attribution", call_attribution)
+    parser = add_verb(verbs, "attribution", call_attribution, data=True)
     parser.shared("run")
     parser.option("--method METHOD", "method to use (default: the only one of the run)")
     parser.shared("--protocols")
     parser.option("--oracle RUN", "also show the gain from perfect 2D masks: the same run with --profile oracle")
     parser.option("--out FIGURE", ".pdf, .png or .svg plot to write")
-    parser.shared("--format")
+    parser.shared("--width", "--format")
 
 
 def call_attribution(arguments: argparse.Namespace) -> None:
@@ -241,7 +266,7 @@ def call_attribution(arguments: argparse.Namespace) -> None:
         from su3d_bench.reports.pictures.plots import draw_attribution
 
         output.show()  # the plot is slower than the answer
-        draw_attribution(attribution, arguments.out)
+        draw_attribution(attribution, arguments.out, arguments.width)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 

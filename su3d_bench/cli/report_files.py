@@ -18,7 +18,7 @@ MEGABYTE = 10**6
 
 
 def add_pages(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "html", call_html, resumes=True)
+    parser = add_verb(verbs, "html", call_html, resumes=True, data=True)
     parser.shared("runs")
     parser.option("--out FILE", "page to write (default: page.html)", type=output_path, default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
@@ -30,7 +30,7 @@ def add_pages(verbs: Verbs) -> None:
         "--max-size-mb MB", "maximum page size; maps are thinned to fit (default: 30)", type=float, default=30.0
     )
     parser.shared("--jobs")
-    parser = add_verb(verbs, "rerun", call_rerun)
+    parser = add_verb(verbs, "rerun", call_rerun, data=True)
     parser.shared("run", "--scenes", "--methods")
     parser.option("--stride N", "use every Nth frame (default: at most 60 frames per scene)", type=count)
     parser.option("--out FILE", ".rrd file to write", type=output_path, required=True)
@@ -41,7 +41,9 @@ def add_archives(verbs: Verbs) -> None:
     parser.shared("runs")
     parser.option("--out FILE", "archive to write (default: name of the first run)", type=output_path)
     parser.option("--trained-on TEXT", "training data of your weights, for a registry", default="")
-    parser = add_verb(verbs, "verify", call_verify)
+    parser.option("--authors TEXT", "authors, for a registry (default: those of a built-in method)", default="")
+    parser.option("--link URL", "https address, for a registry (default: that of a built-in method)", default="")
+    parser = add_verb(verbs, "verify", call_verify, data=True)
     parser.option("files FILE...", "LaTeX files written by report tables, or bundle.zip")
     parser.option("--root DIR", "folder of the runs (default: current folder, then that of the file)")
 
@@ -77,6 +79,7 @@ def call_html(arguments: argparse.Namespace) -> None:
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         [gallery.to_json() for gallery in contents.galleries],
+        command=shlex.join(["su3d-bench", *arguments.words]),
     )
     output.written(arguments.out, page)
     n_bytes = len(page.encode())
@@ -142,7 +145,8 @@ def call_bundle(arguments: argparse.Namespace) -> None:
     place = arguments.out or Path(f"{arguments.runs[0].resolve().name}.zip")
     if not is_bundle(place):
         raise ConfigError(f"--out {place}: expected a file name that ends in .zip")
-    bundle_runs(place, arguments.runs, arguments.trained_on)
+    stated = {name: getattr(arguments, name) for name in ("trained_on", "authors", "link")}
+    bundle_runs(place, arguments.runs, **stated)
     n_bytes = place.stat().st_size
     value = {"file": str(place), "bytes": n_bytes, "sha256": digest_file(place), "runs": len(arguments.runs)}
     line = f"{place}: {counted(len(arguments.runs), 'run')}, {n_bytes / 1e6:.1f} MB, SHA-256 {value['sha256']}"

@@ -6,13 +6,22 @@ import argparse
 import os
 import shlex
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, SHARED, Verbs, add_verb, output_path
+from su3d_bench.cli.options import EXECUTOR, JOBS, SHARED, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
+from su3d_bench.core.errors import (
+    EXIT_CHECK_FAILED,
+    EXIT_DONE,
+    ConfigError,
+    ModelMissing,
+    RunIncomplete,
+    counted,
+    printable,
+)
 
 if TYPE_CHECKING:
     from su3d_bench.reproducing.recipe import Experiment, Recipe, RecipeRequest, RecipeRun
@@ -21,6 +30,7 @@ RUN_OPTIONS = (
     "jobs",
     "limit",
     "question_solver",
+    "refiner",
     "offline",
     "executor",
     "ray_address",
@@ -31,7 +41,7 @@ RUN_OPTIONS = (
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "reproduce", call, resumes=True)
+    parser = add_verb(verbs, "reproduce", call, resumes=True, data=True)
     parser.option("recipe [RECIPE]", "experiments of a paper: built-in recipe or .toml file (default: list recipes)")
     parser.option("--tables TABLE...", "tables of the paper (default: all)", default=[])
     parser.option("--out DIR", "output folder (default: reproduced/<recipe>)", type=output_path)
@@ -45,7 +55,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--text-features METHOD=FILE...", SHARED["--text-features"]["help"], default=[])
     parser.shared("--profile")
     parser.option("--encoder ENCODER", "encoder to use (default: set by the recipe)")
-    parser.shared("--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR, "--set")
+    parser.shared("--device")
+    parser.shared("--jobs", help=JOBS)
+    parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR, "--set")
     parser.option("--bundle FILE", "archive to write (default: bundle.zip in --out)", type=output_path)
     parser.shared("--format")
 
@@ -67,6 +79,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: needs --rehearse")
     _check_device(arguments)
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
+    _check_key(recipe, experiments, arguments, out)
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
     from su3d_bench.cli.rehearsal import places, rehearsed
@@ -75,6 +88,16 @@ def call(arguments: argparse.Namespace) -> int:
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
     with environment(**places(out)):
         return _reproduce(recipe, experiments, asked, out, arguments)
+
+
+def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: argparse.Namespace, out: Path) -> None:
+    """Raise early, before rooms are generated, if a language model is requested without a key or server."""
+    from su3d_bench.reproducing.preflight import language_needs
+    from su3d_bench.reproducing.recipe import asked_runs
+
+    for run in asked_runs(recipe, experiments, _asked(arguments)):
+        for need in () if arguments.dry_run else language_needs(run, out):
+            raise ModelMissing(need.remark)
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
@@ -111,14 +134,17 @@ def _asked(arguments: argparse.Namespace) -> RecipeRequest:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
+    from su3d_bench.reproducing.estimate import estimate, estimate_tables
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
-    known = preflight(runs)
+    known = preflight(runs, out)
     if arguments.dry_run:
-        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
+        costs = estimate(runs, known)
+        value = known.to_json() | {"estimate": asdict(costs)}
+        output.answer_tables(arguments, value, [*preflight_tables(known), *estimate_tables(costs)])
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
     remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
@@ -156,13 +182,15 @@ def _answer(
     """Write tables to stdout and ``tables.md``, cells to ``compared.json``, pictures and the archive."""
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
+    from su3d_bench.reproducing.deviations import deviation_table, run_deviations
     from su3d_bench.reproducing.differences import Results, compared_all, compared_json, draw_queries, result_tables
     from su3d_bench.reproducing.recipe import recipe_file
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)
-    tables = result_tables(experiments, cells, results)
-    value = compared_json(recipe, cells)
+    found = run_deviations(results.runs.values())
+    tables = [*result_tables(experiments, cells, results), *([deviation_table(found)] if found else [])]
+    value = compared_json(recipe, cells) | {"deviations": [asdict(one) for one in found]}
     output.written(
         out / "tables.md", output.formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True)
     )

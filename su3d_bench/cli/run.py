@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb, run_place
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, run_place
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "run", call_run, resumes=True)
+    parser = add_verb(verbs, "run", call_run, resumes=True, data=True)
     parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
     _add_run_options(parser)
-    parser = add_verb(verbs, "ablate", call_ablate, resumes=True)
+    parser = add_verb(verbs, "ablate", call_ablate, resumes=True, data=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
     parser.option("--method METHOD", "method to use (or file.py:Class; default: opensu3d)", default="opensu3d")
     parser.option("--also-methods METHOD...", "additional methods to run without variation", default=[])
@@ -34,8 +34,11 @@ def _add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
-    parser.option("--protocols PROTOCOL...", "protocols to use (default: those of the dataset)")
-    parser.shared("--profile", "--device", "--jobs", "--limit", "--question-solver", "--offline", *EXECUTOR)
+    headline = "protocols to use (default: the dataset's headline protocol)"
+    parser.option("--protocols PROTOCOL...", headline, action="extend")
+    parser.shared("--all-protocols", "--profile", "--device")
+    parser.shared("--jobs", help=JOBS)
+    parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
     parser.option(
@@ -49,9 +52,7 @@ def _add_run_options(parser: Parser) -> None:
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option(
-        "--out DIR",
-        "run folder or URL, such as s3://bucket/run (default: a folder in runs/)",
-        type=run_place,
+        "--out DIR", "run folder or URL, such as s3://bucket/run (default: a folder in runs/)", type=run_place
     )
     into = parser.add_mutually_exclusive_group()
     what = "add scenes, methods and protocols to the run in --out"

@@ -42,17 +42,9 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--yes", "do not ask for confirmation")
     parser = add_verb(actions, "refine", call_refine)
     parser.shared("run", "--method", "--scenes")
-    parser.option(
-        "--refiner",
-        "vote (sum of scores) or model (language model, as in the paper)",
-        choices=("vote", "model"),
-        default="vote",
-    )
+    parser.shared("--refiner", default="vote")
     parser.option("--top-m N", "number of views used (default: 5)", type=count, default=5)
-    parser.option(
-        "--background-names [NAME...]",
-        "names of background to exclude (default: those of the paper)",
-    )
+    parser.option("--background-names [NAME...]", "names of background to exclude (default: those of the paper)")
     parser.option(
         "--max-map-fraction SHARE",
         "maximum share of the map that a box may cover from above (default: 0.95)",

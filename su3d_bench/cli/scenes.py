@@ -148,7 +148,7 @@ def show(arguments: argparse.Namespace) -> None:
     path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
-        draw_scene_picture(look, path)
+        draw_scene_picture(look, path, arguments.width)
     table = {
         "scene": name,
         "picture": str(path),
@@ -158,12 +158,13 @@ def show(arguments: argparse.Namespace) -> None:
         "up": None if look.up is None else asdict(look.up),
         "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
         "no_ground_truth": look.no_truth or None,
+        "no_frames": look.no_frames or None,
     }
     if answer_json(arguments, printable_json(table)):
         return
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:
         answer(f"up: {printable(up_text(look.up))}")
-    if look.no_truth:
-        answer(printable(look.no_truth))
+    for reason in filter(None, (look.no_frames, look.no_truth)):
+        answer(printable(reason))
     answer(f"picture: {printable(str(path))}")

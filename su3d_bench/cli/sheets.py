@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,7 +38,9 @@ def _add_score(verbs: Verbs) -> None:
     parser.option("--key DIR", "folder of the key: which method made what (or its key.json)", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: found near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
+    parser.option("--partial", "score unfinished answers too, without the unanswered questions")
     parser.option("--disputed FILE", "write disputed questions to this CSV file, for --exclude-ids", type=output_path)
+    parser.option("--majority", "with --disputed: without those that more than half of the annotators call right")
     parser.shared("--format")
 
 
@@ -52,7 +55,7 @@ def call_score(arguments: argparse.Namespace) -> None:
     from su3d_bench.formats.tables.table import Prose
     from su3d_bench.human_eval.answers import check_answers, check_key, read_answers
     from su3d_bench.human_eval.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.human_eval.scores import disputed_csv, score
+    from su3d_bench.human_eval.scores import disputed_csv, is_right_by_majority, score
     from su3d_bench.reports.tables.judged import sheet_tables
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
@@ -62,13 +65,15 @@ def call_score(arguments: argparse.Namespace) -> None:
     check_key(sheet, key)
     if arguments.disputed is not None and (sheet.kind != "questions" or not arguments.files):
         raise ConfigError("--disputed: needs the key and answers of sheets of kind questions")
+    if arguments.majority and arguments.disputed is None:
+        raise ConfigError("--majority: needs --disputed FILE")
     rows, faults = [], []
     for file in dict.fromkeys(arguments.files):
         try:
             rows += read_answers(file)
         except DataError as error:
             faults.append(str(error))
-    checked = check_answers(sheet, rows)
+    checked = check_answers(sheet, rows, is_partial=arguments.partial)
     faults += checked.faults
     if faults:
         _refuse(faults, arguments)
@@ -76,7 +81,7 @@ def call_score(arguments: argparse.Namespace) -> None:
         raise DataError(f"{', '.join(map(str, arguments.files))}: no answers in these files")
     if checked.silent and arguments.files:
         remark(f"no answers from {', '.join(checked.silent)}", quiet=arguments.quiet)
-    scores = score(sheet, key, checked.judgements, checked.silent)
+    scores = score(sheet, key, checked.judgements, checked.silent, checked.comments)
     if not scores.cells:
         raise DataError(f"{key_file}: the ground truth answers no item; give files of answers")
     content = asdict(scores)
@@ -87,8 +92,11 @@ def call_score(arguments: argparse.Namespace) -> None:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
-        path = output.written(arguments.disputed, disputed_csv(key, scores.review_items))
-        remark(f"written: {path}", quiet=arguments.quiet)
+        looks = [one for one in scores.review_items if one.reason != "comment"]
+        disputed = [one for one in looks if not (arguments.majority and is_right_by_majority(one))]
+        path = output.written(arguments.disputed, disputed_csv(key, disputed))
+        settled = f"; {counted(len(looks) - len(disputed), 'rating')} settled by majority" if arguments.majority else ""
+        remark(f"written: {path}{settled}", quiet=arguments.quiet)
     output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
 
@@ -144,10 +152,11 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 
 
 def _looks_line(scores: Scores) -> str:
-    n_disagree = sum(look.reason == "annotators disagree" for look in scores.review_items)
-    n_others = len(scores.review_items) - n_disagree
+    n_of = Counter(look.reason for look in scores.review_items)
     others = "that no annotator calls right" if scores.kind == "questions" else "against the ground truth"
-    return f"To review: {n_disagree} where annotators disagree, {n_others} {others}."
+    n_others = n_of["not right"] + n_of["against the truth"]
+    more = f", {n_of['comment']} with only a comment" if n_of["comment"] else ""
+    return f"To review: {n_of['annotators disagree']} where annotators disagree, {n_others} {others}{more}."
 
 
 SUBJECTS = ("similarity", "labels", "reasoning")
@@ -156,9 +165,10 @@ FIGURES = ("comparison", "schemes", "teaser")  # as in questions/question_files.
 
 
 def _add_pictures(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "pictures", call_pictures)
+    parser = add_verb(verbs, "pictures", call_pictures, data=True)
     parser.shared("run")
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write", required=True)
+    parser.shared("--width")
     parser.option("--draw", "what to draw (default: similarity)", choices=SUBJECTS, default="similarity")
     parser.option("--texts TEXT...", "texts to compare with maps (or questions to answer)", default=[])
     parser.option("--paper-figure", "use the texts of a figure of the paper or of its project page", choices=FIGURES)
@@ -218,6 +228,6 @@ def call_pictures(arguments: argparse.Namespace) -> None:
             output.remark_unseen(encoder, text, quiet=arguments.quiet)
         rows = figures.similarity(texts, encoder, arguments.colours)
         scale = scale_stops(arguments.colours)
-    draw_grid(arguments.out, columns, rows, scale)
+    draw_grid(arguments.out, columns, rows, scale, arguments.width)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
     output.answer_either(arguments, value, str(arguments.out))

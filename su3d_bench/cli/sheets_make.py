@@ -1,4 +1,4 @@
-"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page, workbook and table, and their key."""
+"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page, table and workbook, and their key."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "make", call)
+    parser = add_verb(verbs, "make", call, data=True)
     parser.option("run [RUN]", "run folder (not needed for --kinds questions with --scenes)")
     parser.option(
         "--kinds ...",
@@ -49,17 +49,9 @@ def add_parser(verbs: Verbs) -> None:
         type=str,
     )
     parser.shared("--methods")
-    parser.option(
-        "--scenes SCENE...",
-        "scenes or patterns to use (default: all of RUN)",
-        default=[],
-    )
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: all of RUN)", default=[])
     parser.shared("--exclude-ids")
-    parser.option(
-        "--per-kind N",
-        "maximum number per kind and scene (default: depends on the kind)",
-        type=count,
-    )
+    parser.option("--per-kind N", "maximum number per kind and scene (default: depends on the kind)", type=count)
     parser.option("--annotators N", "number of annotators (default: 1)", type=int, default=1)
     parser.option(
         "--overlap SHARE", "share of items that all annotators rate (default: 0.25)", type=float, default=0.25
@@ -75,16 +67,19 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Create annotation sheets for a run or for questions: an offline page, a workbook and a CSV.
+    """Create annotation sheets for a run or for questions: an offline page, a CSV and a workbook.
 
     su3d-bench sheets make runs/my-run --kinds retrieval annotation reasoning --annotators 3 --out sheets
     su3d-bench sheets make --kinds questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
     """
+    from su3d_bench.human_eval.sets import has_openpyxl
     from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run
     from su3d_bench.questions.query_files import read_excluded_ids
     from su3d_bench.runs.finished import read_run
 
     _check(arguments)
+    if not arguments.dry_run and not has_openpyxl():
+        remark("without workbooks (.xlsx): they need pip install 'su3d-bench[sheets]'", quiet=arguments.quiet)
     left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kinds))
     origins: dict[SheetKind, Key] = {}
@@ -198,7 +193,8 @@ def _drafts(
         client, config = options.chat_client(arguments, source.run.folder)
         ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}
-    for scene in source.scenes:  # all kinds of one scene together: they share its ground truth
+    # All kinds of one scene together: they share its ground truth.
+    for scene in output.stepped(source.scenes, "items", is_quiet=arguments.quiet):
         for kind, mine in sources.items():
             n_most = arguments.per_kind or PER_KIND[kind]
             if kind == "annotation":
@@ -252,16 +248,11 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.human_eval.drawing import draw_all
-    from su3d_bench.runs.executors import Event
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
-    with output.progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
-        pictures = draw_all(
-            source,
-            flat,
-            arguments.jobs or os.cpu_count() or 1,
-            lambda n_done, n: report(Event(name, "pictures", n_done, n)),
-        )
+    jobs = arguments.jobs or os.cpu_count() or 1
+    with output.steps("pictures", is_quiet=arguments.quiet) as step:
+        pictures = draw_all(source, flat, jobs, lambda n_done, n: step(name, n_done, n))
     remaining = iter(pictures)
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 

@@ -101,12 +101,13 @@ NEUTRAL_SETTINGS = frozenset(
 class RunConfig(BaseModel):
     """The settings of a run that do not belong to a dataset, method or perception profile.
 
-    ``protocols`` empty: those of each dataset; ``stride`` 0: the method's default; ``jobs`` 0: one per scene, at most
-    one per CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is
-    partial; ``question_solver``: how reasoning questions are answered, by geometry alone or by the text model of
-    ``perception.language``; ``offline``: no language model is called, replies stored with the run are used;
-    ``accept_poses``: also run recordings whose depth contradicts their poses;
-    ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
+    ``protocols`` empty: the headline protocol of each dataset, ``all``: every default one; ``stride`` 0: the method's
+    default; ``jobs`` 0: one per scene, at most one per CPU core, and with foundation models on GPUs at most two per
+    GPU; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
+    ``question_solver``: how reasoning questions are answered, by geometry alone or by the text model of
+    ``perception.language``; ``refiner``: how labels n' are chosen, by vote or by that model; ``offline``: no language
+    model is called, replies stored with the run are used; ``accept_poses``: also run recordings whose depth contradicts
+    their poses; ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
     ``executor`` auto: this process for one job, otherwise processes; ``ray_address`` empty: ``RAY_ADDRESS``, or the
     cluster on this machine; ``retries``: for a scene whose machine was lost; ``slurm``: KEY=VALUE for submitit.
     """
@@ -123,6 +124,7 @@ class RunConfig(BaseModel):
     jobs: int = Field(default=0, ge=0)
     pictures: bool = True
     question_solver: Literal["built-in", "llm"] = "built-in"
+    refiner: Literal["vote", "model"] = "vote"
     offline: bool = False
     accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()

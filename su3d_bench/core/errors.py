@@ -132,6 +132,13 @@ class CheckFailed(Su3dError):
     exit_code = EXIT_CHECK_FAILED
 
 
+def with_notes(error: Su3dError, notes: Iterable[str]) -> Su3dError:
+    """The error with further lines, which the command line prints below its own."""
+    for note in notes:
+        error.add_note(printable(note, MAX_CHARACTERS))
+    return error
+
+
 def some(names: Sequence[str], most: int) -> str:
     """The first ``most`` of ``names``, and how many more there are.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.core.arguments import typed
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UpAxis
 
@@ -16,6 +17,7 @@ def valid_depth(depth_m: Float32Array, depth_min: float, depth_max: float) -> Bo
         return np.isfinite(depth_m) & (depth_m > 0) & (depth_m >= depth_min) & (depth_m <= depth_max)
 
 
+@typed
 def back_project(
     depth_m: Float32Array, intrinsics: Float64Array, camera_to_world: Float64Array, pixels: BoolArray
 ) -> Float64Array:
@@ -29,6 +31,10 @@ def back_project(
     >>> su3d.back_project(np.full((3, 3), 2.0, np.float32), camera, np.eye(4), is_centre).tolist()
     [[0.0, 0.0, 2.0]]
     """
+    if depth_m.ndim != 2 or pixels.shape != depth_m.shape or pixels.dtype != np.bool_:
+        raise DataError(f"back-projection: depth {depth_m.shape}, pixels {pixels.shape}; expected (H, W), and bools")
+    if (intrinsics.shape, camera_to_world.shape) != ((3, 3), (4, 4)):
+        raise DataError("back-projection: expected intrinsics (3, 3) and a pose (4, 4)")
     of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)
     points = np.empty((len(z), 3))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.arguments import check_fields
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import (
     BoolArray,
@@ -19,7 +21,6 @@ from su3d_bench.core.types import (
     Int64Array,
     IntArray,
     Places,
-    check_arrays,
 )
 
 
@@ -30,6 +31,15 @@ def starts_of(sizes: Iterable[int]) -> Int64Array:
     [0, 2, 2, 5]
     """
     return np.cumsum([0, *sizes]).astype(np.int64)
+
+
+@contextmanager
+def _converting(what: str) -> Iterator[None]:
+    """Raise failed conversions of a caller's values in the block as ``PredictionError``."""
+    try:
+        yield
+    except (TypeError, ValueError, OverflowError) as error:
+        raise PredictionError(f"{what}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -46,6 +56,7 @@ class Masks:
     indices: Int32Array
 
     @staticmethod
+    @_converting("masks")
     def of_sets(sets: Sequence[IntArray]) -> Masks:
         """The masks of these point indices, each list ascending."""
         indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
@@ -136,8 +147,7 @@ class Instances(Masks):
     places: Places | None = None
 
     def __post_init__(self) -> None:
-        arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
-        check_arrays(self, "instances", arrays, PredictionError)
+        check_fields(self, "instances", PredictionError)
         k, v = len(self.scores), len(self.views)
         if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
             raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
@@ -171,6 +181,7 @@ class Instances(Masks):
             raise PredictionError(f"instances: an edge names instance {int(edges.max())} of {k} (0..{k - 1})")
 
     @classmethod
+    @_converting("instances")
     def of(
         cls,
         points: Float32Array,
@@ -221,11 +232,11 @@ class Instances(Masks):
             boxes=boxes,
             centroids=means if centroids is None else centroids,
             view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
-            views=_views(views or [()] * k, k),
-            ids=np.array(ids, np.int64),
+            views=_views([()] * k if views is None else views, k),
+            ids=_array("ids", ids, (None,), "iu", "integers").astype(np.int64),
             view_names=view_names,
             view_scores=view_scores,
-            further_labels=tuple(map(tuple, further_labels)) if further_labels else None,
+            further_labels=None if further_labels is None else tuple(map(tuple, further_labels)) or None,
         )
 
 
@@ -323,6 +334,9 @@ class Partition:
     instance: Int32Array
     features: Float32Array
 
+    def __post_init__(self) -> None:
+        check_fields(self, "partition", PredictionError)
+
 
 @dataclass(frozen=True)
 class DenseFeatures:
@@ -335,6 +349,9 @@ class DenseFeatures:
 
     points: Float32Array
     features: NDArray[np.float16]
+
+    def __post_init__(self) -> None:
+        check_fields(self, "dense features", PredictionError)
 
 
 Prediction = Instances | Partition | DenseFeatures

@@ -12,12 +12,13 @@ import importlib.util
 import inspect
 import os
 import sys
+import uuid
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.digests import digest_json
+from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import ConfigError, PlugInError, suggest
 from su3d_bench.core.system.files import user_folder
 
@@ -67,8 +68,31 @@ def names(kind: str) -> list[str]:
     return known
 
 
+_PASSED: dict[str, tuple[type, str]] = {}  # classes passed from Python and a key of their code, by target
+
+
+def target_of(kind: str, plug_in: type) -> str:
+    """The name under which ``load`` finds a class passed from Python: its built-in name or ``module:Class``.
+
+    Its key is that of its file; without one, as in a notebook, it differs for every class.
+    """
+    target = f"{plug_in.__module__}:{plug_in.__qualname__}"
+    if target in BUILT_IN[kind].values():
+        return next(name for name, place in BUILT_IN[kind].items() if place == target)
+    file = Path(getattr(sys.modules.get(plug_in.__module__), "__file__", None) or "")
+    if file.is_file() or _PASSED.get(target, (None,))[0] is not plug_in:
+        _PASSED[target] = plug_in, digest_file(file) if file.is_file() else uuid.uuid4().hex
+    return target
+
+
+def code_key(target: str) -> str | None:
+    """A key of the code of a class that is user-defined or passed from Python; None for any other."""
+    key = digest_file(Path(target.rpartition(":")[0])) if ".py:" in target else _PASSED.get(target, (None, ""))[1]
+    return key[:16] or None
+
+
 def load(kind: str, name: str) -> Any:
-    """The class with this ``name``: a built-in, an entry point or ``path/to/file.py:Class``."""
+    """The class with this ``name``: a built-in, an entry point, ``file.py:Class``, or one passed from Python."""
     return checked(kind, name, _found(kind, name))
 
 
@@ -82,6 +106,8 @@ def _found(kind: str, name: str) -> Any:
                 return entry.load()
     if ".py:" in name:
         return _from_file(kind, name)
+    if name in _PASSED:
+        return _PASSED[name][0]
     known = names(kind)
     raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known)}")
 
@@ -139,7 +165,8 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
     interface, where = INTERFACES[kind], f"{kind} '{target}'"
     if not plug_in.__module__.startswith("su3d_bench."):
         module = sys.modules.get(plug_in.__module__)
-        where = f"{_line_of(plug_in, Path(getattr(module, '__file__', None) or '').name)}: {where}"
+        line = _line_of(plug_in, Path(getattr(module, "__file__", None) or "").name)
+        where = f"{line}: {where}" if line else where
     own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
     known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
     required = {*REQUIRED_CLASS_ATTRS[kind], *(name for name, called in _members(interface).items() if called)}
@@ -160,8 +187,8 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
 
 def _members(plug_in: type) -> dict[str, bool]:
     """The public members of a class, without those of its bases, and whether each is a function."""
-    members = dict.fromkeys(vars(plug_in).get("__annotations__", ()), False)
+    members = dict.fromkeys(inspect.get_annotations(plug_in), False)
     for name in vars(plug_in):
-        value = getattr(plug_in, name)
+        value = getattr(plug_in, name, None)
         members[name] = callable(value) and not isinstance(value, type)
     return {name: is_called for name, is_called in members.items() if not name.startswith("_")}

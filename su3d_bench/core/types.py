@@ -6,14 +6,15 @@ Coordinates are metres in the world frame, with z up, unless a name states other
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError, Su3dError
+from su3d_bench.core.arguments import check_fields
+from su3d_bench.core.errors import DataError
 
 BoolArray = NDArray[np.bool_]
 UInt8Array = NDArray[np.uint8]
@@ -25,6 +26,7 @@ IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
+MaskKind = Literal["grounded", "class-agnostic", "none"]
 Interval = tuple[float, float]
 UP = 1  # the vertical axis in building graphs, as in Habitat
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -57,7 +59,7 @@ class Frame:
 
     def __post_init__(self) -> None:
         where = f"frame {self.index}"
-        check_arrays(self, where, ("rgb", "depth_m", "camera_to_world", "intrinsics"), DataError)
+        check_fields(self, where, DataError)
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.dtype != np.uint8:
             raise DataError(f"{where}: colour is {self.rgb.shape} {self.rgb.dtype}; expected (height, width, 3) uint8")
         if self.depth_m.shape != self.rgb.shape[:2]:
@@ -82,6 +84,8 @@ def _size(image: NDArray[Any]) -> str:
 class SceneInfo:
     """What a method knows of a scene before its first frame; never ground truth.
 
+    ``read_surface`` reads the scan's mesh; None if there is none. Methods call ``surface()``.
+
     >>> import su3d_bench as su3d
     >>> su3d.SceneInfo("rooms", "living0", n_frames=25, stride=40, image_domain="rendered-rooms").seed
     0
@@ -93,6 +97,17 @@ class SceneInfo:
     stride: int
     image_domain: ImageDomain
     seed: int = 0
+    read_surface: Callable[[], Surface] | None = field(default=None, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self, f"scene {self.scene}", DataError)
+
+    def surface(self) -> Surface:
+        """The scan's mesh without labels: ``vertices`` (V, 3) float32 m, ``triangles`` (T, 3) int32, and ``segments``
+        (V,) or None; read at every call. Raises ``DataError`` if the dataset has no mesh."""
+        if self.read_surface is None:
+            raise DataError(f"{self.dataset}/{self.scene}: the dataset has no mesh, which this method needs")
+        return self.read_surface()
 
 
 @dataclass(frozen=True)
@@ -130,6 +145,7 @@ class LabelSet:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        check_fields(self, "label set", DataError)
         if len(self.ids) != len(self.names) or len(set(self.ids)) != len(self.ids):
             raise DataError(f"label set '{self.space}': ids and names must pair up, each id once")
 
@@ -232,20 +248,18 @@ class GroundTruth:
     places: Places | None = None
 
     def __post_init__(self) -> None:
-        check_arrays(self, f"ground truth '{self.variant}'", ("points", "semantic", "instance"), DataError)
+        check_fields(self, f"ground truth '{self.variant}'", DataError)
         n = len(self.points)
         if self.points.shape != (n, 3) or self.semantic.shape != (n,) or self.instance.shape != (n,):
             raise DataError(
                 f"ground truth '{self.variant}': points {self.points.shape}, semantic {self.semantic.shape} and "
                 f"instance {self.instance.shape} do not agree"
             )
-        if self.every_semantic is not None:
-            check_arrays(self, f"ground truth '{self.variant}'", ("every_semantic",), DataError)
-            if self.every_semantic.ndim != 2 or len(self.every_semantic) != n:
-                raise DataError(
-                    f"ground truth '{self.variant}': every_semantic {self.every_semantic.shape}; expected one row "
-                    f"for each of {n} points"
-                )
+        if self.every_semantic is not None and (self.every_semantic.ndim != 2 or len(self.every_semantic) != n):
+            raise DataError(
+                f"ground truth '{self.variant}': every_semantic {self.every_semantic.shape}; expected one row "
+                f"for each of {n} points"
+            )
 
 
 @dataclass(frozen=True)
@@ -268,6 +282,9 @@ class InstanceMesh:
     instance_of_triangle: Int32Array
     class_of_instance: Mapping[int, int]
     labels: LabelSet
+
+    def __post_init__(self) -> None:
+        check_fields(self, "instance mesh", DataError)
 
 
 @dataclass(frozen=True)
@@ -348,6 +365,7 @@ class Detections:
     rows: Int64Array | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self, f"frame {self.frame_index}", DataError)
         n = len(self.names)
         shapes = (len(self.masks), len(self.boxes), len(self.scores), len(self.captions), len(self.crop_features))
         if self.rows is not None and len(self.rows) != n:
@@ -398,7 +416,7 @@ class PerceptionNeeds:
     True
     """
 
-    masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
+    masks: MaskKind = "grounded"
     crop_ratios: tuple[float, ...] = (1.0,)
     crop_padding_px: int = 0
     background_names: tuple[str, ...] = ()
@@ -409,6 +427,9 @@ class PerceptionNeeds:
     frames: bool = True
     automatic: str = "sam"
     grounding: str = "paper"
+
+    def __post_init__(self) -> None:
+        check_fields(self, "perception needs", DataError)
 
 
 @dataclass(frozen=True)
@@ -421,6 +442,9 @@ class Surface:
     vertices: Float32Array
     triangles: Int32Array
     segments: Int32Array | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self, "surface", DataError)
 
 
 @dataclass(frozen=True)
@@ -436,9 +460,3 @@ class Regions:
     names: tuple[str, ...] | None = None
     captions: tuple[str, ...] | None = None
     rows: Int64Array | None = None
-
-
-def check_arrays(value: Any, where: str, names: Sequence[str], error: type[Su3dError]) -> None:
-    for name in names:
-        if not isinstance(array := getattr(value, name), np.ndarray):
-            raise error(f"{where}: {name} is a {type(array).__name__}; expected an array")

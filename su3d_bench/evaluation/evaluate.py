@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown, some, with_notes
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.system.files import noted
@@ -20,17 +20,20 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.openlex3d.release import OpenLexRelease
 from su3d_bench.evaluation import scoring as scene_scoring
 from su3d_bench.evaluation.ground_truth import NOT_INTENDED, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
-from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, some_names
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, grouped_reasons
 from su3d_bench.evaluation.text_ground_truth import FLAG, TextTruths
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
 from su3d_bench.metrics import compatibility
-from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
+from su3d_bench.metrics.protocols.loading import ALL_PROTOCOLS, load_protocol, more_protocols_line, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.predictions.formats import Source, open_sources
+from su3d_bench.predictions.formats import Source, memory_sources, open_sources
 from su3d_bench.predictions.run_predictions import OWN_RUNS
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 
 RANKED_BY_FILE = {"scannet-text", "maskclustering"}  # formats whose own evaluators use the confidences in the files
+
+NOT_REQUESTED = "applies too; not requested"
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "warnings_of"]
 
@@ -44,11 +47,15 @@ class EvaluationStore(Protocol):
 
 
 def evaluate(request: Request, kept: EvaluationStore | None = None) -> Evaluation:
-    """The numbers of ``request`` under every named protocol, or all that fit; ``kept`` receives each scene."""
+    """The numbers of ``request`` under every named protocol, or the default ones; ``kept`` receives each scene."""
     # Load.
     _check_values_have_texts(request, is_text=request.ground_truth is not None)
     texts = read_text_features(request.text_features)
-    sources = open_sources(request.predictions, request.format, request.method)
+    sources = (
+        open_sources(request.predictions, request.format, request.method)
+        if request.contents is None
+        else memory_sources(request.contents)
+    )
 
     # Match to ground truth.
     truths = _open_truths(request, sources)
@@ -91,6 +98,8 @@ def warnings_of(result: Evaluation) -> list[str]:
     reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
         reasons.setdefault(reason, []).append(name)
+    if more := reasons.pop(NOT_REQUESTED, []):
+        lines.append(more_protocols_line(more))
     relevant = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_INTENDED)}
     return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in relevant.items()]
 
@@ -122,12 +131,12 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
     """Each remark with the scenes it concerns, out of ``n`` scenes with a prediction."""
     for line, scenes in scenes_of_remark.items():
-        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
+        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some(scenes, 5)})"
         yield f"{'every scene' if len(scenes) == n > 1 else which}: {line}"
 
 
 class Scoring:
-    """Scores scene after scene under the named protocols, or under all that fit.
+    """Scores scene after scene under the named protocols, or under the dataset's headline protocol if that fits.
 
     ``rules`` and ``outcomes`` hold, by name, the remaining protocols and the outcomes so far; ``unfit`` has the reasons
     for the others. ``file_confidences``: use those of the files if a protocol sets 1 for every mask.
@@ -141,13 +150,18 @@ class Scoring:
         self.outcomes: dict[str, SceneOutcomes] = {}
         self.unfit: dict[str, str] = {}
         self._truths, self._texts, self._file_confidences = truths, texts, file_confidences
-        self._is_named = bool(named)
+        own = [load_protocol(name) for name in named if name != ALL_PROTOCOLS]
+        self._named = {rules.name for rules in own}
+        self._headlines = () if named else truths.headlines
         self._first: Content | None = None  # the first prediction that is not empty
-        for rules in map(load_protocol, dict.fromkeys(named or protocol_names())):
-            reason = truths.incompatibility(rules, is_named=self._is_named)
+        if not own or ALL_PROTOCOLS in named:
+            own += map(load_protocol, dict.fromkeys([*truths.headlines, *protocol_names()]))
+        self._faults: list[str] = []  # reasons that are faults of the data
+        for rules in {one.name: one for one in own}.values():
+            reason = truths.incompatibility(rules, is_named=rules.name in self._named)
             if reason is None:
                 self.rules[rules.name], self.outcomes[rules.name] = rules, SceneOutcomes()
-            elif self._is_named:
+            elif rules.name in self._named:
                 raise ConfigError(f"protocol '{rules.name}' cannot score these predictions: {reason}")
             else:
                 self.unfit[rules.name] = reason
@@ -163,21 +177,44 @@ class Scoring:
         facts = scene_scoring.facts_of(prediction.content)
         if any(rules.names_masks for rules in self.rules.values()):
             facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
+        is_empty = isinstance(prediction.content, VertexMasks | Instances) and not len(prediction.content)
+        if self._first is None and not is_empty:
+            self._keep_headline(prediction, facts)
         found = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
         reasons = {name: reason for name, reason in found.items() if reason is not None}
         for name, reason in reasons.items():
-            if self._is_named or self._first is not None:
+            if name in self._named or self._first is not None:
                 raise PredictionError(f"{where}: {name}: {reason}")
             del self.rules[name], self.outcomes[name]
             self.unfit[name] = reason
         if not self.rules:
-            # the most frequent reason says most: files that only one protocol needs may not be used at all
-            (first, _), *others = Counter(reasons.values()).most_common()
-            more = f" (and {len(others)} more reasons)" if others else ""
-            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
-        is_empty = isinstance(prediction.content, VertexMasks | Instances) and not len(prediction.content)
+            # faults of the data, then the most frequent reason: files that only one protocol needs may not be used
+            self._faults += filter(None, [self._fault(scene, facts)])
+            count = Counter(reasons.values())
+            ordered = sorted({*self._faults, *count}, key=lambda why: (why not in self._faults, -count[why], why))
+            first, *others = ((why, [name for name in reasons if reasons[name] == why]) for why in ordered)
+            error = PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first[0]}")
+            raise with_notes(error, (f"{', '.join(names)}: {why}".removeprefix(": ") for why, names in others))
         if self._first is None and not is_empty:
             self._first = prediction.content
+
+    def _fault(self, scene: str, facts: compatibility.ContentFacts) -> str | None:
+        """Why the points of the prediction cannot be those of the ground truth."""
+        if facts.n_points is None or not isinstance(self._truths, DatasetTruths):
+            return None
+        try:
+            return compatibility.length_mismatch(facts, len(self._truths.vertices(scene, facts.n_points)))
+        except GroundTruthMissing as error:
+            return str(error)
+
+    def _keep_headline(self, prediction: ScenePrediction, facts: compatibility.ContentFacts) -> None:
+        """If none is named and the headline protocol fits, keep only it and those of the queries."""
+        reasons = {name: self._fit(rules, prediction, facts)[0] for name, rules in self.rules.items()}
+        if any(reasons.get(name, "absent") is None for name in self._headlines):
+            for name, rules in list(self.rules.items()):
+                if name not in self._headlines and rules.ground_truth != QUERY_OBJECTS:
+                    del self.rules[name], self.outcomes[name]
+                    self.unfit[name] = reasons[name] or NOT_REQUESTED
 
     def add_missed(self, scenes: Sequence[str]) -> Content:
         """Scenes without a prediction: skipped if the original evaluator skips them, otherwise counted as missed.
@@ -205,31 +242,41 @@ class Scoring:
         protocols = []
         for name, kept in self.outcomes.items():
             rules = self.rules[name]
-            if rules.names_masks and not self._is_named and 0 < kept.n_masks == kept.n_of_class_0:
+            if rules.names_masks and name not in self._named and 0 < kept.n_masks == kept.n_of_class_0:
                 not_scored[name] = "needs classes, every mask has class 0"
             elif kept.scores:
                 protocols.append(formed(rules, kept, file_confidences=self._file_confidences))
             else:
-                not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
+                not_scored[name] = "; ".join(grouped_reasons(kept.unscored)) or "no scene was scored"
         if not protocols:
-            raise PredictionError(f"nothing could be scored: {not_scored[next(iter(self.outcomes))]}")
+            lines = [line for kept in self.outcomes.values() for line in grouped_reasons(kept.unscored)]
+            first, *others = dict.fromkeys(lines or [not_scored[name] for name in self.outcomes])
+            raise with_notes(PredictionError(f"nothing could be scored: {first}"), others)
         return tuple(protocols), dict(sorted(not_scored.items()))
+
+    def _fit(
+        self, rules: ProtocolRules, prediction: ScenePrediction, facts: compatibility.ContentFacts
+    ) -> tuple[str | None, Encoder | None]:
+        """The reason why a prediction does not fit the protocol, None if it does; and the encoder of its features."""
+        has_points = self._truths.has_points
+        if facts.form == "vertex-masks" and compatibility.needs_map(rules) and isinstance(self._truths, DatasetTruths):
+            facts = replace(facts, form="instances", has_every_label=facts.has_labels, n_points=None)
+        reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
+        if reason is None and has_points and rules.name not in self._named and self._first is None:
+            reason = compatibility.class_id_incompatibility(rules, facts)
+        if reason is not None or (n_dimensions := compatibility.n_feature_dimensions(rules, facts)) is None:
+            return reason, None
+        encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OWN_RUNS.name)
+        return (encoder, None) if isinstance(encoder, str) else (None, encoder)
 
     def _score(
         self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: compatibility.ContentFacts
     ) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None if it was."""
-        has_points, kept = self._truths.has_points, self.outcomes[rules.name]
-        reason = compatibility.content_incompatibility(rules, facts, has_points=has_points)
-        if reason is None and has_points and not self._is_named and self._first is None:
-            reason = compatibility.class_id_incompatibility(rules, facts)
+        reason, encoder = self._fit(rules, prediction, facts)
         if reason is not None:
             return reason
-        encoder: Encoder | str | None = None
-        if (n_dimensions := compatibility.n_feature_dimensions(rules, facts)) is not None:
-            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OWN_RUNS.name)
-        if isinstance(encoder, str):
-            return encoder
+        kept = self.outcomes[rules.name]
         if encoder is not None:
             kept.encoder = encoder.name, encoder.digest
         if facts.n and (rules.n_labels or 0) > 1:
@@ -250,11 +297,19 @@ class Scoring:
         kept, facts = self.outcomes[rules.name], scene_scoring.facts_of(content)
         try:
             truth = self._truths.of_scene(rules, scene)
+            points = scene_scoring.vertices_for(rules, self._truths, scene, content)
         except GroundTruthMissing as error:
             if kept.scores or len(self._truths.scenes) > 1:
                 kept.unscored[scene] = str(error)
                 return None
+            self._faults.append(str(error))
             return str(error)
+        over = truth.points if points is None and isinstance(truth, GroundTruth) else points
+        if over is not None and (reason := compatibility.length_mismatch(facts, len(over))) is not None:
+            self._faults.append(reason)
+            return reason
+        if points is not None:
+            content = scene_scoring.on_vertices(content, points, rules)
         used = scene_scoring.with_confidences_of_files(rules) if self._file_confidences else rules
         if isinstance(truth, VertexTruth):
             if (reason := compatibility.length_mismatch(facts, len(truth.values))) is not None:
@@ -262,8 +317,6 @@ class Scoring:
             outcome = scene_scoring.score_on_vertices(used, truth, scene, content, encoder)
             kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
         elif isinstance(truth, GroundTruth):
-            if (reason := compatibility.length_mismatch(facts, len(truth.points))) is not None:
-                return reason
             outcome = scene_scoring.score_on_truth(used, truth, scene, content, encoder)
         else:
             outcome = scene_scoring.score_on_objects(used, truth, scene, content, encoder)

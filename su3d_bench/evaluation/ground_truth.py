@@ -10,6 +10,7 @@ import fnmatch
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,15 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, shown, suggest
-from su3d_bench.core.interfaces import IsAligned, NamesCategories
+from su3d_bench.core.interfaces import HasSurface, IsAligned, NamesCategories
 from su3d_bench.core.registry import GROUND_TRUTH_FILES
-from su3d_bench.core.types import GroundTruth, Int64Array
+from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d.release import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
+from su3d_bench.metrics.protocols.loading import headline_protocols
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.formats import Match, Source, is_known, match_scenes, planned_scenes
@@ -53,10 +55,12 @@ class VertexTruth:
 class SceneTruths(ABC):
     """The ground truth of every scene of an evaluation, and the prediction of each that has one.
 
-    ``where`` is its name in messages; ``has_points``: its points have coordinates.
+    ``where`` is its name in messages; ``has_points``: its points have coordinates; ``headlines``: the protocol that
+    scores it by default, if declared.
     """
 
     has_points = True
+    headlines: tuple[str, ...] = ()
     where: str
     dataset_name: str | None
     scenes: tuple[str, ...]
@@ -103,6 +107,7 @@ class DatasetTruths(SceneTruths):
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
         self._target = request.dataset or _dataset_of(sources)
         self._dataset = open_dataset(self._target)
+        self.headlines = headline_protocols(self._dataset)
         self.where = self.dataset_name = name = str(self._dataset.name)
         known = list(self._dataset.scenes())
         requested = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []
@@ -163,6 +168,15 @@ class DatasetTruths(SceneTruths):
         needs_axes = rules.box_axes == "aligned" and isinstance(dataset, IsAligned)
         alignment = dataset.axis_alignment(scene) if needs_axes else None
         return query_truth(truth, self._queries[scene], where, class_of, alignment)
+
+    def vertices(self, scene: str, n: int | None) -> Float32Array:
+        """The points (V, 3) of masks over ``n`` vertices: those of the ground truth, unless only the mesh has ``n``."""
+        points = self._truth(scene, self._dataset.variants[0]).points
+        if len(points) != n and isinstance(self._dataset, HasSurface):
+            with suppress(DataError):  # no mesh
+                vertices = self._dataset.surface(scene).vertices
+                return vertices if len(vertices) == n else points
+        return points
 
     def _truth(self, scene: str, variant: str) -> GroundTruth:
         if (scene, variant) not in self._kept:

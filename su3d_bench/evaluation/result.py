@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 
+from su3d_bench.core.errors import some
 from su3d_bench.metrics.compatibility import MIN_MULTI_LABEL_SHARE, labels_counted
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
@@ -16,6 +17,7 @@ from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
+from su3d_bench.predictions.base import Content
 
 Confidences = Literal["protocol", "file"]
 ValuesForm = Literal["classes", "instances", "numbers"]
@@ -23,10 +25,11 @@ ValuesForm = Literal["classes", "instances", "numbers"]
 
 @dataclass(frozen=True)
 class Request:
-    """What to score: ``predictions`` are folders or files; everything else is optional.
+    """What to score: ``predictions`` are folders or files, ``contents`` maps in memory by scene instead.
 
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, instead of the dataset's own.
-    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default all that fit.
+    ``ground_truth_values``: the meaning of their values, if ambiguous. ``protocols``: by default the dataset's headline
+    protocol if it fits, otherwise all that fit (as with "all").
     ``scenes``: names or patterns. ``confidences``: if a protocol sets 1 for every mask, use its rule ("protocol") or
     the values in the files ("file"); None: those in the files for the formats of ScanNet's and MaskClustering's
     scripts, as these do, and the protocol's rule for all others. ``queries``: a file of texts and the objects that they
@@ -34,6 +37,7 @@ class Request:
     """
 
     predictions: tuple[Path, ...]
+    contents: Mapping[str, Content] | None = None
     dataset: str | None = None
     ground_truth: Path | None = None
     ground_truth_values: ValuesForm | None = None
@@ -255,13 +259,23 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
     if kept.skipped:
         lines.append(
             f"{len(kept.skipped)} of {n} scenes have no prediction and are skipped, as in the original evaluator; "
-            f"their objects do not count as missed: {some_names(kept.skipped)}"
+            f"their objects do not count as missed: {some(kept.skipped, 5)}"
         )
     if kept.missed:
-        lines.append(
-            f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some_names(kept.missed)}"
-        )
-    return lines + [f"{scene}: not scored: {reason}" for scene, reason in kept.unscored.items()]
+        lines.append(f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some(kept.missed, 5)}")
+    return lines + [f"{scene}: not scored: {why.replace(scene, '<scene>')}" for scene, why in kept.unscored.items()]
+
+
+def grouped_reasons(reasons: Mapping[str, str]) -> list[str]:
+    """One line for each distinct reason of ``reasons`` (by scene), with the scenes that it concerns.
+
+    >>> grouped_reasons({"a": "x/a: no a.ply", "b": "x/b: no b.ply"})
+    ['x/<scene>: no <scene>.ply (a, b)']
+    """
+    scenes_of: dict[str, list[str]] = {}
+    for scene, reason in reasons.items():
+        scenes_of.setdefault(reason.replace(scene, "<scene>"), []).append(scene)
+    return [f"{line} ({some(scenes, 5)})" for line, scenes in scenes_of.items()]
 
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
@@ -284,11 +298,6 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
     if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
         return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP per class is recall x (1 + precision) / 2"]
     return []
-
-
-def some_names(names: Sequence[str]) -> str:
-    """The first five of ``names`` and the number of further ones."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _key(name: str) -> str:

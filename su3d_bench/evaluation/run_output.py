@@ -25,8 +25,10 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.ground_truth import SceneTruths
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request
-from su3d_bench.evaluation.scoring import map_of
+from su3d_bench.evaluation.scoring import map_of, on_vertices, vertices_for
+from su3d_bench.metrics.compatibility import needs_map
 from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import ALL_PROTOCOLS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
@@ -53,6 +55,9 @@ class EvaluatedRun:
     existed: bool = False
 
 
+Progress = Callable[[str, int, int], None]  # the scene, the number of scenes done and of all, for one method
+
+
 @dataclass
 class _Kept:
     """The state of one method's predictions; the maps go to ``folder``, if there is one."""
@@ -60,7 +65,9 @@ class _Kept:
     method: str
     request: Request
     folder: RunFolder | None
+    progress: Progress
     files: dict[str, Mapping[str, str]] = field(default_factory=dict)
+    n_done: int = 0
 
     def begin(self, truths: SceneTruths, sources: Sequence[Source], *, counts_file_confidences: bool) -> None:
         self.truths = truths
@@ -68,6 +75,8 @@ class _Kept:
         self.confidences = "file" if counts_file_confidences else "protocol"
 
     def keep(self, scene: str, content: Content, files: Iterable[Path], rules: Sequence[ProtocolRules]) -> None:
+        self.n_done += 1
+        self.progress(scene, self.n_done, len(self.truths.scenes))
         if self.folder is None:
             return
         address = self.truths.address(scene)
@@ -76,7 +85,10 @@ class _Kept:
 
     def _shown(self, scene: str, content: Content, rules: Sequence[ProtocolRules]) -> Content:
         """The map as scored: on the ground-truth points, with the names of the first protocol with classes."""
-        for each in sorted(rules, key=lambda one: one.class_agnostic is not None):
+        for each in sorted(rules, key=lambda one: (needs_map(one), one.class_agnostic is not None or not one.classes)):
+            points = vertices_for(each, self.truths, scene, content)
+            if points is not None:
+                return on_vertices(content, points, each)
             truth = self.truths.of_scene(each, scene)
             if isinstance(truth, GroundTruth):
                 return map_of(content, truth.points, each)
@@ -107,7 +119,9 @@ class _Kept:
         )
 
 
-def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -> EvaluatedRun:
+def evaluate_methods(
+    requests: Mapping[str, Request], out: Path | None = None, progress: Progress = lambda scene, n_done, n_all: None
+) -> EvaluatedRun:
     """The numbers of each method's predictions, written as one run to ``out`` if given.
 
     A folder with the same evaluation is not changed; ``StoreError`` if it contains another evaluation or anything else.
@@ -115,7 +129,7 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
     for method in requests:
         check_method_name(method)
     if out is None:
-        kept = [_Kept(method, request, None) for method, request in requests.items()]
+        kept = [_Kept(method, request, None, progress) for method, request in requests.items()]
         return _evaluated(kept)
     _check_same_runs(out)
     place = out.absolute()
@@ -123,7 +137,7 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
     try:
         with unfinished_folder(place) as filled:
             folder = RunFolder(filled)
-            kept = [_Kept(method, request, folder) for method, request in requests.items()]
+            kept = [_Kept(method, request, folder, progress) for method, request in requests.items()]
             run = _evaluated(kept)
             record = _write(kept, run, folder)
             if atomic.is_file(out / "run.json"):
@@ -144,6 +158,11 @@ def check_method_name(name: str) -> None:
 
 def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
     evaluations = {one.method: evaluate(one.request, one) for one in kept}
+    scored = {tuple(found.rules.name for found in one.protocols) for one in evaluations.values()}
+    if len(scored) > 1 and not kept[0].request.protocols:  # the headline protocol does not fit every method
+        for one in kept:
+            one.request = replace(one.request, protocols=(ALL_PROTOCOLS,))
+        return _evaluated(kept)
     return EvaluatedRun(evaluations, _metrics(kept, evaluations))
 
 

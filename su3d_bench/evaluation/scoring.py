@@ -10,9 +10,9 @@ from su3d_bench.core import registry
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
-from su3d_bench.evaluation.ground_truth import VertexTruth
+from su3d_bench.evaluation.ground_truth import DatasetTruths, SceneTruths, VertexTruth
 from su3d_bench.evaluation.result import SceneOutcome
-from su3d_bench.metrics.compatibility import ContentFacts
+from su3d_bench.metrics.compatibility import ContentFacts, needs_map
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.score import (
@@ -245,6 +245,19 @@ def score_on_truth(
 def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Prediction:
     """The map of ``content``; content without its own points uses those of the ground truth."""
     return content.on(points, rules) if isinstance(content, VertexMasks | VertexLabels) else content
+
+
+def vertices_for(rules: ProtocolRules, truths: SceneTruths, scene: str, content: Content) -> Float32Array | None:
+    """The points of masks over vertices if a protocol scores them as a map; None for other content."""
+    if not isinstance(truths, DatasetTruths) or not isinstance(content, VertexMasks) or not needs_map(rules):
+        return None
+    return truths.vertices(scene, content.n_points) if len(content) else None
+
+
+def on_vertices(content: Content, points: Float32Array, rules: ProtocolRules) -> Instances:
+    """The map of masks over these vertices; their class numbers mean nothing to a protocol without classes."""
+    assert isinstance(content, VertexMasks)
+    return (content if rules.classes else replace(content, class_numbers=None)).on(points, rules)
 
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:

@@ -19,6 +19,7 @@ from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreEr
 from su3d_bench.core.files.atomic import make_folder, write_error, write_json
 from su3d_bench.core.files.locks import clear_unfinished, hold_folder
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.version import documentation
 from su3d_bench.datasets.replica import folders
 from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
 from su3d_bench.fetching.download import (
@@ -310,5 +311,5 @@ def _remarks(planned: Planned, arrived: Sequence[FetchedFile]) -> tuple[str, ...
             f"{record_path(planned.root)}, and later downloads are compared with it"
         )
     if planned.source.name == "ram-plus":
-        remarks.append("RAM++ needs its own package or an exported model; see docs/methods/models.md")
+        remarks.append(f"RAM++ needs its own package or an exported model; see {documentation('methods/models')}")
     return tuple(remarks)

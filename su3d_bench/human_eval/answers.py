@@ -18,7 +18,7 @@ from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.tables.table import meant, read_workbook
-from su3d_bench.human_eval.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
+from su3d_bench.human_eval.items import ANSWER_COLUMNS, COMMENT, Key, Sheet, SheetItem
 from su3d_bench.numerics.statistics import DIFFERENCE, MIN_ITEMS, jackknife_interval, leave_one_out
 from su3d_bench.questions.query_files import csv_rows
 
@@ -40,16 +40,17 @@ class AnswerRow:
     question: str
     answer: str
     check: str
+    comment: str = ""
 
 
 def read_answers(path: Path) -> list[AnswerRow]:
     """All rows of a CSV file or XLSX workbook, in order; ``DataError`` if it is not an answers file."""
     required = [name for name in ANSWER_COLUMNS if name != "annotator"]
-    rows = rows_of_file(path, ANSWER_COLUMNS)
+    rows = rows_of_file(path, ANSWER_COLUMNS, (COMMENT,))
     return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in required)]
 
 
-def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+def rows_of_file(path: Path, columns: Sequence[str], optional: Sequence[str] = ()) -> list[tuple[str, dict[str, str]]]:
     """Location and texts of each non-empty row of a CSV file or of each worksheet that has the ``columns``."""
     where = printable(str(path), 200)
     pages: list[tuple[str, Iterable[tuple[int, Sequence[str | None]]]]]
@@ -64,7 +65,8 @@ def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str
     found, has_columns = [], False
     for place, page in pages:
         rows = iter(page)
-        header = next((known for n, row in rows if n <= HEADER_WITHIN and (known := _places(row, columns))), None)
+        heads = (_places(row, columns, optional) for n, row in rows if n <= HEADER_WITHIN)
+        header = next(filter(None, heads), None)
         has_columns |= header is not None
         for number, row in rows if header else ():
             at = f"{place}: row {number}"
@@ -76,10 +78,12 @@ def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str
     return found
 
 
-def _places(row: Sequence[str | None], columns: Sequence[str]) -> dict[str, int] | None:
+def _places(row: Sequence[str | None], columns: Sequence[str], optional: Sequence[str]) -> dict[str, int] | None:
     """Index of each column; None if the row is not the header."""
     names = [(cell or "").strip().lower() for cell in row]
-    return {name: names.index(name) for name in columns} if all(names.count(name) == 1 for name in columns) else None
+    if any(names.count(name) != 1 for name in columns):
+        return None
+    return {name: names.index(name) for name in (*columns, *optional) if name in names}
 
 
 def _text(value: str | None, name: str, at: str) -> str:
@@ -108,12 +112,13 @@ class Judgement:
 class CheckedAnswers:
     """``judgements`` in the order of the sheet; ``faults`` has one line for each problem that must be fixed first.
 
-    ``silent``: annotators of the set without any answer.
+    ``silent``: annotators of the set without any answer. ``comments``: item -> annotator -> text.
     """
 
     judgements: tuple[Judgement, ...]
     faults: tuple[str, ...]
     silent: tuple[str, ...]
+    comments: Mapping[str, Mapping[str, str]]
 
 
 def check_key(sheet: Sheet, key: Key) -> None:
@@ -127,15 +132,24 @@ def check_key(sheet: Sheet, key: Key) -> None:
         )
 
 
-def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> CheckedAnswers:
-    """Check every row against the sheet, then list the missing answers of each annotator."""
+def check_answers(sheet: Sheet, rows: Sequence[AnswerRow], *, is_partial: bool = False) -> CheckedAnswers:
+    """Check every row against the sheet, then list the missing answers of each annotator, unless ``is_partial``."""
     items = {item.id: item for item in sheet.items}
     shares = {share.name: share.item_ids for share in sheet.annotators}
     first: dict[tuple[str, str, str], str] = {}
     judgements, faults = [], []
+    comments: dict[str, dict[str, str]] = {}
     for row in rows:
         place = (row.annotator, row.item_id, row.question)
         fault = _fault(sheet, row, items, shares)
+        if fault is None and row.comment:
+            of_item = comments.setdefault(row.item_id, {})
+            before = of_item.get(row.annotator)
+            of_item[row.annotator] = row.comment if before in (None, row.comment) else f"{before}; {row.comment}"
+        if fault is None and not row.answer:
+            if is_partial:
+                continue
+            fault = f"missing answer (item '{row.item_id}', question '{row.question}'); answer it, or use --partial"
         if fault is None and place in first:
             fault = f"duplicate answer, first at {first[place]}; remove one of them"
         first.setdefault(place, row.at)
@@ -143,18 +157,19 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> CheckedAnswers:
             judgements.append(Judgement(row.item_id, row.annotator, row.question, _plain(row.answer)))
         else:
             faults.append(f"{row.at}: {fault}")
-    answered = {row.annotator for row in rows if row.sheet_id == sheet.id}
+    answered = {row.annotator for row in rows if row.sheet_id == sheet.id and (row.answer or not is_partial)}
     for name, share in shares.items():
         missing = [item_id for item_id in share for ask in items[item_id].asks if (name, item_id, ask) not in first]
-        if name in answered and missing:
+        if name in answered and missing and not is_partial:
             faults.append(
                 f"annotator '{printable(name, 40)}': {len(missing)} answers are missing "
-                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); complete them or pass the remaining files"
+                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); complete them, pass all files or use --partial"
             )
     order = {item.id: k for k, item in enumerate(sheet.items)}
     names = [ask.name for ask in sheet.asks]
     judgements.sort(key=lambda one: (order[one.item_id], names.index(one.ask), one.annotator))
-    return CheckedAnswers(tuple(judgements), tuple(faults), tuple(name for name in shares if name not in answered))
+    silent = tuple(name for name in shares if name not in answered)
+    return CheckedAnswers(tuple(judgements), tuple(faults), silent, comments)
 
 
 def _plain(answer: str) -> str:
@@ -180,10 +195,8 @@ def _fault(
     if row.item_id not in shares.get(row.annotator, ()):
         hint = suggest(row.annotator, sorted(shares), "it has")
         return f"item '{item.id}' is not assigned to annotator '{printable(row.annotator, 40)}'{hint}"
-    if not row.answer:
-        return f"missing answer (item '{item.id}', question '{row.question}'); answer it and export again"
     choices = sheet.ask(row.question).choices
-    if _plain(row.answer) not in choices:
+    if row.answer and _plain(row.answer) not in choices:
         hint = suggest(row.answer, choices, "choose one of")
         return f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{hint}"
     return None
@@ -208,8 +221,9 @@ class Agreement:
     """Agreement coefficients of one question over its items with at least two answers.
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the most common number. ``alpha``
-    is Krippendorff's for nominal data over all items; its ``interval`` is over items and needs at least ten. None:
-    undefined, because there are no items or only one answer occurs.
+    is Krippendorff's for nominal data over all items; its ``interval`` is over items and needs at least ten.
+    ``ordinal_alpha`` is for ordered answers, ``ac1`` is Gwet's. None: undefined, because there are no items or (except
+    for ``ac1``) only one answer occurs.
     """
 
     n_annotators: int
@@ -221,16 +235,20 @@ class Agreement:
     n_raters: int
     alpha: float | None
     interval: Interval | None
+    ordinal_alpha: float | None = None
+    ac1: float | None = None
 
 
-def agreement(ratings: Ratings) -> Agreement:
-    """All coefficients for one question; items of ``ratings`` with a single answer are ignored."""
-    answers = sorted({answer for item in ratings.values() for answer in item.values()})
+def agreement(ratings: Ratings, choices: Sequence[str], *, is_ordered: bool = False) -> Agreement:
+    """All coefficients for one question with these ``choices``, which may be ordered.
+
+    Items with a single answer are ignored, except for the shares of the answers in ``ac1``.
+    """
     annotators = sorted({annotator for item in ratings.values() for annotator in item})
     given = [list(item.values()) for item in ratings.values()]
-    counts = np.array([[item.count(answer) for answer in answers] for item in given], np.int64)
-    counts = counts.reshape(-1, len(answers))
-    counts = counts[counts.sum(axis=1) >= 2]
+    every = np.array([[item.count(choice) for choice in choices] for item in given], np.int64)
+    every = every.reshape(-1, len(choices))
+    counts = every[every.sum(axis=1) >= 2]
     sizes = counts.sum(axis=1)
     n_raters = 0 if not len(sizes) else int(np.argmax(np.bincount(sizes)))
     even = counts[sizes == n_raters]
@@ -250,6 +268,8 @@ def agreement(ratings: Ratings) -> Agreement:
         n_raters=n_raters,
         alpha=alpha,
         interval=interval,
+        ordinal_alpha=ordinal_alpha(counts) if is_ordered else None,
+        ac1=gwet_ac1(every),
     )
 
 
@@ -316,3 +336,44 @@ def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array
     with np.errstate(invalid="ignore", divide="ignore"):
         alphas: Float64Array = np.where(expected > 0, 1.0 - observed / expected, np.nan)
     return alphas
+
+
+def ordinal_alpha(counts: Int64Array) -> float | None:
+    """Krippendorff's alpha for ordinal data [Krippendorff 2011, section D] of items (rows) by ordered answers.
+
+    The distance of two answers is the squared difference of their mean ranks among all answers. Items and None as in
+    ``krippendorff_alpha``.
+
+    >>> round(ordinal_alpha(np.array([[2, 0, 0], [0, 1, 1], [0, 0, 2], [1, 1, 0]])), 4)
+    0.7083
+    """
+    pairable = counts[counts.sum(axis=1) >= 2]
+    totals = pairable.sum(axis=0)
+    if np.count_nonzero(totals) < 2:
+        return None
+    ranks = np.cumsum(totals) - totals / 2
+    distance = np.square(ranks[:, None] - ranks)
+    sizes = pairable.sum(axis=1)
+    observed = float((np.einsum("ic,ck,ik->i", pairable, distance, pairable) / (sizes - 1)).sum())
+    return 1.0 - observed * (int(totals.sum()) - 1) / float(totals @ distance @ totals)
+
+
+def gwet_ac1(counts: Int64Array) -> float | None:
+    """Gwet's AC1 of items (rows) by possible answers (columns), used or not; None without items with two answers.
+
+    Unlike kappa it is not low merely because nearly all answers are equal. Gwet, Computing inter-rater reliability and
+    its variance in the presence of high agreement, British J. of Math. and Stat. Psychology 61 (2008). Items with one
+    answer count in the shares of the answers only, as in his R package irrCAC.
+
+    >>> round(gwet_ac1(np.array([[2, 0]] * 118 + [[1, 1]] * 7)), 4)  # Cohen's kappa: -0.02
+    0.9408
+    """
+    rated = counts[counts.sum(axis=1) > 0]
+    sizes = rated.sum(axis=1)
+    if not (sizes >= 2).any():
+        return None
+    pairs = sizes * (sizes - 1)
+    observed = float(((rated * (rated - 1)).sum(axis=1)[pairs > 0] / pairs[pairs > 0]).mean())
+    shares = (rated / sizes[:, None]).mean(axis=0)
+    by_chance = float((shares * (1 - shares)).sum()) / (len(shares) - 1)
+    return (observed - by_chance) / (1.0 - by_chance)

@@ -126,7 +126,7 @@ def make_audit(
         if one.scene != drawn:
             drawn = one.scene
             progress(drawn)
-        name = f"{number:03d}.png"
+        name = f"{number:03d}.jpg"
         write_bytes(out / PICTURES / name, artist.draw(_draft(one, source)))
         cells = (one.scene, one.kind, one.text, one.answer)
         rows.append((number, *(printable(cell, MAX_CHARACTERS) for cell in cells), "", ""))

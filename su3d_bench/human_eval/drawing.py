@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -37,7 +36,6 @@ ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that the judged
 # A map's points may be 5 cm from the surfaces in the frames, and 5 cm apart. Points of neighbours within that reach are
 # removed again, except within the width of a drawn point, as a tolerance for noise.
 REACH_M, BACK_M = items.CAP_M, 0.035
-PALETTE_FRAMES = 8  # frames from which the colours of all pictures of a scene are chosen
 
 
 @dataclass(frozen=True)
@@ -74,16 +72,6 @@ class ShownRoom:
         self.above: MapView = view_of(self.points, cameras_of(self.points, ZOOM_WIDTH, LOW_HEIGHT)[0])
         corners = cameras_of(self.points, PHOTO_WIDTH, LOW_HEIGHT)[1:]
         self.corners: tuple[MapView, ...] = tuple(view_of(self.points, camera) for camera in corners)
-
-    @cached_property
-    def palette(self) -> UInt8Array:
-        """The palette (n, 3) shared by all pictures of the scene."""
-        photos = [self.frames[k].rgb for k in evenly(len(self.frames), PALETTE_FRAMES)]
-        views = [
-            colour(view.shown, pale(self.colours, share))
-            for view, share in ((self.above, PLACE_SHARE), *((corner, ROOM_SHARE) for corner in self.corners))
-        ]
-        return items.palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
 
     def region(self, points: Float32Array) -> Region:
         """The region of an instance with these ``points`` (M, 3), independent of their number and order."""
@@ -155,8 +143,8 @@ class Artist:
         self._photos: dict[bytes, tuple[Frame, BoolArray] | None] = {}
 
     def draw(self, draft: Draft) -> bytes:
-        """The PNG of a draft."""
-        return items.png_bytes(items.compose(self.parts(draft)), palette=self.room(draft.scene).palette)
+        """The JPEG of a draft."""
+        return items.jpeg_bytes(items.compose(self.parts(draft)))
 
     def parts(self, draft: Draft) -> ItemParts:
         """The content of the picture of a draft: only the regions of ``rows`` and ``others`` of its map."""
@@ -313,7 +301,7 @@ def draw_all(
 
 
 def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
-    """The PNG of each draft of one scene by index."""
+    """The JPEG of each draft of one scene by index."""
     artist = Artist(unit.opener())
     pictures = {}
     for place, draft in unit.drafts.items():

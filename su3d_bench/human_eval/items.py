@@ -32,6 +32,7 @@ MAX_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
 SheetKind = Literal["retrieval", "annotation", "reasoning", "questions"]
 # Columns of an answers file; others may follow and are only for readers.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
+COMMENT = "comment"  # an optional column
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
 ARGUABLE = "arguable"
 VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: one that cannot be decided from pictures is at best arguable

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -29,21 +29,24 @@ if TYPE_CHECKING:
 
 
 WHOLE = "all three"
-REVIEW_COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
+REVIEW_COLUMNS = (
+    *("item_id", "question", "reason", "answers", "truth", "comments", "scene", "methods", "text", "pictures"),
+)
 DISPUTED_COLUMNS = (COLUMN, "scene", "kind", "why", "text")
 
 
-def whole_verdicts(judgements: Iterable[Judgement]) -> Iterator[Judgement]:
-    """The overall judgement per annotator and question: the worst judgement of its parts."""
+def whole_verdicts(judgements: Iterable[Judgement], n_parts: int) -> Iterator[Judgement]:
+    """The overall judgement per annotator and question of which all ``n_parts`` are answered: the worst of them."""
     given: dict[tuple[str, str], list[str]] = defaultdict(list)
     for judgement in judgements:
         given[judgement.item_id, judgement.annotator].append(judgement.answer)
     for (item_id, annotator), answers in given.items():
-        yield Judgement(item_id, annotator, WHOLE, max(answers, key=items.VERDICTS.index))
+        if len(answers) == n_parts:
+            yield Judgement(item_id, annotator, WHOLE, max(answers, key=items.VERDICTS.index))
 
 
 Judge = Literal["people", "automatic"]
-Reason = Literal["annotators disagree", "against the truth", "not right"]
+Reason = Literal["annotators disagree", "against the truth", "not right", "comment"]
 STEPS = (1, 2, 6, 12, 60)  # denominators for shares of up to 1, 2, 3, 4, 6 judges, and their differences
 MAX_STEPS = 50_000  # a distribution of 100,001 sums takes a few seconds for as many items
 ANY_KIND = "all"
@@ -123,9 +126,9 @@ class Confusion:
 
 @dataclass(frozen=True)
 class ReviewItem:
-    """An item on which annotators disagree or contradict the ground truth, or a question that none of them calls right.
+    """An item on which annotators disagree, comment or contradict the ground truth, or a question none calls right.
 
-    ``automatic`` is '' if unknown.
+    ``automatic`` is '' if unknown; ``comments``: annotator -> text.
     """
 
     item_id: str
@@ -137,11 +140,15 @@ class ReviewItem:
     answers: Mapping[str, str]
     automatic: str
     reason: Reason
+    comments: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Scores(items.JudgedRun):
-    """All results of a set; ``annotators``: name -> number of judgements, ``silent`` those without any."""
+    """All results of a set; ``annotators``: name -> number of judgements, ``silent`` those without any.
+
+    ``assigned``: name -> number of questions to answer.
+    """
 
     sheet_id: str
     kind: str
@@ -157,12 +164,19 @@ class Scores(items.JudgedRun):
     agreements: tuple[AskAgreement, ...]
     confusions: tuple[Confusion, ...]
     review_items: tuple[ReviewItem, ...]
+    assigned: Mapping[str, int] = field(default_factory=dict)
 
 
-def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
+def score(
+    sheet: Sheet,
+    key: Key,
+    judgements: Sequence[Judgement],
+    silent: Sequence[str] = (),
+    comments: Mapping[str, Mapping[str, str]] | None = None,
+) -> Scores:
     """The scores of judgements validated by ``check_answers``; without any, the ground truth's judgements of all."""
     keys = {item.id: item for item in key.items}
-    counted = [*judgements, *(whole_verdicts(judgements) if sheet.kind == "questions" else ())]
+    counted = [*judgements, *(whole_verdicts(judgements, len(sheet.asks)) if sheet.kind == "questions" else ())]
     given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in counted]
     by_people = _shares(given)
     clear = by_people[by_people["n_clear"] > 0]
@@ -186,9 +200,10 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         n_judged=len({judgement.item_id for judgement in judgements}),
         cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _shares(truth))),
         tests=tuple(test for test in _tests(sheet, key, clear) if test.n_items),
-        agreements=tuple(AskAgreement(what, agreement(of_ask)) for what, of_ask in ratings.items()),
+        agreements=tuple(AskAgreement(what, _agreement(sheet, of_ask)) for what, of_ask in ratings.items()),
         confusions=tuple(confusion for what in ratings if (confusion := _confusion(sheet, what, given)) is not None),
-        review_items=tuple(_review_items(sheet, keys, judgements)),
+        review_items=tuple(_review_items(sheet, keys, judgements, comments or {})),
+        assigned={share.name: sum(len(one.asks) for one in sheet.items_of(share)) for share in sheet.annotators},
         **key.provenance_remarks(),
     )
 
@@ -202,6 +217,13 @@ def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[s
     for (key, ask, answer), judgement in zip(given, judgements, strict=True):
         ratings.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[judgement.annotator] = answer
     return ratings
+
+
+def _agreement(sheet: Sheet, ratings: Mapping[str, Mapping[str, str]]) -> Agreement:
+    """The agreement on one kind of ask; only verdicts are ordered."""
+    ask = next(iter(ratings)).partition("\0")[2]
+    choices = items.VERDICTS if ask == WHOLE else sheet.ask(ask).choices
+    return agreement(ratings, choices, is_ordered=choices == items.VERDICTS)
 
 
 def _asked(key: KeyItem, ask: str) -> str:
@@ -373,7 +395,12 @@ def _confusion(sheet: Sheet, what: str, given: Sequence[_Given]) -> Confusion | 
     )
 
 
-def _review_items(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterable[Judgement]) -> list[ReviewItem]:
+def _review_items(
+    sheet: Sheet,
+    keys: Mapping[str, KeyItem],
+    judgements: Iterable[Judgement],
+    comments: Mapping[str, Mapping[str, str]],
+) -> list[ReviewItem]:
     """Items to review, in the order of the sheet."""
     given: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
     for judgement in judgements:
@@ -385,12 +412,11 @@ def _review_items(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterabl
             answers = given[item.id, ask]
             automatic = key.automatic.get(ask, "")
             reason = _reason(sheet.kind, list(answers.values()), automatic)
+            if reason is None and item.id in comments and ask == item.asks[0]:
+                reason = "comment"
             if reason is not None:
-                looks.append(
-                    ReviewItem(
-                        item.id, ask, item.text, key.scene, key.methods, item.pictures, answers, automatic, reason
-                    )
-                )
+                shown = (item.text, key.scene, key.methods, item.pictures, answers, automatic, reason)
+                looks.append(ReviewItem(item.id, ask, *shown, comments.get(item.id, {})))
     return looks
 
 
@@ -421,12 +447,13 @@ def review_items_csv(looks: Sequence[ReviewItem]) -> str:
     rows = [REVIEW_COLUMNS]
     for one in looks:
         listed = ", ".join(one.methods), one.text, ", ".join(one.pictures)
-        rows.append((one.item_id, one.ask, one.reason, _review_reason(one), one.automatic, one.scene, *listed))
+        given, comments = _of_each(one.answers), _of_each(one.comments)
+        rows.append((one.item_id, one.ask, one.reason, given, one.automatic, comments, one.scene, *listed))
     return csv_lines(rows)
 
 
-def _review_reason(look: ReviewItem) -> str:
-    return "; ".join(f"{name}: {answer}" for name, answer in look.answers.items())
+def _of_each(texts: Mapping[str, str]) -> str:
+    return "; ".join(f"{name}: {text}" for name, text in texts.items())
 
 
 def review_items_page(looks: Sequence[ReviewItem], pictures: str, sheet_id: str) -> str:
@@ -437,7 +464,14 @@ def review_items_page(looks: Sequence[ReviewItem], pictures: str, sheet_id: str)
 def _entry(look: ReviewItem) -> Entry:
     truth = f"; ground truth: {look.automatic}" if look.automatic else ""
     head = f"{look.item_id}, {look.scene}, {', '.join(look.methods)}"
-    return Entry(head, look.text, (f"{look.reason}, {look.ask}: {_review_reason(look)}{truth}",), look.pictures)
+    comments = (f"comment, {_of_each(look.comments)}",) if look.comments else ()
+    lines = (f"{look.reason}, {look.ask}: {_of_each(look.answers)}{truth}", *comments)
+    return Entry(head, look.text, lines, look.pictures)
+
+
+def is_right_by_majority(look: ReviewItem) -> bool:
+    """Whether more than half of the annotators answer right, so that a tie settles nothing."""
+    return 2 * sum(answer == RIGHT for answer in look.answers.values()) > len(look.answers)
 
 
 def disputed_csv(key: Key, looks: Iterable[ReviewItem]) -> str:

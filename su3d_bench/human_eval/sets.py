@@ -1,4 +1,4 @@
-"""Create a set of sheets from drafts: shuffle, number, assign to annotators; write HTML page, workbook and CSV."""
+"""Create a set of sheets from drafts: shuffle, number, assign to annotators; write HTML page, CSV and workbook."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.errors import ConfigError, ModelMissing, printable
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.table import csv_lines
@@ -25,10 +25,10 @@ from su3d_bench.human_eval.items import PICTURES, AnnotatorShare, Key, KeyItem, 
 from su3d_bench.reports.sheet.page import page_html
 
 # These include the columns of an answers file; those that annotators need not see are hidden.
-COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")
+COLUMNS = ("item_id", "picture", "text", "asked", "answer", "comment", "question", "sheet_id", "annotator", "check")
 HIDDEN = ("question", "sheet_id", "annotator", "check")
-LETTERS = dict(zip(COLUMNS, "ABCDEFGHI", strict=True))
-WIDTHS = {"item_id": 11, "picture": 88, "text": 34, "asked": 30, "answer": 17}  # in characters
+LETTERS = dict(zip(COLUMNS, "ABCDEFGHIJ", strict=True))
+WIDTHS = {"item_id": 11, "picture": 88, "text": 34, "asked": 30, "answer": 17, "comment": 30}  # in characters
 HEADER_ROW = 3
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of every file in a workbook
 PICTURE_WIDTH = 600  # pixels as shown; the file has more
@@ -38,12 +38,19 @@ FONT = "Calibri"  # the font of a plain cell; without a name a bold cell gets a 
 HEAD_FILL, OPEN_FILL = "FF1857B8", "FFFFF4CC"
 
 
+def has_openpyxl() -> bool:
+    """Whether workbooks can be written."""
+    try:
+        import openpyxl  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
 def workbook_bytes(sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, bytes], title: str) -> bytes:
     """A deterministic XLSX file of the sheet; needs the ``sheets`` extra."""
-    try:
-        from openpyxl import Workbook
-    except ImportError as error:
-        raise ModelMissing("writing a workbook needs the sheets extra; pip install 'su3d-bench[sheets]'") from error
+    from openpyxl import Workbook
+
     book = Workbook()
     page = book.active
     page.title = "answers"
@@ -68,12 +75,12 @@ def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mappin
         for name in item.asks:
             row += 1
             ask = sheet.ask(name)
-            values = (item.id, "", item.text, ask.text, "", name, sheet.id, share.name, item.check)
+            values = (item.id, "", item.text, ask.text, "", "", name, sheet.id, share.name, item.check)
             for column, value in enumerate(values, 1):
                 cell = text_cell(page, row, column, value)
                 cell.alignment = Alignment(wrap_text=True, vertical="top")
             answer = page.cell(row, COLUMNS.index("answer") + 1)
-            answer.protection = Protection(locked=False)
+            answer.protection = page.cell(row, COLUMNS.index(items.COMMENT) + 1).protection = Protection(locked=False)
             if ask.choices not in lists:
                 lists[ask.choices] = _choice_list(ask.choices)
             lists[ask.choices].add(answer)
@@ -184,7 +191,7 @@ def _without_time(content: bytes) -> bytes:
             if name == "docProps/core.xml":
                 member = re.sub(rb"(<dcterms:(?:created|modified)[^>]*>)[^<]*", rb"\g<1>" + stamp, member)
             entry = zipfile.ZipInfo(name, date_time=ZIP_EPOCH)
-            entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
+            entry.compress_type = zipfile.ZIP_STORED if name.endswith(".jpeg") else zipfile.ZIP_DEFLATED
             new.writestr(entry, member)
     return buffer.getvalue()
 
@@ -207,14 +214,14 @@ def make_sheets(
 ) -> GeneratedSheets:
     """The set of all ``drafts``, assigned evenly to ``annotators``; a share ``overlap`` of it goes to all of them.
 
-    ``origin``: the key without an id and items; ``drawn``: the picture of each draft, a PNG.
+    ``origin``: the key without an id and items; ``drawn``: the picture of each draft, a JPEG.
     """
     check_split(len(drafts), annotators, overlap)
     random = np.random.default_rng(seed)
     order = np.argsort(random.permutation(len(drafts))).tolist()
     chosen = [drafts[k] for k in order]
     ids = [f"item-{number:04d}" for number in range(1, len(order) + 1)]
-    pictures = {f"{item_id}.png": drawn[k] for item_id, k in zip(ids, order, strict=True)}
+    pictures = {f"{item_id}.jpg": drawn[k] for item_id, k in zip(ids, order, strict=True)}
     digests = [digest_bytes(content) for content in pictures.values()]
     shown = list(zip(ids, chosen, pictures, digests, strict=True))
     contents = [[item_id, draft.text, list(draft.asks), digest] for item_id, draft, _, digest in shown]
@@ -275,7 +282,8 @@ def write_sheets(made: GeneratedSheets, folder: Path, key_folder: Path) -> list[
     for share in made.sheet.annotators:
         own = folder / share.name
         files[own / PAGE] = page_html(title, page_data(made, share)).encode()
-        files[own / WORKBOOK] = workbook_bytes(made.sheet, share, made.pictures, title)
+        if has_openpyxl():
+            files[own / WORKBOOK] = workbook_bytes(made.sheet, share, made.pictures, title)
         files[own / TABLE] = table_csv(made.sheet, share).encode()
     _check_same_sheets(made.sheet.id, folder, key_folder, files)
     for path in (folder, key_folder, folder / PICTURES):
@@ -311,7 +319,7 @@ def page_data(made: GeneratedSheets, share: AnnotatorShare) -> dict[str, Any]:
     return {
         "id": made.sheet.id,
         "annotator": share.name,
-        "columns": list(items.ANSWER_COLUMNS),
+        "columns": [*items.ANSWER_COLUMNS, items.COMMENT],
         "guide": list(items.guide_of(made.sheet)),
         "asks": [asdict(ask) for ask in made.sheet.asks],
         "items": [
@@ -329,10 +337,10 @@ def page_data(made: GeneratedSheets, share: AnnotatorShare) -> dict[str, Any]:
 
 def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     """The table of one annotator, answers to be filled in; text that looks like a formula starts with ``'``."""
-    rows: list[tuple[str, ...]] = [(*items.ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
+    rows: list[tuple[str, ...]] = [(*items.ANSWER_COLUMNS, items.COMMENT, "picture", "text", "asked", "choices")]
     for item in sheet.items_of(share):
         for name in item.asks:
             ask = sheet.ask(name)
             shown = (f"../{PICTURES}/{item.pictures[0]}", " / ".join(item.text.split("\n")), ask.text)
-            rows.append((sheet.id, item.id, share.name, name, "", item.check, *shown, " | ".join(ask.choices)))
+            rows.append((sheet.id, item.id, share.name, name, "", item.check, "", *shown, " | ".join(ask.choices)))
     return csv_lines(rows)

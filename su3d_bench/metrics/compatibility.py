@@ -183,6 +183,11 @@ def truth_incompatibility(rules: ProtocolRules, truth: TruthFacts) -> str | None
     return None
 
 
+def needs_map(rules: ProtocolRules) -> bool:
+    """Whether a protocol scores masks over vertices only as a map of the points of these vertices."""
+    return rules.needs_own_points and not rules.uses_names and not rules.needs_places
+
+
 def content_incompatibility(rules: ProtocolRules, content: ContentFacts, *, has_points: bool = True) -> str | None:
     """Why such a prediction cannot be scored under a protocol; ``has_points``: ground truth has coordinates."""
     if rules.needs_own_points and not has_points:

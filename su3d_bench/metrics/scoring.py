@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.arguments import typed
 from su3d_bench.core.errors import DataError, PredictionError, printable
 from su3d_bench.core.files.atomic import DAMAGE, read_arrays
 from su3d_bench.core.interfaces import Encoder
@@ -81,6 +82,7 @@ def metric_of(rules: ProtocolRules) -> Metric[Any]:
     return METRICS[rules.kind](rules)
 
 
+@typed
 def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
     """The additive counts of one scene under one protocol.
 
@@ -189,6 +191,7 @@ def plain_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+@typed
 def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_intervals: bool = True) -> ProtocolResult:
     """The protocol's values over the scenes of ``scores``, whose order does not matter.
 

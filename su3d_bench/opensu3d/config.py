@@ -1,6 +1,6 @@
 """Parameters of OpenSU3D: those the paper fixes and those it leaves open, with their defaults.
 
-Defaults are the paper's (section IV-A) where it states one; comments mark our own choices.
+Defaults are the paper's (section III-A) where it states one; comments mark our own choices.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 from su3d_bench.perception.cache import FrameCache, cached_regions, content_key, crop_images
 from su3d_bench.perception.detections import Assembler, captioned
 from su3d_bench.perception.language.captioner import Captioner
+from su3d_bench.perception.language.chat import PRESETS
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS
@@ -24,7 +25,8 @@ from su3d_bench.perception.models.masks.grounded_sam import (
 )
 
 # opensu3d.tex, section IV-A.
-PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h", "gpt-4-vision-preview"
+PAPER_ENCODER, PAPER_SEGMENTER = "clip-vit-h-14", "sam-vit-h"
+PAPER_VISION_MODEL = PRESETS["paper"]["vision_model"]
 
 
 def paper_deviations(
@@ -86,7 +88,8 @@ class PaperPerception:
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         assert needs.masks != "none", "the runner asks nothing for a method that needs no masks"
         regions = cached_regions(self._segmenter(needs), frame, self._cache, False, timer)
-        describe = captioned if self._captioner is None else self._described
+        # A region without a name is not an object that the paper's model was asked for.
+        describe = captioned if self._captioner is None or needs.masks != "grounded" else self._described
         return self._assembler.assemble(frame, regions, needs, timer, describe=describe)
 
     def regions(self) -> RegionPerception:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Protocol
 
@@ -9,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
+from su3d_bench.core.system.devices import gpu_memory_bytes
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import (
     Detections,
@@ -30,6 +32,7 @@ from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperCon
 from su3d_bench.perception.oracle import OracleConfig, OraclePerception
 from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerception
 from su3d_bench.perception.stored_masks import LabelImages
+from su3d_bench.perception.unit_costs import gpu_memory_gb
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
 # Replies of vision models, below the cache's folder, so that a rerun sends no request twice.
@@ -121,6 +124,34 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
     from su3d_bench.perception.models.loading import is_front_end_available
 
     return "paper" if is_front_end_available(config.paper, config.models) else "embedded"
+
+
+def models_of(profile: str, config: PerceptionConfig) -> list[str]:
+    """The foundation models that a profile, not ``auto``, loads, by their names in the catalogue."""
+    from su3d_bench.perception.models.loading import DETECTOR, PAPER_ENCODER, TAGGER
+
+    is_paper = profile == "paper"
+    encoder = config.models.encoder or (PAPER_ENCODER if is_paper else EMBEDDED)
+    tagger = [] if config.paper.tagger == "words" else [TAGGER]
+    return [
+        *([] if encoder == EMBEDDED else [encoder]),
+        *([config.paper.segmenter, DETECTOR, *tagger] if is_paper else []),
+    ]
+
+
+# While one process builds its map on the CPU, another uses the GPU. Kernels of different processes take turns, so a
+# third adds memory and hardly any speed: networks take most of an update's time (see unit_costs.toml).
+MAX_PROCESSES_PER_GPU = 2
+
+
+def default_jobs(profile: str, config: PerceptionConfig) -> int:
+    """Parallel jobs unless requested otherwise: one per CPU core; with foundation models on GPUs at most two per GPU,
+    one if two do not fit into its memory."""
+    n_cores = os.cpu_count() or 1
+    models = models_of(profile, config)
+    memory = gpu_memory_bytes(config.models.device) if models else []
+    need = 1e9 * gpu_memory_gb(models)
+    return min(n_cores, sum(max(1, min(MAX_PROCESSES_PER_GPU, int(total / need))) for total in memory) or n_cores)
 
 
 def check_models(profile: str, config: PerceptionConfig) -> None:

@@ -10,7 +10,7 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, pri
 from su3d_bench.formats.torch_files import SparseTensor
 from su3d_bench.predictions import dense, hovsg, masks, objects
 from su3d_bench.predictions import scannet_text as text
-from su3d_bench.predictions.base import Reader, file_format, folder_format
+from su3d_bench.predictions.base import Content, Reader, file_format, folder_format
 from su3d_bench.predictions.run_predictions import OWN_RUNS, of_method
 from su3d_bench.predictions.scannet_text import text_format
 from su3d_bench.store.records import RunRecord, read_record
@@ -68,6 +68,7 @@ _ALL = (
     # FROSS's scene graphs of all scenes in one file, with the classes and predicates of ReplicaSSG
     Reader("fross", objects.looks_like_fross, objects.fross_scenes, objects.fross, "scene graph"),
 )
+IN_MEMORY = "arrays in memory"  # instead of a format and a path
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 
 
@@ -109,6 +110,13 @@ class Match:
     scene: str
     name: str
     source: Source
+
+
+def memory_sources(contents: Mapping[str, Content]) -> list[Source]:
+    """The one source of maps in memory, by scene."""
+    places = dict.fromkeys(contents, Path(IN_MEMORY))
+    reader = Reader(IN_MEMORY, lambda _: None, lambda _: places, lambda _, scene: (contents[scene], ()))
+    return [Source(Path(IN_MEMORY), reader, tuple(contents))]
 
 
 def open_sources(paths: Sequence[Path], format: str | None, method: str | None = None) -> list[Source]:

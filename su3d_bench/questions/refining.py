@@ -2,14 +2,15 @@
 
 The file of labels n' is stored next to a map, which itself stays unchanged. The paper's filter of large background
 objects is applied again under labels n': "Large background objects (walls, ground, roof, ceiling) and objects with
-bounding boxes > 95 % of image area are excluded" (section IV, Filtering and Post-Processing); labels n' "help to filter
-out undesired large instances" (the text beside Table V).
+bounding boxes > 95 % of image area are excluded" (section III-A, Filtering and Post-Processing); labels n' "help to
+filter out undesired large instances" (the text beside Table V).
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -30,6 +31,7 @@ from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_o
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.parsing import chosen_name
+from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder
 
 _OF_IMAGES = OpenSU3DConfig()
@@ -151,6 +153,7 @@ class ModelRefiner:
                 max_answer_tokens=min(config.max_answer_tokens, MAX_ANSWER_TOKENS),
                 temperature=config.temperature,
                 seed=config.seed,
+                reasoning_effort=config.reasoning_effort,
             )
             for top in tops
             if top.names
@@ -225,7 +228,7 @@ class NameRecords(BaseModel):
         who = f"the model {self.model}" if self.refiner == "model" else "the vote"
         return RefinedNames(
             tuple(record.refined for record in self.names),
-            f"{who} of su3d-bench runs refine, names of {self.top_m} views",
+            f"{who} of the refiner, names of {self.top_m} views",
             tuple(record.left_out for record in self.names),
         )
 
@@ -290,6 +293,20 @@ def read_records(job: JobFolder) -> NameRecords | None:
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
         raise StoreError(f"{path}: does not belong to the map {job.prediction.name}; run su3d-bench runs refine again")
     return records
+
+
+def refine_by_model(job: JobFolder, model: LanguageModel, config: LanguageConfig) -> None:
+    """Store labels n' by the text model with a map that has names per view, unless they are there."""
+    with suppress(StoreError):  # those of another map
+        known = read_records(job)
+        if known is not None and (known.refiner, known.model) == ("model", config.text_model):
+            return
+    instances = read_prediction(job.prediction)
+    if isinstance(instances, Instances) and instances.view_names is not None:
+        tops = top_names(instances, MAX_NAMES)
+        refined = ModelRefiner(model, config).refine(tops)
+        by = config.text_model, MAX_NAMES, FilterConfig()
+        write_records(job, records_of(job, instances, tops, refined, "model", *by))
 
 
 def refined_digest(job: JobFolder) -> dict[str, str]:

@@ -429,7 +429,7 @@ def _listed(objects: Objects) -> str:
 
 
 # Settings of the language model that affect an answer; times, prices and limits do not.
-ANSWER_SETTINGS = {"text_model", "temperature", "seed", "max_answer_tokens", "context_tokens"}
+ANSWER_SETTINGS = {"text_model", "temperature", "seed", "max_answer_tokens", "context_tokens", "reasoning_effort"}
 FEW_OBJECTS = 1  # always given, however small the model's context
 
 
@@ -534,6 +534,7 @@ def ask_request(context: Context, question: str, config: LanguageConfig) -> Chat
         max_answer_tokens=config.max_answer_tokens,
         temperature=config.temperature,
         seed=config.seed,
+        reasoning_effort=config.reasoning_effort,
     )
 
 

@@ -1,7 +1,7 @@
 """Bundles: runs in one archive with SHA-256 digests (and recipe and tables of a reproduction), and their verification.
 
 A zip without compression, with members sorted by name and a fixed date and mode: the same folder gives the same bytes
-on every machine. Predictions are already compressed.
+on every machine, apart from the date in the manifest of ``bundle_runs``. Predictions are already compressed.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import stat
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Literal
 
@@ -22,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from su3d_bench.analysis.rescoring import TOLERANCE, check_dataset_ground_truth, rescored
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, shown
 from su3d_bench.core.files import atomic
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
 from su3d_bench.core.registry import CEILING_METHOD
@@ -52,6 +53,7 @@ _FILE_OF_RUN = re.compile(
 MAX_HEADER_BYTES = 160  # of a member beside its content and its two names, and at the end of the archive
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # the first line of the specification's pointer files
 _SAFE = re.compile(r"[^/\\:\x00-\x1f\x7f]+(/[^/\\:\x00-\x1f\x7f]+)*")
+LINK = r"^(https://[^\s<>\"']+)?$"
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -68,7 +70,7 @@ class Manifest(BaseModel):
     """The contents of a bundle; ``runs`` are the folders of its runs.
 
     ``recipe`` is empty if the runs are not from a recipe; ``trained_on``: training data of the weights, as stated by
-    the creator of the bundle.
+    the creator of the bundle, as are ``authors`` and ``link``; ``date``: of the bundle, ISO 8601.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -79,6 +81,9 @@ class Manifest(BaseModel):
     runs: tuple[str, ...]
     files: dict[str, Entry]
     trained_on: Annotated[str, Field(max_length=MAX_REMARK_CHARACTERS)] = ""
+    authors: Annotated[str, Field(max_length=MAX_REMARK_CHARACTERS)] = ""
+    link: Annotated[str, Field(max_length=MAX_REMARK_CHARACTERS, pattern=LINK)] = ""
+    date: Annotated[str, Field(pattern=r"^(\d{4}-\d\d-\d\d)?$")] = ""
 
 
 def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Path], out: Path) -> None:
@@ -87,8 +92,13 @@ def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Pat
     _write(place, runs, {**temporary_path, RECIPE: recipe_file}, {"recipe": recipe})
 
 
-def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
-    """Write the archive of any finished ``runs`` to ``place``; ``StoreError`` if two folders have the same name."""
+def bundle_runs(place: Path, runs: Sequence[Path], **stated: str) -> None:
+    """Write the archive of any finished ``runs`` to ``place``, with today's date and other fields of ``Manifest``.
+
+    Raises ``StoreError`` if two folders have the same name, ``ConfigError`` for an invalid ``link``.
+    """
+    if not re.match(LINK, stated.get("link", "")):
+        raise ConfigError(f"--link '{printable(stated['link'], 100)}': expected an address that starts with https://")
     whole = [Path(os.path.abspath(folder)) for folder in runs]
     names = [folder.name for folder in whole]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -97,8 +107,8 @@ def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None
     bad = next((name for name in names if not is_safe(name)), None)
     if bad is not None:
         raise StoreError(f"'{printable(bad, 100)}': this run name is not valid on other systems; rename its folder")
-    remark = {"trained_on": printable(trained_on, MAX_REMARK_CHARACTERS)} if trained_on else {}
-    _write(place, whole, {}, {"recipe": "", **remark})
+    remarks = {name: printable(text, MAX_REMARK_CHARACTERS) for name, text in stated.items() if text}
+    _write(place, whole, {}, {"recipe": "", "date": f"{datetime.now(UTC):%Y-%m-%d}", **remarks})
 
 
 def _write(place: Path, runs: Sequence[Path], temporary_path: Mapping[str, Path], about: Mapping[str, str]) -> None:

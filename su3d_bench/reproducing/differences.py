@@ -398,7 +398,7 @@ def _of_run(experiment: Experiment, run: FinishedRun, out: Path, device: str) ->
             for text in experiment.queries:
                 ranking = rank(prediction, text, encoder)
                 first = [(prediction.names[k], float(ranking.similarity[k])) for k in ranking.order[:SHOWN]]
-                lines = [f"{place}. {name}  {value:.3f}" for place, (name, value) in enumerate(first, 1)]
+                lines = [f"{place}. {value:.3f} {name}" for place, (name, value) in enumerate(first, 1)]
                 picture = out / f"{text.replace(' ', '-')}-{method.replace('@', '-')}.png"
                 draw_heat_map(prediction, ranking.similarity, picture, f'{scene}, {method}: "{text}"', lines)
                 yield picture

@@ -5,22 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
 from su3d_bench.core.errors import ModelMissing, Su3dError, counted
 from su3d_bench.core.system.devices import require_installed
+from su3d_bench.core.version import documentation
 from su3d_bench.fetching.sources import built_in
 from su3d_bench.formats.tables.table import Table, text_table
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.perception.language.client import check_key
 from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName
 from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.loading import DETECTOR, PACKAGES, TAGGER
-from su3d_bench.perception.profiles import PerceptionConfig
+from su3d_bench.perception.models.loading import PACKAGES, TAGGER
+from su3d_bench.perception.profiles import PerceptionConfig, models_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
+from su3d_bench.runs.executors import ELSEWHERE
 from su3d_bench.runs.frame_loop import surface_of
-from su3d_bench.runs.job import build_method
-from su3d_bench.runs.plan import method_part, named_method
+from su3d_bench.runs.job import Part, build_method
+from su3d_bench.runs.plan import asks_language_model, method_part, named_method
 from su3d_bench.runs.scenes import data_root
 
 PAPER = "paper"
@@ -30,7 +34,7 @@ OPTIONAL_MODELS = (TAGGER,)  # without RAM++, a word list provides the detector'
 
 @dataclass(frozen=True)
 class Need:
-    """One requirement of runs: ``kind`` is package, model, scene, data (of all scenes), mesh or truth.
+    """One requirement of runs: ``kind`` is package, model, key, scene, data (of all scenes), mesh or truth.
 
     ``n_bytes``: download size, None if unknown.
     ``is_required`` false: the run works without it, and ``remark`` explains how.
@@ -59,11 +63,11 @@ class Preflight:
         return asdict(self)
 
 
-def preflight(runs: Sequence[RecipeRun]) -> Preflight:
+def preflight(runs: Sequence[RecipeRun], out: Path) -> Preflight:
     """The requirements of ``runs``; no frames are read, nothing is written and no server is contacted."""
     needs: dict[tuple[str, str], Need] = {}
     for run in runs:
-        for need in (*_models(run), *_data(run)):
+        for need in (*_models(run), *language_needs(run, out), *_data(run)):
             needs.setdefault((need.kind, need.name), need)
     return Preflight(tuple(needs.values()))
 
@@ -74,7 +78,7 @@ def _fetched(dataset: str) -> tuple[float | None, str]:
         if source.group == dataset and source.scenes is not None:
             mean = None if source.n_bytes is None else source.n_bytes / source.scenes.n_scenes
             return mean, f"su3d-bench datasets fetch {source.group}"
-    return None, "see docs/datasets.md"
+    return None, f"see {documentation('datasets')}"
 
 
 def _data(run: RecipeRun) -> Iterator[Need]:
@@ -103,12 +107,22 @@ def _data(run: RecipeRun) -> Iterator[Need]:
             yield Need("data", source.name, is_available=False, n_bytes=source.n_bytes, how=how)
 
 
+def _settings(run: RecipeRun) -> Settings:
+    bases = {named_method(text).base for text in run.methods}
+    device = Setting(("perception", "models", "device"), run.device, "--device")
+    return Settings((device,) if run.device else ()) + read_assignments(
+        run.settings, tuple({*run.methods, *bases}), (run.dataset,)
+    )
+
+
+def parts_of(run: RecipeRun) -> list[Part]:
+    """The methods of a run with their settings."""
+    return [method_part(named_method(text), _settings(run)) for text in run.methods]
+
+
 def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
     """The scan's mesh, if it is missing and a method requires it."""
-    named = [named_method(text) for text in run.methods]
-    settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
-    methods = {one.name: build_method(method_part(one, settings)) for one in named}
-    asking = [name for name, method in methods.items() if getattr(method, "needs_surface", False)]
+    asking = [part.name for part in parts_of(run) if getattr(build_method(part), "needs_surface", False)]
     if not asking:
         return
     try:
@@ -137,14 +151,34 @@ def _truths(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Need
         yield Need("truth", name, is_available=False, how=gives, is_required=not left, remark=remark)
 
 
+def perception_of(run: RecipeRun) -> PerceptionConfig:
+    """The perception settings of a run."""
+    config: PerceptionConfig = resolve(_settings(run), ("perception",), PerceptionConfig)
+    return config
+
+
+def asks(run: RecipeRun) -> list[str]:
+    """What a run asks language models for: captions, question_solver, refiner."""
+    uses_captions = run.profile == PAPER and perception_of(run).paper.captions == "model"
+    return [*(["captions"] if uses_captions else []), *asks_language_model(run.values)]
+
+
+def language_needs(run: RecipeRun, out: Path) -> Iterator[Need]:
+    """The missing key of the language model, if requests would be sent."""
+    has_replies = run.values.get("offline") or (run.folder(out) / "language").is_dir()
+    if not asks(run) or has_replies or run.values.get("executor") in ELSEWHERE:
+        return
+    key = perception_of(run).language.key_variable
+    try:
+        check_key(perception_of(run).language)
+    except ModelMissing as error:
+        yield Need("key", key, is_available=False, how=f"export {key}=...", remark=str(error))
+
+
 def _models(run: RecipeRun) -> Iterator[Need]:
     """Packages and weights of the profile ``paper``, and any encoder other than the embedded one."""
-    methods = {named_method(method).base for method in run.methods}
-    settings = read_assignments(run.settings, tuple({*methods, *run.methods}), (run.dataset,))
-    config = resolve(settings, ("perception",), PerceptionConfig)
-    names = [run.encoder] if run.encoder != "embedded" else []
-    if run.profile == PAPER:
-        names += [config.paper.segmenter, DETECTOR, *([] if config.paper.tagger == "words" else [TAGGER])]
+    config = perception_of(run)
+    names = models_of(run.profile, config)
     for package in PACKAGES if names else ():
         try:
             require_installed(package, "profile 'paper'")
@@ -163,12 +197,13 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     if name == TAGGER:  # its original checkpoint requires its own package
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
-    remark = "" if is_required else "a fixed list of words replaces its tags of the image, unlike in the paper"
+    remark = "" if is_required else f"replaced by the {config.paper.n_tags} most likely words of a list, by the encoder"
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
         how = f"su3d-bench models fetch {'--profile paper' if name in FETCHED_FOR_PAPER else name}"
+        how += ", then tools/export_onnx.py ram-plus" if forms == ("onnx",) else ""
         return Need("model", name, is_available=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_available=True, n_bytes=0.0, remark=str(files.folder))
 

@@ -31,7 +31,16 @@ from su3d_bench.runs.ablation import ablation_rows, write_rows
 from su3d_bench.runs.executors import Report
 from su3d_bench.runs.existing import Into
 from su3d_bench.runs.job import build_dataset, part_of
-from su3d_bench.runs.plan import Plan, asked_settings, make_plan, named_method
+from su3d_bench.runs.plan import (
+    ASKS,
+    USES_LANGUAGE,
+    Plan,
+    asked_settings,
+    asks_language_model,
+    flag_of,
+    make_plan,
+    named_method,
+)
 from su3d_bench.runs.runner import RunResult, run_plan
 from su3d_bench.runs.scenes import data_root, split_address
 
@@ -272,6 +281,8 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
     usual = asked.encoder or recipe.encoder
     runs = []
     for (dataset, encoder, stride), mine in parts.items():
+        protocols = _joined(_fitting(one, dataset) for one, _ in mine)
+        unused = {name for name in ASKS if not any(USES_LANGUAGE[name](load_protocol(one)) for one in protocols)}
         named = dataset, encoder if encoder != usual else "", f"stride{stride}" if stride else ""
         run = RecipeRun(
             name="-".join(filter(None, named)),
@@ -281,14 +292,17 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
             stride=stride,
             scenes=_joined(scenes for _, scenes in mine),
             methods=_joined(methods_of(one) for one, _ in mine),
-            protocols=_joined(_fitting(one, dataset) for one, _ in mine),
+            protocols=protocols,
             settings=(*recipe.settings, f"perception.models.encoder={encoder}", *asked.assignments),
             experiments=tuple(one.name for one, _ in mine),
             rows=_joined(sweep_rows(one) for one, _ in mine),
             device=asked.device,
-            values=dict(asked.values),
+            values={name: value for name, value in dict(asked.values).items() if name not in unused},
         )
         runs += [run] if run.methods else []
+    for name in asks_language_model(dict(asked.values)):
+        if not any(name in run.values for run in runs):
+            raise ConfigError(f"{flag_of(name)}: no requested table uses it; add --tables reasoning")
     return tuple(runs)
 
 

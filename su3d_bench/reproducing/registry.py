@@ -5,24 +5,29 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_order, ranked
+from su3d_bench.core import registry as plugins
 from su3d_bench.core.config import NEUTRAL_SETTINGS, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
-from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
+from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
 from su3d_bench.core.system.files import opened
 from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
+from su3d_bench.reports.pictures.maps import thumbnail
 from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, copy_pieces, unpack, verify_bundle
+from su3d_bench.runs.catalogue import about_method
 from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JOBS, RECORDS
 
 UNKNOWN = "unknown: run.toml is incomplete"
@@ -109,7 +114,7 @@ class Row(RankingRow):
 
     ``update_s`` and ``map_s``: median time per frame after the first ones of a scene, with and without perception; None
     if no frame was timed. ``encoder``: the encoder whose features named the instances, None if the method did.
-    ``values_of_scenes``: scene -> one value per headline metric.
+    ``values_of_scenes``: scene -> one value per headline metric. ``picture``: PNG of the first map, if requested.
     """
 
     bundle: BundleFacts
@@ -127,6 +132,10 @@ class Row(RankingRow):
     changed: tuple[str, ...]
     caveat: str
     warnings: tuple[str, ...]
+    authors: str
+    link: str
+    date: str
+    picture: bytes | None
 
     @property
     def what(self) -> str:
@@ -139,13 +148,13 @@ class Row(RankingRow):
         return self.stated_training_data or "; ".join(known) or (USES_GROUND_TRUTH if self.is_ceiling else NOT_STATED)
 
 
-def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
+def rows_of_bundle(file: Path, *, with_pictures: bool = False) -> tuple[list[Row], list[Refused]]:
     """The rows of the bundle in ``file``, and its scores that cannot be ranked.
 
     Raises ``StoreError`` if it is not a bundle.
     """
     with TemporaryFolder("su3d-bundle-") as folder:
-        unpacked = unpack(file, folder, keep=_is_row_file)
+        unpacked = unpack(file, folder, keep=_kept(with_pictures))
         manifest = unpacked.manifest
         facts = BundleFacts(
             printable(file.stem, 120),
@@ -161,11 +170,29 @@ def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
         return rows, [replace(one, reason=one.reason.replace(f"{folder}/", "")) for one in refused]
 
 
-def _is_row_file(name: str) -> bool:
-    parts = name.split("/")
-    if name == MANIFEST or parts[0] != RUNS:
-        return False
-    return (len(parts) == 3 and parts[2] in RECORDS) or (parts[2:3] == [JOBS] and parts[-1] in ROW_FILES)
+def _kept(with_pictures: bool) -> Callable[[str], bool]:
+    """Whether a file is needed: records, files of rows, and for pictures the first map of each run and method."""
+    drawn = set[tuple[str, str]]()
+
+    def keep(name: str) -> bool:
+        parts = name.split("/")
+        if name == MANIFEST or parts[0] != RUNS:
+            return False
+        if with_pictures and parts[-1] == "prediction.npz" and (parts[1], parts[-2]) not in drawn:
+            drawn.add((parts[1], parts[-2]))
+            return True
+        return (len(parts) == 3 and parts[2] in RECORDS) or (parts[2:3] == [JOBS] and parts[-1] in ROW_FILES)
+
+    return keep
+
+
+def _picture(run: FinishedRun, method: str) -> bytes | None:
+    """The picture of the first unpacked map of ``method``; None if there is none or it cannot be drawn."""
+    for file in (run.folder.job(scene, method).prediction for scene in run.scenes):
+        if is_file(file):
+            with suppress(Su3dError):
+                return thumbnail(read_prediction(file))
+    return None
 
 
 def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
@@ -196,6 +223,11 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
     stages = {stage.name: stage for stage in summarise(times, WARM_UP).stages} if times else {}
     per_scene = record.result.per_scene
     is_elsewhere = entry.method in run.external
+    manifest = unpacked.manifest
+    name = entry.method.partition("@")[0]
+    is_known = not is_elsewhere and name in plugins.names("method")
+    about = about_method(name, plugins.load("method", name)) if is_known else {}
+    source = re.search(r"https://[^\s;,]+", about.get("source") or "")
     return Row(
         **vars(entry),
         bundle=bundle,
@@ -208,7 +240,11 @@ def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: Bundle
         hardware=NOT_STATED if is_elsewhere else printable(run.record.hardware, 200),
         encoder=None if record.encoder is None else printable(record.encoder, 80),
         weights=() if is_elsewhere else tuple(_weights(run, record.encoder, record.profile)),
-        stated_training_data=printable(unpacked.manifest.trained_on, 400),
+        stated_training_data=printable(manifest.trained_on, 400),
+        authors=printable(manifest.authors or about.get("paper") or NOT_STATED, 400),
+        link=manifest.link or (source[0] if source else ""),
+        date=manifest.date,
+        picture=_picture(run, entry.method),
         command=command_of(run, entry.method),
         code=printable(run.record.code, 80),
         commit="" if run.record.git is None else printable(run.record.git.commit, 80),
@@ -328,7 +364,7 @@ def bundle_files(folder: Path) -> list[Path]:
     return files
 
 
-def read_registry(folder: Path) -> Registry:
+def read_registry(folder: Path, *, with_pictures: bool = False) -> Registry:
     """The registry in ``folder``, with each file checked against its manifest and each number against its counts.
 
     Maps are only scored again in ``add_bundle``. Of two conflicting rows, the one with the later bundle name is
@@ -342,7 +378,7 @@ def read_registry(folder: Path) -> Registry:
     rows: list[Row] = []
     refused: list[Refused] = []
     for file in files:
-        mine, others = _read(file)
+        mine, others = _read(file, with_pictures=with_pictures)
         refused += others
         for row in mine:
             reason = conflict_with(row, rows)
@@ -353,10 +389,10 @@ def read_registry(folder: Path) -> Registry:
     return Registry(len(files), tuple(_boards(rows)), tuple(refused))
 
 
-def _read(file: Path) -> tuple[list[Row], list[Refused]]:
+def _read(file: Path, *, with_pictures: bool = False) -> tuple[list[Row], list[Refused]]:
     name = printable(file.name, 120)
     try:
-        rows, refused = rows_of_bundle(file)
+        rows, refused = rows_of_bundle(file, with_pictures=with_pictures)
     except Su3dError as error:
         return [], [Refused(name, "bundle", printable(str(error).replace(f"{shown(file)}: ", ""), 400))]
     return rows, [replace(one, run=f"{name} {one.run}") for one in refused]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
 from su3d_bench.core.files.locks import is_unfinished
@@ -26,7 +28,8 @@ MAX_ADDRESS_CHARACTERS = 500
 TITLE = "Registry of results"
 ROW_FIELDS = (  # fields of a row that pages show unchanged
     "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
-    "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run",
+    "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run", "authors", "link",
+    "date",
 )  # fmt: skip
 
 
@@ -96,6 +99,9 @@ def _value(registry: Registry, title: str, address: str | None) -> dict[str, Any
     return {
         "title": title,
         "n_bundles": registry.n_bundles,
+        "pictures": {
+            digest_bytes(row.picture)[:16]: base64.b64encode(row.picture).decode() for row in rows if row.picture
+        },
         "boards": boards,
         "methods": [
             {"name": name, "page": _page(METHODS, name), "n_rows": sum(row.method == name for row in rows)}
@@ -147,6 +153,7 @@ def _row(row: Row, address: str | None) -> dict[str, Any]:
     return {
         **{name: getattr(row, name) for name in ROW_FIELDS},
         "page": _page(METHODS, row.method),
+        "picture": None if row.picture is None else digest_bytes(row.picture)[:16],
         "times": AS_SUBMITTED,
         "of_scenes": dict(row.values_of_scenes),
         "weights": [{**asdict(one), "files": dict(one.files)} for one in row.weights],
@@ -177,7 +184,10 @@ def _method_page(value: Mapping[str, Any], method: Mapping[str, Any]) -> dict[st
         for board in value["boards"]
     ]
     pages = {scene["name"]: scene["page"] for scene in value["scenes"]}
-    return {"name": method["name"], "boards": [board for board in boards if board["rows"]], "scene_pages": pages}
+    boards = [board for board in boards if board["rows"]]
+    shown = {row["picture"] for board in boards for row in board["rows"]}
+    pictures = {name: picture for name, picture in value["pictures"].items() if name in shown}
+    return {"name": method["name"], "boards": boards, "scene_pages": pages, "pictures": pictures}
 
 
 def _scene_page(value: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
@@ -203,6 +213,8 @@ def _plain_tables(registry: Registry) -> Table | Prose:
                 Cell(NOT_MEASURED if row.update_s is None else f"{row.update_s:.3g}"),
                 Cell(row.hardware),
                 Cell(row.trained_on),
+                Cell(row.authors),
+                Cell(row.date or NOT_MEASURED),
                 Cell(f"{row.bundle.name}{SUFFIX} {row.bundle.sha256}"),
             ),
             group=row.protocol,
@@ -211,7 +223,8 @@ def _plain_tables(registry: Registry) -> Table | Prose:
     ]
     if not rows:
         return Prose(("This registry has no rows.",))
-    columns = ("protocol", "values", "rank", "scenes", "s per frame", "hardware", "weights trained on", "bundle")
+    facts = ("hardware", "weights trained on", "authors", "date", "bundle")
+    columns = ("protocol", "values", "rank", "scenes", "s per frame", *facts)
     return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
 
 

@@ -179,7 +179,8 @@ def _changed_values(existing: ExistingRun, now: Request) -> list[str]:
 def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
     """Whether the value at ``path`` can affect a number of the request with these ``values``."""
     if path[:2] == ("perception", "language"):
-        return values.get(("question_solver",)) == "llm" and path[2:3] in [(name,) for name in ANSWER_SETTINGS]
+        is_asked = values.get(("question_solver",)) == "llm" or values.get(("refiner",)) == "model"
+        return is_asked and path[2:3] in [(name,) for name in ANSWER_SETTINGS]
     return not ".".join(path).startswith(NOT_IN_KEY)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from su3d_bench.core import interfaces, types
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Proposals, starts_of
 from su3d_bench.core.safe_output import one_line, plain_text
 from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
@@ -89,19 +90,15 @@ def warm_up(method: interfaces.Method) -> None:
     intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
     frame = types.Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
     detections = _detections(frame, method.needs, n=1, dim=1)
-    method.start(types.SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
+    points = back_project(depth_m, intrinsics, np.eye(4), depth_m > 0).astype(np.float32)
+    surface = types.Surface(points, np.zeros((0, 3), np.int32))
+    scene = types.SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera", read_surface=lambda: surface)
+    method.start(scene)
     for _ in range(N_WARM_UP):
         method.update(frame, detections, Timer())
     method.finish()
     if isinstance(method, interfaces.Closable):
         method.close()
-
-
-def surface_of(dataset: interfaces.Dataset, scene: str) -> types.Surface:
-    """The mesh of a scene without labels; ``DataError`` if its dataset has none."""
-    if not isinstance(dataset, interfaces.HasSurface):
-        raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh, which this method needs")
-    return dataset.surface(scene)
 
 
 def true_proposals(truth: types.GroundTruth) -> Proposals:

@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import RunConfig, Settings, flatten, resolve
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import Method, UsesGroundTruth
 from su3d_bench.core.maps import Prediction
@@ -165,7 +165,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
     key |= {f"input.{name}": digest for name, digest in attribute_of(method, "inputs", {}).items()}
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
-        if digest := custom_code_key(target):
+        if digest := registry.code_key(target):
             key[f"code.{kind}"] = digest
     return (
         key
@@ -187,11 +187,6 @@ class ConfiguredMethods:
             method = build_method(part)
             self._known[job.dataset, part] = method, config_key(job, part, method)
         return self._known[job.dataset, part]
-
-
-def custom_code_key(target: str) -> str | None:
-    """A key of the file of a user-defined dataset or method, which is not part of the program's code."""
-    return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def check_same_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:

@@ -30,11 +30,18 @@ from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
+from su3d_bench.core.types import ImageDomain
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
-from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
+from su3d_bench.metrics.protocols.loading import (
+    ALL_PROTOCOLS,
+    headline_protocols,
+    load_protocol,
+    protocol_names,
+    protocols_for,
+)
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.language.client import check_key
-from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
+from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models, default_jobs, resolve_profile
 from su3d_bench.runs.executors import ELSEWHERE, check_execution
 from su3d_bench.runs.existing import (
     ExistingRun,
@@ -52,7 +59,6 @@ from su3d_bench.runs.job import (
     Part,
     SceneJob,
     check_same_run,
-    custom_code_key,
     options_model,
     part_of,
 )
@@ -236,16 +242,21 @@ def make_plan(
     ceiling = None if CEILING_METHOD in named else part_of("method", CEILING_METHOD, settings)
     datasets = {target: part_of("dataset", target, settings) for target in targets.values()}
     protocols = protocols_of_run(config.protocols, list(datasets))
-    if config.question_solver == "llm" and not any(map(asks_questions, protocols.values())):
-        raise ConfigError("--question-solver llm: needs a reasoning protocol, such as --protocols rooms-reasoning")
+    asked = asks_language_model(config.model_dump())
+    rules = [load_protocol(name) for names in protocols.values() for name in names]
+    for name in asked:
+        if not any(map(USES_LANGUAGE[name], rules)):
+            raise ConfigError(f"{flag_of(name)}: needs a reasoning protocol, such as --protocols rooms-reasoning")
     if place is None:
         place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
         existing = existing_run(place.folder.path)
     if place.url is None:
         place.folder.check_is_run_folder()
-    uses_captions = config.profile == "paper" and of_perception.paper.captions == "model"
+    domain: ImageDomain = "rendered-rooms" if set(targets) == {"rooms"} else "camera"
+    profile = resolve_profile(config.profile, domain, of_perception)
+    uses_captions = profile == "paper" and of_perception.paper.captions == "model"
     has_replies = config.offline or (place.folder.path / "language").is_dir()  # else requests are sent
-    if (config.question_solver == "llm" or uses_captions) and not has_replies and config.executor not in ELSEWHERE:
+    if (asked or uses_captions) and not has_replies and config.executor not in ELSEWHERE:
         check_key(of_perception.language)
     root = os.environ.get("SU3D_DATA") or ""
     with data_place(root) if is_url(root) else nullcontext(DataPlace(data_root())) as data_root_here:
@@ -268,8 +279,8 @@ def make_plan(
         )
         for index, (target, scene) in enumerate(chosen)
     )
-    n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
-    n_workers = min(config.jobs or n_here, len(jobs))
+    n_here = config.jobs or (len(jobs) if config.executor in ELSEWHERE else default_jobs(profile, of_perception))
+    n_workers = min(n_here, len(jobs))
     notes += tuple(_notes_on_protocols(protocols, config.protocols))
     plan = Plan(config, settings, place, jobs, n_workers, notes, data, existing)
     try:
@@ -365,10 +376,15 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
 
 
 def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Dataset target -> protocols that score it: the requested ones that fit it, or its own if none is requested."""
+    """Dataset target -> protocols that score it: the requested ones that fit it, by default its headline protocol.
+
+    ``ALL_PROTOCOLS`` requests those of ``usual_protocols``.
+    """
+    usual = {target: usual_protocols(target) for target in targets}
     if not wanted:
-        return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
-    wanted = list(dict.fromkeys(wanted))
+        return {target: headline_protocols(registry.load("dataset", target)) or usual[target] for target in targets}
+    are_all = ALL_PROTOCOLS in wanted
+    wanted = [name for name in dict.fromkeys(wanted) if name != ALL_PROTOCOLS]
     rules = [load_protocol(name) for name in wanted]
     _check_unique_names("--protocols", [(rule.name, rule) for rule in rules])
     truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
@@ -377,25 +393,30 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
         if len(reasons) == len(truths):
             raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(name for name, one in zip(wanted, rules, strict=True) if not truth_incompatibility(one, truth))
+        target: tuple(dict.fromkeys([
+            *(usual[target] if are_all else ()),
+            *(name for name, one in zip(wanted, rules, strict=True) if not truth_incompatibility(one, truth)),
+        ]))
         for target, truth in truths.items()
-    }
+    }  # fmt: skip
 
 
-def _usual_protocols(dataset: Any) -> tuple[str, ...]:
-    """The protocols of a dataset; if no protocol names it, those that fit its ground truth."""
-    if own := protocols_for(dataset.name):
-        return tuple(own)
-    truth = TruthFacts.of_dataset(dataset)
-    known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
-    return tuple(rules.name for rules in known if truth.variants and truth_incompatibility(rules, truth) is None)
+def usual_protocols(target: str) -> tuple[str, ...]:
+    """The protocols of a dataset, its headline first; if no protocol names it, those that fit its ground truth."""
+    dataset = registry.load("dataset", target)
+    own = protocols_for(dataset.name)
+    if not own and dataset.variants:
+        truth = TruthFacts.of_dataset(dataset)
+        known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
+        own = [rules.name for rules in known if truth_incompatibility(rules, truth) is None]
+    return tuple(dict.fromkeys([*headline_protocols(dataset), *own]))
 
 
 def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
     """Notes on which protocols score user-defined datasets, if none was requested."""
     for target, names in protocols.items():
         dataset = registry.load("dataset", target)
-        if wanted or not dataset.variants or protocols_for(dataset.name):
+        if wanted or not dataset.variants or protocols_for(dataset.name) or headline_protocols(dataset):
             continue
         if names:
             yield f"{dataset.name}: scored under all protocols that fit its ground truth; choose with --protocols"
@@ -404,14 +425,27 @@ def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence
         yield f"{dataset.name}: no protocol fits its {truth}; create a custom one: su3d-bench protocols new FILE"
 
 
-def asks_questions(protocols: Sequence[str]) -> bool:
-    """Whether one of ``protocols`` asks questions about the map."""
-    return any(load_protocol(name).answers is not None for name in protocols)
+# Settings of a run that ask a language model, with the value that does, and the protocols that they affect.
+ASKS = {"question_solver": "llm", "refiner": "model"}
+USES_LANGUAGE: Mapping[str, Callable[[ProtocolRules], bool]] = {
+    "question_solver": lambda rules: rules.answers is not None,
+    "refiner": lambda rules: rules.uses_names,
+}
+
+
+def flag_of(name: str) -> str:
+    """The option that asks a language model."""
+    return f"--{name.replace('_', '-')} {ASKS[name]}"
+
+
+def asks_language_model(values: Mapping[str, Any]) -> list[str]:
+    """The settings among ``values`` that ask a language model."""
+    return [name for name, value in ASKS.items() if values.get(name) == value]
 
 
 def _run_name(config: RunConfig, methods: Sequence[Part], datasets: Sequence[Part], perception: str) -> str:
     request = config.model_dump(mode="json", exclude=set(NEUTRAL_SETTINGS))
     options = [part.options for part in (*methods, *datasets)]
-    own = [digest for part in (*methods, *datasets) if (digest := custom_code_key(part.target))]
+    own = [digest for part in (*methods, *datasets) if (digest := registry.code_key(part.target))]
     key = digest_json([request, options, perception, code_digest(), *own])[:8]
     return "-".join([*(part.name for part in datasets), config.profile, key])

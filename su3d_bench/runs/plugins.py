@@ -20,7 +20,7 @@ from su3d_bench.core.errors import PlugInError, Su3dError, printable, user_code_
 from su3d_bench.core.interfaces import ABILITIES, INTERFACES
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.system.files import user_folder
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.store.predictions import array_fault, prediction_arrays, value_fault
 
 # The types in which arrays are stored. Arrays of the same kind are converted, those of another kind are rejected.
@@ -45,10 +45,6 @@ ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
 def validation_error(found: Any) -> str | None:
     """What is wrong with a returned value of the right type; None if it is valid."""
     match found:
-        case SceneInfo():
-            return _fault_of_choice("image_domain", found.image_domain, get_args(types.ImageDomain))
-        case PerceptionNeeds():
-            return _fault_of_choice("masks", found.masks, ("grounded", "class-agnostic", "none"))
         case Frame():
             depth = found.depth_m
             is_metres = not depth.size or (depth.min() >= 0 and depth.max() < np.inf)  # NaN is neither
@@ -80,24 +76,15 @@ def in_stored_form(found: Any) -> Any:
     return replace(found, **changed) if changed else found
 
 
-def _fault_of_choice(name: str, value: Any, known: Sequence[str]) -> str | None:
-    return None if value in known else f"{name} is {value!r}; expected one of {', '.join(map(repr, known))}"
-
-
 def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
     for name, row in ARRAYS[type(found)].items():
         value, form = getattr(found, name), np.dtype(FORMS[name])
-        if not isinstance(value, np.ndarray):
-            return f"{name} is {_kind_of(value)}; expected an array of {form}"
         if value.dtype != form or value.shape != (len(value), *row):
             return f"{name} is {value.dtype} {value.shape}; expected {form} {('N', *row)}"
         if not np.isfinite(value).all():
             return f"{name} has values that are not finite"
         if name.startswith("instance") and value.size and value.min() < 0:
             return f"{name} has {value.min()}; ids start at 1, and 0 means none"
-    labels = getattr(found, "labels", None)
-    if not isinstance(found, Surface) and not isinstance(labels, types.LabelSet):
-        return f"labels is {_kind_of(labels)}; expected a LabelSet"
     return None
 
 

@@ -28,11 +28,11 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth, pack_scores, score_located
-from su3d_bench.perception.language.chat import ReplyStore
+from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.questions.ground_truths import question_truth
-from su3d_bench.questions.refining import refined_names
+from su3d_bench.questions.refining import refine_by_model, refined_names
 from su3d_bench.questions.solver import MapSolver, by_language_model
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import not_scored_lines
@@ -187,13 +187,15 @@ class _Scene:
         raise missing[0]
 
     @cached_property
+    def language(self) -> tuple[ChatClient, LanguageConfig]:
+        """The language model of questions and labels n', and its settings."""
+        config = PerceptionConfig.model_validate_json(self.job.perception).language
+        return ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.config.offline), config
+
+    @cached_property
     def solver(self) -> MapSolver | None:
         """The solver that answers questions about maps; None: the built-in solver."""
-        if self.job.config.question_solver == "built-in":
-            return None
-        config = PerceptionConfig.model_validate_json(self.job.perception).language
-        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.config.offline)
-        return by_language_model(client, config)
+        return None if self.job.config.question_solver == "built-in" else by_language_model(*self.language)
 
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only if its completion record is missing or does not match."""
@@ -214,6 +216,8 @@ class _Scene:
             log.recall(folder.remarks("predict"))
         else:
             self._predict(part, inputs, folder, key, log)
+        if self.job.config.refiner == "model" and any(load_protocol(name).uses_names for name in self.job.protocols):
+            refine_by_model(folder, *self.language)
         score_key = inputs.score_key(key, folder)
         if not inputs.is_scored(folder, folder.completion_records().get("score"), score_key):
             self._score(part, inputs, folder, score_key, log)
@@ -239,7 +243,6 @@ class _Scene:
             tools = interfaces.SceneTools(
                 frames=frame_loop.FirstFrames(frames, n),
                 regions=frame_loop.TimedRegions(inputs.perception.regions(), clock),
-                surface=partial(frame_loop.surface_of, self.dataset, self.job.scene_name),
                 true_proposals=self._true_proposals if method.needs.true_proposals else None,
             )
             with clock.running("start"):
@@ -258,8 +261,10 @@ class _Scene:
             self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)), clock
         )
         try:
+            has_surface = isinstance(self.dataset, interfaces.HasSurface)
+            read_surface = partial(self.dataset.surface, self.job.scene_name) if has_surface else None
             with clock.running("start"):
-                method.start(inputs.info)
+                method.start(replace(inputs.info, read_surface=read_surface))
             with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
                 for share in shares:
                     feeding.feed_until(math.ceil(share * n), ahead, n)

@@ -101,7 +101,7 @@ def expand_scenes(
     for address in addresses:
         target, pattern = split_address(address)
         dataset = build_dataset(datasets[target], root) if target in datasets else None
-        scenes = [] if dataset is None else _matching_scenes(dataset, pattern)
+        scenes = _matching_scenes(dataset, pattern) if dataset is not None and pattern else []
         if not scenes and os.path.exists(address):
             ignored.append(address)
         elif not scenes:

@@ -6,6 +6,7 @@ and however often a run was killed and resumed.
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -26,14 +27,14 @@ from su3d_bench.core.system.timing import hardware_line, processor_digest
 from su3d_bench.metrics.compatibility import labels_counted
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.metric import SceneScore, n_predictions
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, more_protocols_line
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.run import Found, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, record_of_rules
 from su3d_bench.runs.job import MethodOutcome
-from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.plan import Plan, usual_protocols
 from su3d_bench.store import records
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -213,6 +214,10 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
             lines.append(f"{outcome.scene}: no ground-truth ceiling: {outcome.error}")
+    usual = {name for job in plan.jobs for name in usual_protocols(job.dataset.target)}
+    if not plan.config.protocols and (more := usual - {rules.name for rules in plan.rules}):
+        how = f"su3d-bench run --extend --all-protocols --out {shlex.quote(plan.place.name)}"
+        lines.append(more_protocols_line(more, how))
     return tuple(dict.fromkeys(lines))
 
 

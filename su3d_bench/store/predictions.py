@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.arguments import typed
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacing, row_blocks, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.files import regular
 
+Place = str | Path
 MAX_TEXTS = 1 << 20  # per field; each becomes a Python object
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
 # The dtype kind and shape of each field of a stored prediction, None for any length, in the order of the file.
@@ -142,7 +144,8 @@ def _write_rows(path: Path, table: NDArray[Any]) -> None:
             stream.write(np.ascontiguousarray(block).data)
 
 
-def read_prediction(path: Path) -> Prediction:
+@typed
+def read_prediction(path: Place) -> Prediction:
     """The prediction that a run stored at ``path``; features of a dense one are memory-mapped.
 
     Points are metres, (M, 3) float32. Raises ``StoreError`` or ``PredictionError`` for a damaged or missing file.
@@ -152,6 +155,7 @@ def read_prediction(path: Path) -> Prediction:
     >>> type(prediction).__name__, prediction.points.shape[1]
     ('Instances', 3)
     """
+    path = Path(path)
     arrays = read_npz(path)
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         arrays["features"] = _mapped_rows(features_beside(path))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from painted_runs import see_painted
 from places import ROOT, SCENES
+from pydantic import BaseModel
 
 import su3d_bench as su3d
 from su3d_bench.cli.main import main
@@ -221,9 +222,12 @@ def test_failed_scenes_raise_an_error_and_the_others_are_kept(tmp_path: Path, mo
             lambda: su3d.run("rooms/living0", settings={"opensu3d.top_m": object()}),
             r"run\(settings=...\): no TOML form",
         ),
-        (lambda: su3d.run("rooms/living0", into="other"), "expected one of own, extend, replace"),  # type: ignore[arg-type]
+        (lambda: su3d.run("rooms/living0", into="other"), "run: into is 'other'; expected one of 'own', 'extend'"),  # type: ignore[arg-type]
         (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions; pass a folder"),
-        (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),  # type: ignore[call-overload]
+        (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), "confidences is 'files'; expected one of"),  # type: ignore[call-overload]
+        (lambda: su3d.evaluate("x", datset="rooms"), "evaluate: got an unexpected keyword argument 'datset'"),  # type: ignore[call-overload]
+        (lambda: su3d.run("rooms/living0", su3d), "methods: expected one name or several, not <module"),  # type: ignore[arg-type]
+        (lambda: su3d.run("rooms/living0", dict), "'Config' is missing; a method has Config, finish"),
         (lambda: su3d.load_run("nowhere"), "nowhere: contains no run.json"),
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
@@ -235,6 +239,95 @@ def test_each_user_error_is_one_line(call: Any, line: str, here: Path) -> None:
     with pytest.raises(su3d.Su3dError, match=line) as raised:
         call()
     assert "\n" not in str(raised.value)
+
+
+WRONG: tuple[Any, ...] = (
+    None, 3, -1.5, "x", "a\0b", b"x", [], ["x", 3], {}, {"a": 1}, {"a": (None, np.zeros(2))}, object(), np.zeros(3),
+    np.array("x"), (), lambda: 1, type, float("nan"), 10**30,
+)  # fmt: skip
+FUNCTIONS = [name for name in su3d.__all__ if inspect.isfunction(getattr(su3d, name))]
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Run", "Frame", "GroundTruth", "Detections", "LabelSet", "Instances.of"])
+def test_values_of_any_type_are_accepted_or_a_typed_error(name: str, here: Path) -> None:
+    function = su3d.Instances.of if name == "Instances.of" else getattr(su3d, name)
+    parameters = inspect.signature(function).parameters.values()
+    required = [one.name for one in parameters if one.default is one.empty and one.kind != one.VAR_KEYWORD]
+    lines = list[str]()
+    for one in parameters:
+        for value in WRONG:
+            fine = {"scenes": "rooms/none9", "points": np.zeros((4, 3), np.float32), "masks": [[0, 1]]}
+            named = {other: fine.get(other, value) for other in required} | {one.name: value}
+            try:
+                function(**named if one.kind != one.VAR_KEYWORD else {"scenes": "rooms/none9", "seed": value})
+            except su3d.Su3dError as error:
+                lines.append(str(error))
+    assert all("\n" not in line for line in lines) and (lines or not required)
+
+
+# maps and classes in memory
+
+
+def test_arrays_score_as_their_files(here: Path) -> None:
+    files = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
+    masks = np.repeat([1, 0], 200)[:, None] > 0
+    arrays = masks, np.array([0.9]), np.array([5])
+    names = ("pred_masks", "pred_scores", "pred_classes")
+    for scene in (arrays, dict(zip(names, arrays, strict=True))):
+        found = su3d.evaluate({"scene0000_00": scene}, ground_truth="truth", protocols="scannet-instance")
+        assert found.metrics.equals(files.metrics)
+    run = su3d.evaluate(
+        {"mine": {"scene0000_00": arrays}, "files": "predictions"},
+        ground_truth="truth", protocols="scannet-instance", out="runs/arrays",
+    )  # fmt: skip
+    assert run.metrics.groupby("method")["value"].first().to_dict() == {"mine": 0.5, "files": 0.5}
+    for wrong, line in (((masks[:9], *arrays[1:]), "9 points"), ((masks, np.zeros(3)), "scores are an array of shape")):
+        with pytest.raises(su3d.Su3dError, match=line):
+            su3d.evaluate({"scene0000_00": wrong}, ground_truth="truth", protocols="scannet-instance")
+
+
+def test_map_of_a_run_scores_as_the_run(here: Path) -> None:
+    run = su3d.load_run("runs/demo")
+    scenes = {"rooms/bathroom7": run.prediction("rooms/bathroom7", "oracle")}
+    found = su3d.evaluate(scenes, dataset="rooms", protocols=BOTH)
+    assert set(found.metrics.query("is_headline")["value"]) == {1.0}
+
+
+def test_class_runs_in_this_process_and_reads_the_mesh(here: Path) -> None:
+    class Half:
+        """Half of the scan's mesh is one bed."""
+
+        name = "half"
+        Config = type("Config", (BaseModel,), {})
+
+        def __init__(self, config: Any) -> None:
+            self.needs = su3d.PerceptionNeeds(masks="none")
+
+        def start(self, scene: su3d.SceneInfo) -> None:
+            self.points = scene.surface().vertices
+
+        def update(self, frame: su3d.Frame, detections: su3d.Detections, timer: su3d.Timer) -> None:
+            """Frames change nothing."""
+
+        def finish(self) -> su3d.Instances:
+            return su3d.Instances.of(self.points, [np.arange(len(self.points) // 2)], labels=["bed"])
+
+    words: dict[str, Any] = {"settings": SMALL, "pictures": False, "out": "runs/half", "limit": 1}
+    run = su3d.run("rooms/bathroom7", Half, **words)
+    assert run.methods == ("half",) and run.protocols == ("rooms-semantic",)
+    assert any("4 more protocols apply: su3d-bench run --extend --all-protocols" in line for line in run.remarks)
+    assert len(run.prediction("rooms/bathroom7").points) > 1000
+    assert su3d.run("rooms/bathroom7", Half, **words).is_complete  # the same class resumes
+    for more in ({"jobs": 2}, {"executor": "processes"}):
+        with pytest.raises(su3d.Su3dError, match=r"a class runs in this process; use jobs=1, or save it"):
+            su3d.run("rooms/bathroom7", Half, **words, **more)
+    other = type("Half", (Half,), {"__qualname__": Half.__qualname__})
+    assert su3d.run("rooms/bathroom7", other, **words | {"out": "runs/other"}).methods == ("half",)
+
+
+def test_scene_without_mesh_is_one_line() -> None:
+    with pytest.raises(su3d.Su3dError, match="tum/desk: the dataset has no mesh, which this method needs"):
+        su3d.SceneInfo("tum", "desk", 1, 1, "camera").surface()
 
 
 # the notebook

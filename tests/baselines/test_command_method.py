@@ -19,8 +19,7 @@ from places import SCENES
 from su3d_bench.baselines.command.folders import FrameFolder, class_names
 from su3d_bench.baselines.command.method import Command, CommandConfig, check_placeholders
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.interfaces import SceneTools
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, SceneInfo, Surface
@@ -67,14 +66,8 @@ def fed(
     shots: Sequence[Frame] | None = None,
     scene: SceneInfo = SCENE,
 ) -> Command:
-    def give() -> Surface:
-        if surface is None:
-            raise DataError("rooms/a b: the dataset has no mesh")
-        return surface
-
     shots = frames() if shots is None else shots
-    one.receive_tools(SceneTools(shots, None, give))  # type: ignore[arg-type]
-    one.start(scene)
+    one.start(scene if surface is None else replace(scene, read_surface=lambda: surface))
     for frame in shots:
         one.update(frame, no_detections(frame, one.needs), Timer())
     return one

@@ -210,8 +210,8 @@ def ran(
     regions, counted = WallOfPatches(), CountedFrames(frames)
     surface = Surface(proposals.points, np.zeros((0, 3), np.int32))
     method = OpenMask3D(config)
-    method.receive_tools(SceneTools(counted, regions, lambda: surface, lambda: proposals))
-    method.start(SCENE)
+    method.receive_tools(SceneTools(counted, regions, lambda: proposals))
+    method.start(replace(SCENE, read_surface=lambda: surface))
     for one in frames:
         method.update(one, no_detections(one, method.needs), Timer())
     return method, method.finish(), counted, regions
@@ -325,8 +325,8 @@ class TestVariants:
         sizes = {}
         for cls in (OpenMask3D, OpenMask3DSegment3D):
             method = cls(cls.Config(**shared))
-            method.receive_tools(SceneTools((), WallOfPatches(), lambda: surface))
-            method.start(SCENE)
+            method.receive_tools(SceneTools((), WallOfPatches()))
+            method.start(replace(SCENE, read_surface=lambda: surface))
             sizes[cls.name] = np.diff(method.finish().indptr).tolist()
         assert sizes == {"openmask3d": [41], "openmask3d-segment3d": [20]}  # of two equal parts floor(0.8 * 2) stay
 

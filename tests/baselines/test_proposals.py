@@ -25,10 +25,9 @@ from su3d_bench.baselines.openmask3d.proposals import (
     voted_by_segments,
 )
 from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
-from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.interfaces import SceneTools
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Proposals
-from su3d_bench.core.types import Surface
+from su3d_bench.core.types import SceneInfo, Surface
 
 MASKS = np.array([[1, 1, 0, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)  # two overlap, one is empty
 SCENE: dict[str, Any] = {
@@ -221,19 +220,14 @@ class TestTree:
         assert sorted(len(mask) for mask in masks_of(found)) == [18, 18]
 
 
-def tools(surface: Surface | None, truth: Proposals | None = None) -> SceneTools:
-    def give() -> Surface:
-        if surface is None:
-            raise DataError("tum/desk: the dataset has no mesh; this method works on one")
-        return surface
-
-    return SceneTools((), None, give, None if truth is None else lambda: truth)  # type: ignore[arg-type]
+def scene_with(surface: Surface) -> SceneInfo:
+    return SceneInfo("rooms", "room0", 1, 1, "camera", read_surface=lambda: surface)
 
 
 class TestConfig:
     def test_true_proposals_are_mapped_to_the_nearest_vertices_with_overlaps(self) -> None:
         truth = made_proposals(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
-        found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
+        found = make_proposals(ProposalConfig(proposals="oracle"), scene_with(flat()), lambda: truth)
         assert masks_of(found) == [[0, 1, 2, 3], [2, 3, 4, 5]] and found.source == "made"  # 3 is 0.9 from 2.1
         assert OpenMask3D(OpenMask3DConfig(proposals="oracle")).caveat is None
 
@@ -244,6 +238,6 @@ class TestConfig:
         for split, expected in (("surface", [[0, 1, 4, 5]] * 3), ("never", [[0, 1, 4, 5]] * 3),
                                 ("always", [[0, 1], [4, 5]] * 3)):  # fmt: skip
             config = ProposalConfig(proposals_folder=tmp_path, split_parts=split, part_eps_m=1.0)  # type: ignore[arg-type]
-            assert masks_of(make_proposals(config, tools(surface), "rooms", "room0")) == expected
+            assert masks_of(make_proposals(config, scene_with(surface), None)) == expected
         method = OpenMask3D(OpenMask3DConfig(proposals_folder=tmp_path))
         assert method.caveat is None and list(method.inputs) == ["proposals"]

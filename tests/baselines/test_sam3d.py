@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +10,7 @@ import pytest
 from plates import Plate, axis, contents, look
 
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.maps import Instances, Proposals
+from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo, Surface
 
@@ -28,21 +26,9 @@ def plate(low: float, high: float, k: int = 0, name: str = "left") -> Plate:
 LEFT, RIGHT = plate(-0.6, 0.0), plate(0.0, 0.6, name="right")
 
 
-def tools_with(surface: Callable[[], Surface]) -> SceneTools:
-    def no_proposals() -> Proposals:
-        raise AssertionError("SAM3D makes its own masks")
-
-    return SceneTools((), None, surface, no_proposals)  # type: ignore[arg-type]
-
-
-def no_mesh() -> Surface:
-    raise DataError("made/plates: the dataset has no mesh")
-
-
 def run(views: Views, config: SAM3DConfig = TREE, surface: Surface | None = None) -> SAM3D:
     method = SAM3D(config)
-    method.receive_tools(tools_with(no_mesh if surface is None else lambda: surface))
-    method.start(SCENE)
+    method.start(SCENE if surface is None else replace(SCENE, read_surface=lambda: surface))
     for frame, detections in views:
         method.update(frame, detections, Timer())
     return method

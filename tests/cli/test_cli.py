@@ -1,21 +1,25 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import json
+import os
 import re
 import shlex
 import subprocess
 import sys
+from email import message_from_string
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fuzz_words import verbs
-from places import SCENES
+from places import ROOT, SCENES
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.output import answer_either, file_name_of, file_name_of_scene
 from su3d_bench.core.errors import EXIT_INTERNAL, ConfigError
+from su3d_bench.core.version import documentation
 from su3d_bench.reports.pictures import maps
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -56,6 +60,40 @@ def test_simple_commands_import_no_heavy_modules(words: list[str], unneeded: tup
     assert done.stdout.splitlines()[-1].split() == ["loaded:", "0"], done.stderr
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("su3d-bench re", {"report", "reproduce"}),
+        ("su3d-bench query ", {"text", "ask", "make", "show", "audit", "score"}),
+        ("su3d-bench report tables runs/demo --format ", {"text", "markdown", "latex", "csv", "html"}),
+        ("su3d-bench run rooms/liv", {"rooms/living0", "rooms/living1"}),
+        ("su3d-bench run --scenes re", {"replica/"}),
+        ("su3d-bench run --methods conceptg", {"conceptgraphs", "conceptgraphs-detector"}),
+        ("su3d-bench evaluate p --protocols rooms-se", {"rooms-semantic"}),
+        ("su3d-bench evaluate p --dataset scan", {"scannet", "scannetpp"}),
+        ("su3d-bench compare runs/b runs/", {"runs/a", "runs/b"}),
+        ("su3d-bench report bundle runs/a --out pap", {"paper.zip"}),
+    ],
+)
+def test_shell_completes_commands_and_values_without_heavy_imports(
+    line: str, words: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in ("runs/a/run.json", "runs/b/run.json", "paper.zip"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text("")
+    found = tmp_path / "found"
+    environment = {
+        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
+        "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_COMP_WORDBREAKS": " ",
+    }  # fmt: skip
+    program = [sys.executable, "-X", "importtime", "-m", "su3d_bench"]
+    done = subprocess.run(program, env=os.environ | environment, check=True, capture_output=True, text=True)
+    assert not {row.rpartition("|")[2].strip() for row in done.stderr.splitlines()} & set(HEAVY)
+    assert words <= {word.strip() for word in found.read_text().split("\n")}
+    assert not {"run", "evaluate"} & {word.strip() for word in found.read_text().split("\n")}
+
+
 def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -69,7 +107,18 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
     assert rules.digest in text
 
 
-@pytest.mark.parametrize(("words", "prog"), [("", ""), ("help", ""), ("report", " report"), ("help run", " run")])
+@pytest.mark.parametrize(
+    ("words", "prog"),
+    [
+        ("", ""),
+        ("help", ""),
+        ("report", " report"),
+        ("help run", " run"),
+        ("help report tables", " report tables"),
+        ("report help", " report"),
+        ("dev cache help", " dev cache"),
+    ],
+)
 def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 0
     assert capsys.readouterr().out.startswith(f"usage: su3d-bench{prog} [-h]")
@@ -307,3 +356,76 @@ def test_undefined_number_is_null_in_json(capsys: pytest.CaptureFixture[str]) ->
     arguments = argparse.Namespace(json=True, json_file=None)
     answer_either(arguments, {"x": [float("nan"), (float("inf"), 1.5)]}, "words")
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"x": [None, [None, 1.5]]}
+
+
+def test_data_option_replaces_the_environment_variable_for_workers_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "other"))
+    (tmp_path / "here").mkdir()
+    assert main(["datasets", "list", "--data", "here", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["data_root"] == os.environ["SU3D_DATA"] == str(tmp_path / "here")
+    for words in (["run", "--scenes", "replica/*"], ["evaluate", "here"], ["datasets", "check", "replica/*"]):
+        assert main([*words, "--data", "nowhere"]) == 2
+        error = capsys.readouterr().err
+        assert "--data nowhere: no such folder" in error and error.count("\n") == 1
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "nowhere"))
+    for words in (["run", "--scenes", "replica/room0"], ["datasets", "check", "replica/room0"]):
+        assert main(words) == 2
+        assert f"no scene in {tmp_path / 'nowhere'} (there is no such folder)" in capsys.readouterr().err
+
+
+def test_messages_name_pages_of_the_documentation_not_files_of_the_repository() -> None:
+    named = re.compile(r"\bdocs/[\w/-]+\.md")
+    for file in (
+        file for name in ("su3d_bench", "datasets", "baselines", "reports") for file in (ROOT / name).rglob("*")
+    ):
+        if file.suffix == ".py":
+            tree = ast.parse(file.read_text())
+            described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+            texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and id(node) not in described]
+            assert not [node.value for node in texts if named.search(str(node.value))], file
+        elif file.parent.name == "templates" or file.suffix in (".js", ".html"):
+            assert file.is_dir() or not named.search(file.read_text()), file
+
+
+@pytest.mark.parametrize(
+    ("fields", "place"),
+    [("", "page a/b of the documentation"), ("Project-URL: Documentation, https://x.org/y/\n", "https://x.org/y/a/b/")],
+)
+def test_address_of_the_documentation_is_that_of_the_package(
+    fields: str, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.metadata.metadata", lambda name: message_from_string(fields))
+    assert documentation("a/b") == place
+
+
+def test_other_systems_are_refused_in_one_line() -> None:
+    code = "import sys; sys.platform = 'win32'; import su3d_bench"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr == "su3d-bench: needs Linux or macOS; on Windows use WSL\n"
+
+
+@pytest.mark.parametrize("width_cm", [8, 17])
+def test_every_figure_has_its_printed_width_and_8_pt_type(width_cm: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--out", "runs/one"]) == 0
+    for words in (
+        "query text painted/a sofa --run runs/one --method collector",
+        "query ask painted/a 'How many chairs are there?' --run runs/one --method collector",
+        f"datasets show {PAINTED}/a",
+        "report attribution runs/one",
+        "protocols diff rooms-semantic replica-mesh-ex6 --run runs/one",
+        "sheets pictures runs/one --texts sofa",
+        "sheets pictures runs/one --draw labels",
+        "sheets pictures runs/one --draw reasoning --texts 'How many chairs are there?'",
+    ):
+        assert main([*shlex.split(words), "--out", "figure.svg", "--width", f"{width_cm}cm", "--quiet"]) == 0, words
+        text = Path("figure.svg").read_text(encoding="utf-8")
+        (width_pt,) = re.findall(r'<svg [^>]*width="([0-9.]+)pt"', text)
+        assert float(width_pt) == pytest.approx(width_cm / 2.54 * 72, abs=0.1), words
+        sizes = set(re.findall(r"font(?:-size)?: (?:[a-z0-9]+ )?([0-9.]+)px", text))
+        assert sizes <= {"8", "12"} and "8" in sizes, words  # 12: coloured squares of a legend
+        Path("figure.svg").unlink()
+    assert main(["query", "text", "painted/a", "sofa", "--width", "9cm"]) == 2
+    assert "unknown --width '9cm'" in capsys.readouterr().err

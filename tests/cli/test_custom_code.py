@@ -197,6 +197,9 @@ def test_templates_of_method_dataset_and_protocol_run_together(capsys: pytest.Ca
     scenes, methods = "own/my_rooms.py:MyRooms/*", "merge_all.py:MergeAll"
     assert main(["datasets", "check", scenes]) == 0
     assert capsys.readouterr().out.count(" s: OK\n") == 2
+    for command in (["datasets", "check"], ["datasets", "show"], ["run"]):
+        assert main([*command, scenes.removesuffix("/*")]) == 2
+        assert f"is a dataset; name its scenes, such as '{scenes}'" in capsys.readouterr().err
     words = ["run", "--scenes", scenes, "--methods", methods, "--profile", "oracle", "--jobs", "1", "--out", "run"]
     assert main([*words, "--no-pictures", "--protocols", "mine.toml"]) == 0
     assert results("run")["merge-all", "mine"]["AP25"] == 1.0

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,22 +60,3 @@ def test_library_that_crashes_does_not_crash_the_doctor(monkeypatch: pytest.Monk
     assert doctor.loaded("open3d") == ({}, "ended by signal 11 while it was loaded")
     assert doctor.loaded("numba")[1] == "ModuleNotFoundError: No module named 'no_such_module'"
     assert doctor.loaded("torch") == ({"gpus": []}, "")
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("su3d-bench re", {"report", "reproduce"}),
-        ("su3d-bench query ", {"text", "ask", "make", "show", "audit", "score"}),
-        ("su3d-bench report tables runs/demo --format ", {"text", "markdown", "latex", "csv", "html"}),
-    ],
-)
-def test_shell_completes_commands_and_choices(line: str, words: set[str], tmp_path: Path) -> None:
-    found = tmp_path / "found"
-    environment = {
-        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
-        "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_COMP_WORDBREAKS": " ",
-    }  # fmt: skip
-    subprocess.run([sys.executable, "-m", "su3d_bench"], env=os.environ | environment, check=True)
-    assert words <= {word.strip() for word in found.read_text().split("\n")}
-    assert not {"run", "evaluate"} & {word.strip() for word in found.read_text().split("\n")}

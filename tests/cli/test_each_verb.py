@@ -36,6 +36,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report timing": ("out --out timing", 0, "timing/timing.md"),
     "report html": ("out --no-maps --out page.html", 0, "page.html"),
     "report instances": ("out --out samples.csv", 0, "predicted instances"),
+    "report claims": ("out --out claims.md", 0, "claims.md"),
     "report rerun": ("out --out out.rrd", 0, "out.rrd"),
     "report leaderboard": ("out --out board.md", 0, "board.md"),
     "report bundle": ("out --out registry/bundles/mine.zip", 0, "registry/bundles/mine.zip"),

@@ -40,7 +40,7 @@ def test_list_shows_datasets_folders_scenes_and_how_to_get_missing_ones(
     text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
     assert (
-        "with su3d-bench datasets fetch replica frames, set SU3D_DATA to their folder, or create rooms in this" in text
+        "with su3d-bench datasets fetch replica frames, set SU3D_DATA to their folder, or create a room in this" in text
     )
 
 
@@ -50,6 +50,7 @@ def test_list_shows_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], 
         if traj is not None:
             (tmp_path / "data" / "Replica" / scene / "traj.txt").write_text(traj)
     (tmp_path / "data/replica_v1/room_0/habitat").mkdir(parents=True)
+    (tmp_path / "data/Replica/cam_params.json").touch()
     assert main(["datasets", "list", "--json"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["datasets"]}
     assert [row["scene"] for row in rows["replica"]["scenes"]] == ["replica/room0", "replica/room1"]
@@ -66,7 +67,7 @@ def test_generated_room_is_a_replica_scene_and_repeating_the_command_does_nothin
     assert main(words) == 0
     printed = capsys.readouterr()
     assert printed.out.split() == ["bathroom0", "generated", "replica/bathroom0"]
-    assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in printed.err
+    assert "su3d-bench run --data made --scenes 'replica/*'" in printed.err
     assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["scenes"] == [

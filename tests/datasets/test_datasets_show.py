@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,8 @@ from painted import Painted
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, look_at
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.reports.pictures.scene import draw_scene_picture, look_at
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,7 @@ def test_picture_shows_frames_classes_and_trajectory(whole: Path, tmp_path: Path
     draw_scene_picture(look_at(Replica(whole), "room0"), tmp_path / "new" / "room0.png")
     picture = pixels(tmp_path / "new" / "room0.png")
     height, width = picture.shape[:2]
-    assert width == WIDTH and 900 < height < 1400
+    assert width == 2007 and 900 < height < 1500  # 17 cm at 300 dpi
     assert n_near(picture, (0xD6, 0x24, 0x6E)) > 300  # the trajectory
     assert n_near(picture, (0x1A, 0x98, 0x50)) > 30  # its start
     assert sum(n_near(picture, rgb) > 1000 for rgb in COLOURS) >= 4  # the frames
@@ -80,7 +82,30 @@ def test_command_writes_the_picture_and_prints_counts(capsys: pytest.CaptureFixt
     assert lines[0].startswith("replica/room0: 12 frames of 48x36 · depth 1.")
     assert lines[0].endswith("6 objects of 3 classes · 23,600 ground-truth points (mesh-vertices)")
     assert lines[1] == "picture: replica-room0.png"
-    assert pixels(Path("replica-room0.png")).shape[1] == WIDTH
+    assert pixels(Path("replica-room0.png")).shape[1] == 2007
+
+
+def test_scan_without_recording_shows_its_ground_truth_or_mesh(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(whole, tmp_path / "data")
+    (tmp_path / "data/Replica/room0/traj.txt").unlink()
+    assert main(["datasets", "show", "replica/room0", "--data", "data"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("replica/room0: no frames") and "traj.txt is missing" in lines[1]
+    scan = tmp_path / "data/scans/scene0000_00"
+    scan.mkdir(parents=True)
+    assert main(["datasets", "show", "scannet/scene0000_00", "--data", "data"]) == 2
+    assert "scene0000_00_vh_clean_2.ply is missing" in capsys.readouterr().err
+    points = Replica(whole).ground_truth("room0", "mesh-vertices").points
+    corners = ListColumn(np.arange(0, len(points), 3), np.arange(len(points) // 3 * 3, dtype=np.int32))
+    vertex = PlyElement("vertex", len(points), {axis: points[:, k].copy() for k, axis in enumerate("xyz")})
+    face = PlyElement("face", len(points) // 3, {"vertex_indices": corners})
+    write_ply(scan / "scene0000_00_vh_clean_2.ply", [vertex, face])
+    assert main(["datasets", "show", "scannet/scene0000_00", "--data", "data"]) == 0
+    text = capsys.readouterr().out
+    assert "no frames" in text and "mesh of 23,600 vertices" in text and "no recording in" in text
+    assert n_near(pixels(Path("scannet-scene0000_00.png")), (214, 214, 210)) > 1000
 
 
 @pytest.mark.parametrize(

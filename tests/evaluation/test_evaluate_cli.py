@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 from evaluated_text import CHAIR, TABLE, scene, write_truth
 from prediction_files import write_scannet_text
 
+from su3d_bench.cli import output
 from su3d_bench.cli.main import main
 
 
@@ -28,11 +30,12 @@ WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocols", "scannet-i
 def test_table_has_values_with_interval_ceiling_and_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*WORDS, "--json", "out/numbers.json"]) == 0
     answer = capsys.readouterr()
-    assert answer.out.startswith("**scannet-instance** (version 1), 2 scenes\n")
+    assert answer.out.startswith("**scannet-instance (version 1)**\n")
     rows = {line.split("|")[1].strip(): line for line in answer.out.splitlines() if line.startswith("|")}
-    assert [cell.strip() for cell in rows["result"].split("|")[2:-1]] == ["75.0 [0.0, 100.0]"] * 3  # of two scenes
-    assert "| 100.0 " in rows["GT ceiling"]
-    assert "each mask under each class" in rows
+    cells = [cell.strip() for cell in rows["predictions"].split("|")[2:-1]]
+    assert cells == [*["75.0 [0.0, 100.0]"] * 3, "100.0 / 100.0 / 100.0", "2", "-"]  # of two scenes
+    assert "75.0 " in rows["predictions: mean over scenes"] and "predictions: each mask under each class" in rows
+    assert "the mean over scenes weights each scene equally" in answer.out
     assert (
         "- predictions per scene: 1.5 (1 to 2); near-duplicate pairs 0, identical pairs 0; confidences 0.8"
         in answer.out
@@ -53,6 +56,17 @@ def test_json_file_has_the_documented_form(capsys: pytest.CaptureFixture[str]) -
     assert one["per_class"]["table"] == {"ap": 0.5, "ap50": 0.5, "ap25": 0.5}
     assert one["per_class"]["sofa"]["ap"] is None
     assert one["per_scene"]["scene0001_01"]["ap"] == 0.5
+
+
+def test_long_evaluation_prints_lines_with_the_time_left_where_there_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(WORDS) == 0 and "steps" not in capsys.readouterr().err
+    monkeypatch.setattr(output, "LINE_EVERY_S", 1e-9)
+    assert main(WORDS) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("evaluate: ")]
+    assert re.fullmatch(r"evaluate: scene0001_00 done, 1 of 2 steps, about \d+ s left", lines[0])
+    assert lines[1:] == ["evaluate: scene0001_01 done, 2 of 2 steps"]
 
 
 WRONG = {
@@ -83,9 +97,17 @@ def test_oracle_on_rooms_scores_exactly_one(
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     run = ["run", "--scenes", "rooms/bathroom0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
-    assert main([*run, "--quiet"]) == 0
+    assert main(run) == 0
+    ran = capsys.readouterr()
+    assert "rooms-semantic" in ran.out and "rooms-instance" not in ran.out
+    assert "4 more protocols apply: su3d-bench run --extend --all-protocols --out run\n" in ran.err
+    assert main(["run", "--extend", "--all-protocols", "--out", "run", "--quiet"]) == 0
     capsys.readouterr()
-    assert main(["evaluate", "run", "--json", "out.json"]) == 0
+    assert main(["evaluate", "run"]) == 0
+    evaluated = capsys.readouterr()
+    assert "rooms-semantic" in evaluated.out and "rooms-instance" not in evaluated.out
+    assert "4 more protocols apply: --all-protocols\n" in evaluated.err
+    assert main(["evaluate", "run", "--all-protocols", "--json", "out.json"]) == 0
     protocols = json.loads(Path("out.json").read_text())["protocols"]
     assert {"rooms-instance", "rooms-semantic", "replica-openmask3d", "replica-mesh-ex6"} <= set(protocols)
     for name, one in protocols.items():

@@ -104,6 +104,7 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
         assert f"{method}: {line}" in explained["remarks"]
     latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--ceiling", "--intervals")
     assert f"value={ap['mine']!r}" in latex and "external predictions" in latex
+    assert "scenes are unreliable (here: 3)" in latex and "docs/" not in latex
     Path("paper.tex").write_text(latex)
     assert " 0 differ" in answered(capsys, "report", "verify", "paper.tex")
     answered(capsys, "report", "html", RUN, "--out", "page.html", "--no-errors")

@@ -9,7 +9,14 @@ import pytest
 
 import su3d_bench.human_eval.answers as module
 from su3d_bench.core.types import Int64Array
-from su3d_bench.human_eval.answers import agreement, cohen_kappa, fleiss_kappa, krippendorff_alpha
+from su3d_bench.human_eval.answers import (
+    agreement,
+    cohen_kappa,
+    fleiss_kappa,
+    gwet_ac1,
+    krippendorff_alpha,
+    ordinal_alpha,
+)
 
 # Fleiss 1971, Psychological Bulletin 76, table 1: 30 patients, 6 psychiatrists each, 5 diagnoses; kappa = .430
 FLEISS = """00060 03003 01401 00006 03030 20400 00402 20310 20040 00006 10050 11040 03300 10050 02031 00501 30012 51000
@@ -50,6 +57,28 @@ def test_krippendorffs_alpha_matches_the_published_examples(observers: tuple[str
     assert krippendorff_alpha(counts_of(*observers)) == pytest.approx(alpha, abs=5e-4)
 
 
+def test_ordinal_alpha_matches_the_published_example_and_a_hand_worked_one() -> None:
+    assert ordinal_alpha(counts_of(*WITH_GAPS)) == pytest.approx(0.815, abs=5e-4)  # Krippendorff 2011, example C
+    # totals 3, 2, 3: mean ranks 1.5, 4, 6.5; neighbours differ by 6.25, ends by 25 (squared)
+    observed, expected = 2 * 6.25 + 2 * 6.25, (2 * 3 * 2 * 6.25 + 2 * 2 * 3 * 6.25 + 2 * 3 * 3 * 25) / 7
+    hand_worked = np.array([[2, 0, 0], [0, 1, 1], [0, 0, 2], [1, 1, 0]])
+    assert ordinal_alpha(hand_worked) == pytest.approx(1 - observed / expected)
+    far, near = np.array([[2, 0, 0], [0, 0, 2], [1, 0, 1]]), np.array([[2, 0, 0], [0, 0, 2], [1, 1, 0]])
+    assert (ordinal_alpha(near) or 0) > (ordinal_alpha(far) or 0)
+    # with two answers it is the nominal coefficient
+    assert ordinal_alpha(counts_of(*BINARY)) == pytest.approx(krippendorff_alpha(counts_of(*BINARY)))
+
+
+def test_ac1_matches_the_published_examples_and_a_hand_worked_one() -> None:
+    # README of the author's R package irrCAC: raw4raters (the ratings of WITH_GAPS) and 3x3abstractors
+    assert gwet_ac1(counts_of(*WITH_GAPS)) == pytest.approx(0.77544, abs=5e-6)
+    both = repeated([[13, 0, 0], [0, 20, 7], [0, 4, 56]])
+    assert gwet_ac1(counts_of(*("".join(one) for one in both))) == pytest.approx(0.8493305, abs=5e-8)
+    # shares 3/4 and 1/4: by chance 2 x 3/4 x 1/4 = 3/8; two of four items equal
+    assert gwet_ac1(np.array([[2, 0], [2, 0], [1, 1], [1, 1]])) == pytest.approx((1 / 2 - 3 / 8) / (1 - 3 / 8))
+    assert gwet_ac1(np.array([[2, 0, 0], [2, 0, 0]])) == 1.0  # where kappa is undefined
+
+
 def test_cohens_kappa_matches_the_published_example() -> None:
     # Cohen 1960, Educational and Psychological Measurement 20, table 1, as counts of 100: (.29 - .35) / .65 = -.092
     left, right = repeated([[25, 13, 12], [12, 2, 16], [3, 15, 2]])
@@ -64,8 +93,10 @@ def test_agreement_is_undefined_without_two_answers_or_items() -> None:
     assert cohen_kappa([], []) is None
     nothing = np.zeros((0, 2), np.int64)
     assert fleiss_kappa(nothing) is None
-    assert krippendorff_alpha(nothing) is None
-    assert krippendorff_alpha(np.array([[1, 0], [0, 1]])) is None  # no item with two answers
+    for coefficient in (krippendorff_alpha, ordinal_alpha, gwet_ac1):
+        assert coefficient(nothing) is None
+        assert coefficient(np.array([[1, 0], [0, 1]])) is None  # no item with two answers
+    assert ordinal_alpha(always) is None
 
 
 def test_all_agreement_coefficients_of_a_question() -> None:
@@ -76,7 +107,7 @@ def test_all_agreement_coefficients_of_a_question() -> None:
         "d": {"ann": "wrong", "bob": "wrong"},
         "e": {"cyn": "wrong"},
     }
-    found = agreement(ratings)
+    found = agreement(ratings, ("right", "wrong"), is_ordered=True)
     assert (found.n_annotators, found.n_items, found.n_equal) == (3, 4, 3)
     assert (found.n_fleiss, found.n_raters) == (3, 2)  # three items have two answers, one has three
     # of b, c, d: observed 2/3; right 1/6, wrong 5/6: by chance 26/36
@@ -88,14 +119,18 @@ def test_all_agreement_coefficients_of_a_question() -> None:
     assert (pairs["ann", "bob"].n, pairs["ann", "bob"].n_equal) == (4, 3)
     assert (pairs["ann", "cyn"].n, pairs["ann", "cyn"].kappa) == (1, None)
     # n = 9, right 4, wrong 5; disagreeing pairs of c: 2; 1 - 8 x 2 / (81 - 16 - 25)
-    assert found.alpha == pytest.approx(1 - 8 * 2 / 40)
+    assert found.alpha == found.ordinal_alpha == pytest.approx(1 - 8 * 2 / 40)
+    # right: 1, 0, 1/2, 0, 0 of the five items' answers; three of four items equal
+    by_chance = 2 * 0.3 * 0.7
+    assert found.ac1 == pytest.approx((3 / 4 - by_chance) / (1 - by_chance))
     assert found.interval is None  # four items
 
 
 def test_alpha_interval_is_a_jackknife_over_items() -> None:
     answers = ["rr", "ww", "rw", "rr", "ww", "rr", "wr", "rr", "ww", "rr", "rw"]
     ratings = {str(k): dict(zip("xy", both, strict=True)) for k, both in enumerate(answers)}
-    found = agreement(ratings)
+    found = agreement(ratings, ("r", "w"))
+    assert found.ordinal_alpha is None
     counts = np.array([[both.count("r"), both.count("w")] for both in answers])
     without = np.array([krippendorff_alpha(np.delete(counts, k, axis=0)) for k in range(11)], np.float64)
     assert found.alpha is not None

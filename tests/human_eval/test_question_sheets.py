@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.human_eval.answers import Judgement, check_key
 from su3d_bench.human_eval.drafts import question_drafts
 from su3d_bench.human_eval.items import (
+    ANSWER_COLUMNS,
     ARGUABLE,
     ASKS,
     RIGHT,
@@ -101,6 +103,16 @@ def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
 
 
+def test_workbooks_are_left_out_with_a_remark_without_openpyxl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
+    assert main([*words, "--out", "out"]) == 0
+    assert capsys.readouterr().err.startswith("without workbooks")
+    assert sorted(path.name for path in Path("out/annotator-1").iterdir()) == ["sheet.csv", "sheet.html"]
+
+
 # Scoring
 
 
@@ -139,8 +151,10 @@ def scored() -> tuple[Sheet, Key, Scores]:
 
 def test_question_score_is_the_worst_of_its_parts() -> None:
     sheet, _ = question_set(KINDS_ASKED)
-    whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB))]
+    whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB), 3)]
     assert whole == [RIGHT, ARGUABLE, WRONG, WRONG]
+    unfinished = judgements(sheet, ann=BOB)[:-1]
+    assert len(list(whole_verdicts(unfinished, 3))) == 3
 
 
 def test_shares_of_right_are_counted_per_kind_of_question() -> None:
@@ -157,3 +171,33 @@ def test_shares_of_right_are_counted_per_kind_of_question() -> None:
     }  # fmt: skip
     assert [shares["closer", part] for part in PARTS] == [0.75, 1.0, 0.25]
     assert [shares["instance", part] for part in PARTS] == [1.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("answers", "is_settled"),
+    [
+        ((RIGHT, RIGHT, WRONG), True),
+        ((RIGHT, WRONG), False),  # a tie
+        ((RIGHT, RIGHT, ARGUABLE, WRONG), False),  # not more than half
+        ((WRONG, WRONG, RIGHT), False),  # the majority finds it wrong
+    ],
+)
+def test_majority_settles_questions_that_most_find_right(
+    answers: tuple[str, ...], is_settled: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1", "--quiet"]
+    assert main([*words, "--annotators", str(len(answers)), "--overlap", "1", "--out", "out"]) == 0
+    sheet = read_sheet(Path("out/sheet.json"))
+    rows = [",".join(ANSWER_COLUMNS)]
+    for item in sheet.items:
+        for share, answer in zip(sheet.annotators, answers, strict=True):
+            first = answer if item is sheet.items[0] else RIGHT  # they disagree on one item only
+            given = zip(PARTS, (first, RIGHT, RIGHT), strict=True)
+            rows += [f"{sheet.id},{item.id},{share.name},{ask},{one},{item.check}" for ask, one in given]
+    Path("answers.csv").write_text("\n".join(rows))
+    score_words = ["sheets", "score", "answers.csv", "--key", "out-key", "--disputed", "disputed.csv"]
+    assert main(score_words) == 0 and len(Path("disputed.csv").read_text().splitlines()) == 2
+    capsys.readouterr()
+    assert main([*score_words, "--majority"]) == 0
+    assert len(Path("disputed.csv").read_text().splitlines()) == (1 if is_settled else 2)
+    assert f"{int(is_settled)} rating" in capsys.readouterr().err

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import zipfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 from simulated_annotators import as_csv, both, retrieval_set, workbook
 
+from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import write_json
 from su3d_bench.human_eval.answers import check_answers, check_key, read_answers
-from su3d_bench.human_eval.items import ANSWER_COLUMNS, Key, Sheet
+from su3d_bench.human_eval.items import ANSWER_COLUMNS, COMMENT, SCHEMA, Key, Sheet
+from su3d_bench.human_eval.scores import read_scores, review_items_csv, review_items_page, score
+from su3d_bench.reports.tables.judged import sheet_tables
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +80,51 @@ def test_each_error_names_its_file_and_row(small: tuple[Sheet, Key], change: dic
     faults = check_answers(small[0], rows).faults
     assert sum(fault.startswith("ann.csv: row 3: ") for fault in faults) == 1
     assert not any("\n" in fault for fault in faults)
+
+
+def test_unfinished_answers_are_scored_only_if_asked_for(small: tuple[Sheet, Key]) -> None:
+    rows = both(small)
+    n_of_ann = sum(row.annotator == "ann" for row in rows)
+    unfinished = [replace(rows[0], answer="", comment="too dark"), *rows[1 : n_of_ann - 2]]  # none of bob's
+    assert len(check_answers(small[0], unfinished).faults) == 2
+    checked = check_answers(small[0], unfinished, is_partial=True)
+    assert (checked.faults, checked.silent) == ((), ("bob",))
+    assert checked.comments == {rows[0].item_id: {"ann": "too dark"}}
+    found = score(*small, checked.judgements, checked.silent, checked.comments)
+    assert found.annotators == {"ann": n_of_ann - 3} and found.n_judged == n_of_ann - 3
+    notes = "; ".join(sheet_tables(asdict(found))[0].notes)
+    assert f"judgements by ann {n_of_ann - 3} of {n_of_ann}; unanswered questions are excluded" in notes
+    (look,) = found.review_items
+    assert (look.reason, look.comments, look.answers) == ("comment", {"ann": "too dark"}, {})
+    # other faults are still faults
+    wrong = [*unfinished, replace(rows[0], answer="", check="c0"), replace(rows[1], answer="wrnog")]
+    assert len(check_answers(small[0], wrong, is_partial=True).faults) == 2
+
+
+def test_comments_are_optional_and_escaped(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    rows = both(small)
+    assert {one.comment for one in rows} == {""}  # files without the column
+    hostile = '=HYPERLINK("x")<script>'
+    rows[0] = replace(rows[0], comment=hostile)
+    (tmp_path / "a.xlsx").write_bytes(workbook(rows, columns=(*ANSWER_COLUMNS, COMMENT)))
+    read = read_answers(tmp_path / "a.xlsx")
+    assert [one.comment for one in read] == [hostile, *[""] * (len(rows) - 1)]
+    checked = check_answers(small[0], read)
+    looks = score(*small, checked.judgements, checked.silent, checked.comments).review_items
+    assert not [
+        cell for row in csv.reader(review_items_csv(looks).splitlines()) for cell in row if cell.startswith("=")
+    ]
+    page = review_items_page(looks, "pictures", "set")
+    assert "comment, ann: =HYPERLINK" in page and "<script" not in page
+
+
+def test_scores_without_newer_fields_are_read(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    content = asdict(score(*small, check_answers(small[0], both(small)).judgements))
+    del content["assigned"]
+    for one in content["agreements"]:
+        del one["agreement"]["ac1"], one["agreement"]["ordinal_alpha"]
+    write_json(tmp_path / "scores.json", content | {"schema_version": SCHEMA, "digest": digest_json(content)})
+    assert read_scores(tmp_path).agreements[0].agreement.ac1 is None
 
 
 NO_WORDS = ",".join(ANSWER_COLUMNS).encode() + b"\na,b,\x1b[2J,d,e,f\n"

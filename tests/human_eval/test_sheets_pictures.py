@@ -21,6 +21,7 @@ from su3d_bench.human_eval.sources import RunSource
 from su3d_bench.questions.question_files import figure_texts
 from su3d_bench.reports.pictures.items import (
     best_view,
+    jpeg_bytes,
     mask_in_frame,
     seen_in,
 )
@@ -36,10 +37,18 @@ def test_picture_of_an_item_is_small_and_shows_the_object(painted_source: RunSou
         draft = replace(draft, names=("chair", "sofa", "", ""), others=(0,))
     content = Artist(painted_source).draw(draft)
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
-    assert len(content) < 150_000 and picture.shape[1] == 960
+    assert len(content) < 200_000 and picture.shape[1] == 960
     is_outline = (np.abs(picture - [255, 64, 200]).sum(axis=2) < 60).mean()
     assert is_outline > 0.001
     assert content == Artist(painted_source).draw(draft)
+
+
+@pytest.mark.parametrize("colour", [(180, 150, 120), (214, 194, 170), (245, 245, 220), (255, 64, 200)])
+def test_flat_areas_keep_their_colour(colour: tuple[int, int, int]) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (96, 192, 3)).astype(np.uint8)  # many other colours
+    picture[16:80, 16:80] = colour
+    shown = np.asarray(Image.open(io.BytesIO(jpeg_bytes(picture)))).astype(int)
+    assert np.abs(shown[16:80, 16:80] - colour).max() <= 1
 
 
 def frame_of(depth_m: np.ndarray, x_m: float = 0.0) -> Frame:

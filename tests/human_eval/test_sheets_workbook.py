@@ -37,7 +37,7 @@ def test_workbook_cells_are_text_except_one_formula(hostile: tuple[GeneratedShee
 
 def test_answers_are_chosen_from_lists_and_other_cells_are_locked(hostile: tuple[GeneratedSheets, bytes]) -> None:
     page = openpyxl.load_workbook(io.BytesIO(hostile[1]))["answers"]
-    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
+    letter = "ABCDEFGHIJ"[COLUMNS.index("answer")]
     lists = {
         one.formula1: {str(part) for part in str(one.sqref).split()} for one in page.data_validations.dataValidation
     }
@@ -45,8 +45,8 @@ def test_answers_are_chosen_from_lists_and_other_cells_are_locked(hostile: tuple
     assert f"{letter}6" in lists['"well-merged,under-merged,over-merged,cannot tell"']
     assert page.protection.sheet and page.freeze_panes == "B4"
     for row in page.iter_rows(min_row=HEADER_ROW + 1):
-        assert [cell.coordinate[0] for cell in row if not cell.protection.locked] == [letter]
-    hidden = [name for name, one in zip(COLUMNS, "ABCDEFGHI", strict=True) if page.column_dimensions[one].hidden]
+        assert [cell.coordinate[0] for cell in row if not cell.protection.locked] == [letter, "F"]
+    hidden = [name for name, one in zip(COLUMNS, "ABCDEFGHIJ", strict=True) if page.column_dimensions[one].hidden]
     assert tuple(hidden) == HIDDEN
 
 

@@ -131,7 +131,7 @@ def test_map_that_differs_from_the_papers_is_detected() -> None:
     assert [name for name, fault in FAULTS.items() if not differences(fault(found), program)] == []
 
 
-# The values of section IV-A, and our readings of what the paper leaves open.
+# The values of section III-A, and our readings of what the paper leaves open.
 OF_THE_PAPER = {
     "crop_ratios": (0.8, 1.0, 1.2), "multi_scale": "direct", "multi_view": "direct", "top_m": 5, "border_px": 20.0,
     "border_reference_width": 1200, "border_shape": "disc", "border_pixel_rule": "background",

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
+from prediction_files import Tensor, write_torch
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 
 from su3d_bench.cli.main import main
@@ -71,6 +72,48 @@ def test_damaged_files_are_read_or_give_one_line_error(tmp_path: Path, name: str
         assert n_refused > 20
 
 
+def objects_of(folder: Path) -> np.ndarray:
+    """The masks (points, 2) of the two objects."""
+    instance = Replica(folder / "data").ground_truth("room0", "mesh-vertices").instance
+    return np.stack([instance == 1, instance == 6], axis=1)
+
+
+def write_masks(folder: Path, masks: np.ndarray) -> Path:
+    """The masks (points, masks) of a scene as OpenMask3D writes them, with the features of ``write_map``."""
+    folder.mkdir()
+    write_torch(folder / "room0_masks.pt", Tensor(masks))
+    np.save(folder / "room0_openmask3d_features.npy", np.eye(8, dtype=np.float32)[[2, 5]])
+    return folder
+
+
+def test_masks_over_vertices_are_kept_as_the_map_that_was_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_map(tmp_path, monkeypatch)
+    (tmp_path / "q.csv").write_text(CSV)
+    masks = write_masks(tmp_path / "masks", objects_of(tmp_path))
+    words = ["--dataset", "replica", "--queries", str(tmp_path / "q.csv"), "--protocols", "query-ap", "--json"]
+    words += ["--text-features", str(tmp_path / "texts.npz")]
+    for predictions, out in ((masks, ["--out", str(tmp_path / "run")]), (tmp_path / "run", [])):
+        assert main(["evaluate", str(predictions), *words, *out]) == 0
+        assert json.loads(capsys.readouterr().out)["protocols"]["query-ap"]["metrics"]["ap"] == 1
+
+
+def test_every_reason_is_printed_and_faults_of_the_data_come_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_map(tmp_path, monkeypatch)
+    (tmp_path / "q.csv").write_text(CSV)
+    masks = write_masks(tmp_path / "short", np.ones((3, 2), bool))
+    assert main(["evaluate", str(masks), "--dataset", "replica", "--queries", str(tmp_path / "q.csv")]) == 2
+    first, *others = capsys.readouterr().err.splitlines()
+    n = len(Replica(tmp_path / "data").ground_truth("room0", "mesh-vertices").points)
+    assert f"can score it: the masks are of 3 points, the ground truth has {n}; " in f"{first} {others}"
+    kinds = [any(word in line for word in ("the masks are of", "no ground truth")) for line in (first, *others)]
+    assert kinds == sorted(kinds, reverse=True) and not kinds[-1] and len({*others, first}) == len(kinds)
+    assert all(line.startswith("  ") for line in others)
+
+
 def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -82,6 +125,7 @@ def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
 
     monkeypatch.setattr(Replica, "ground_truth", tilted)  # flat objects have no volume, and no overlap in ScanRefer
     write_map(tmp_path, monkeypatch)
+    masks = write_masks(tmp_path / "masks", objects_of(tmp_path))
     rows = [
         ("a place to sit", 0),
         ("something to eat at", 5),
@@ -92,11 +136,12 @@ def test_scanrefer_and_nr3d_sentences_are_scored_by_boxes(
     lines = "".join(f"room0,{number},{text}\n" for text, number in rows)
     (tmp_path / "nr3d.csv").write_text(f"scan_id,target_id,utterance\n{lines}")
     for name in ("ScanRefer_filtered_val.json", "nr3d.csv"):
-        words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / name)]
-        files = ["--text-features", str(tmp_path / "texts.npz"), "--protocols", "grounding", "--json", "--quiet"]
-        assert main([*words, *files]) == 0
-        scored = json.loads(capsys.readouterr().out)["protocols"]["grounding"]
-        assert {value for value in scored["metrics"].values() if value is not None} == {2 / 3}  # unique alone
+        for predictions in (tmp_path / "maps", masks):
+            words = ["evaluate", str(predictions), "--dataset", "replica", "--queries", str(tmp_path / name)]
+            files = ["--text-features", str(tmp_path / "texts.npz"), "--protocols", "grounding", "--json", "--quiet"]
+            assert main([*words, *files]) == 0
+            scored = json.loads(capsys.readouterr().out)["protocols"]["grounding"]
+            assert {value for value in scored["metrics"].values() if value is not None} == {2 / 3}  # unique alone
     (tmp_path / "broken.json").write_text('[{"scene_id": "room0"}]')
     words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / "broken.json")]
     assert main(words) == 2

@@ -220,7 +220,7 @@ def test_refusal_of_the_model_leaves_the_question_unsettled() -> None:
         "Which sink is closer to bed?"
     )
     assert not found.is_decided
-    assert found.text.startswith("I cannot settle this: gpt-4-1106-preview: ")
+    assert found.text.startswith("I cannot settle this: gpt-6-luna: ")
 
 
 PAGE = json.loads((CASES / "page_reasoning.json").read_text())["cases"]

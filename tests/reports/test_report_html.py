@@ -20,6 +20,7 @@ from painted_runs import COLLECTOR, painted_page, painted_run
 from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.core.version import __version__
 from su3d_bench.reports.page.maps import (
     NO_GROUND_TRUTH_NEAR,
     NOT_SCORED,
@@ -88,6 +89,12 @@ def test_page_has_the_numbers_of_metrics_json(run: Path, page: str) -> None:
         assert [one["metrics"] for one in shown["anytime"]] == [one["metrics"] for one in stored["anytime"]]
 
 
+def test_page_begins_with_its_date_version_and_command(page: str) -> None:
+    pattern = r'<p class="made">Created \d{4}-\d\d-\d\d \d\d:\d\d UTC by su3d-bench (\S+)[^:]*: <code>(.*)</code></p>'
+    (found,) = re.findall(pattern, page)
+    assert found[0] == __version__ and found[1].startswith("su3d-bench report html ")
+
+
 def test_page_has_confusion_errors_timing_and_comparison_of_every_method(page: str) -> None:
     found = data_of(page)
     methods = found["runs"][0]["methods"]
@@ -118,7 +125,7 @@ def test_page_policy_allows_only_embedded_scripts_and_styles(page: str) -> None:
 
 def test_hostile_text_of_a_run_is_never_markup() -> None:
     plain = elements(page_html("title", {"name": ""}, [{"name": ""}], ["AAAA"]))
-    found = elements(page_html(HOSTILE, {"name": HOSTILE, HOSTILE: 1}, [{"name": HOSTILE}], ["AAAA"]))
+    found = elements(page_html(HOSTILE, {"name": HOSTILE, HOSTILE: 1}, [{"name": HOSTILE}], ["AAAA"], command=HOSTILE))
     assert found.tags == plain.tags
     assert json.loads(found.content["data"]) == {"name": HOSTILE, HOSTILE: 1}
     assert json.loads(found.content["scene-0"]) == {"name": HOSTILE}

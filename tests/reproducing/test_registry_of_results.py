@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ from painted_runs import consistent
 from registry_bundles import edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.reproducing.bundle import bundle_runs
 from su3d_bench.reproducing.registry import ModelWeights, conflict_with, read_registry, rows_of_bundle
 
@@ -101,6 +104,15 @@ def test_features_of_two_encoders_conflict_if_the_protocol_requires_one(registry
     assert conflict_with(same, [replace(one, weights=weights[0])]) is None
 
 
+def test_link_of_a_bundle_is_an_https_address(made: Path, registry: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--link 'javascript:1': expected an address that starts with https://"):
+        bundle_runs(tmp_path / "x.zip", [made / "runs" / "bob"], link="javascript:1")
+    files, manifest = read_bundle(registry / "bundles" / "bob.zip")
+    rewrite_bundle(registry / "bundles" / "bob.zip", files, {**manifest, "link": "javascript:1"})
+    (refused,) = read_registry(registry).refused
+    assert refused.run == "bob.zip" and "link" in refused.reason
+
+
 def test_site_has_one_page_per_method_and_scene_and_escapes_texts_of_bundles(
     registry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -114,6 +126,12 @@ def test_site_has_one_page_per_method_and_scene_and_escapes_texts_of_bundles(
     value = json.loads((tmp_path / "site" / "registry.json").read_text())
     bundle = value["boards"][0]["rows"][0]["bundle"]
     assert bundle["address"] == f"https://example.org/b/{bundle['file']}" and len(bundle["sha256"]) == 64
+    rows = {row["bundle"]["file"]: row for row in value["boards"][0]["rows"]}
+    assert (rows["ann.zip"]["authors"], rows["bob.zip"]["authors"]) == (f"my own photos {STRUCK}", "not stated")
+    assert (rows["ann.zip"]["link"], rows["bob.zip"]["link"]) == ("https://example.org/method", "")
+    for row in rows.values():
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", row["date"])
+        assert base64.b64decode(value["pictures"][row["picture"]]).startswith(b"\x89PNG")
     before = {page: (tmp_path / "site" / page).read_bytes() for page in pages}
     assert main([*words, "--bundle-url", "https://example.org/b"]) == 0
     assert {page: (tmp_path / "site" / page).read_bytes() for page in pages} == before, "the same bytes again"

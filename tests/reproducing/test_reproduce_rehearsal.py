@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from chat_server import Answered, Body, ChatServer
 from registry_bundles import Files, edit_record, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
@@ -15,18 +16,64 @@ from su3d_bench.cli.main import main
 TABLES = ["V", "reasoning"]
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=80", "width=160", "height=120", "mesh_spacing_m=0.1"]
 WORDS = ["reproduce", "opensu3d", "--tables", *TABLES, "--rehearse", *ROOM, "--jobs", "1", "--quiet"]
+WORDS += ["--refiner", "model"]
+ROOMS = ["rooms/bedroom0", "--protocols", "rooms-reasoning"]
+COMMANDS = [WORDS[:6], ["run", *ROOMS], ["ablate", *ROOMS, "--vary", "top_m=1,2"]]
+
+
+def last_name(body: Body) -> Answered:
+    """The reply of a language model to a list of names."""
+    assert body["messages"][0]["content"].startswith("assign a single name to the object")
+    return Answered(f"Object: {json.loads(body['messages'][1]['content'])[-1]}.")
 
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of a rehearsal, with the embedded profile."""
+    """The folder of a rehearsal, with the embedded profile, and labels n' by a local language model."""
     out = tmp_path_factory.mktemp("rehearsal")
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, ChatServer() as server:
+        server.answer = last_name
+        patch.setenv("OPENAI_BASE_URL", server.url)
         patch.setenv("SU3D_CACHE", str(out / "cache"))
         assert main([*WORDS, "--out", str(out), "--dry-run"]) == 0
+        assert server.n_asked == 0
         assert main([*WORDS, "--out", str(out)]) == 0
+        assert server.n_asked > 0
         patch.setenv("SU3D_DATA", str(out / "data"))
+        patch.setenv("OPENAI_BASE_URL", "http://127.0.0.1:9/v1")  # nothing is asked again
         yield out
+
+
+def test_labels_by_the_language_model_reach_the_table_and_the_differences(rehearsed: Path) -> None:
+    text = (rehearsed / "tables.md").read_text()
+    assert "refined label (n' by the model gpt-6-luna)" in text
+    record = json.loads((rehearsed / "compared.json").read_text())
+    here = {one["name"]: one["here"] for one in record["deviations"]}
+    assert here["label n'"] == "the model gpt-6-luna of the refiner, names of 5 views"
+    assert here["reasoning"] == "the built-in solver" and here["masks"] == "those of the profile 'embedded'"
+    assert here["scenes"] == "procedurally generated rooms"
+    assert here["border"].startswith("3 px in images 160 px wide")
+    assert "**Differences from the paper**" in text
+    for path in rehearsed.glob("runs/*/scenes/*/opensu3d/refined_names.json"):
+        names = json.loads(path.read_text())["names"]
+        assert {one["source"] for one in names} <= {"model", "label"}
+        assert all(one["refined"] == one["candidates"][-1].lower() for one in names if one["source"] == "model")
+
+
+@pytest.mark.parametrize("words", [["--refiner", "model"], ["--question-solver", "llm"]])
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
+def test_language_model_without_a_key_is_an_error_before_anything_is_written(
+    command: list[str],
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("OPENAI_API_KEY", "OPENAI_BASE_URL"):
+        monkeypatch.delenv(name, raising=False)
+    assert main([*command, *words, "--out", str(tmp_path / "out")]) == 2
+    assert "$OPENAI_API_KEY is not set" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_every_printed_cell_has_a_measured_value_and_causes_of_the_difference(rehearsed: Path) -> None:

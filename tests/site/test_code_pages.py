@@ -35,7 +35,8 @@ def pages() -> dict[str, str]:
 
 
 def words(page: str) -> str:
-    """The text of a page without its tags."""
+    """The text of a page without its tags, addresses for links out of the site."""
+    page = re.sub(r'<a href="(https?:[^"]+)">[^<]+</a>', r"\1", page)
     return " ".join(unescape(re.sub(r"<[^>]+>", "", page)).split())
 
 

@@ -26,7 +26,7 @@ _CODE_OR_LINK = re.compile(
     r"(?P<mark>!?)\[(?P<words>(?:`[^`]*`|\[[^\[\]]*\]|[^\[\]`])*)\]\((?P<target>[^()\s]+)\)",
     re.MULTILINE,
 )
-_ADDRESS = re.compile(r"https?://[^\s;,()<>&\"']+")
+_ADDRESS = re.compile(r"https?://(?:www\.|github\.com/)?(?P<words>[^\s;,()<>&\"']+?)/?(?=[\s;,()<>&\"']|$)")
 _QUOTED = re.compile(r"``(.+?)``|`(.+?)`", re.DOTALL)
 
 
@@ -52,9 +52,9 @@ def prose(text: object) -> str:
     """``text`` as in ``plain``, with addresses as links and quoted parts as code.
 
     >>> prose("``a<b``: https://example.org/x, read")
-    '<code>a&lt;b</code>: <a href="https://example.org/x">https://example.org/x</a>, read'
+    '<code>a&lt;b</code>: <a href="https://example.org/x">example.org/x</a>, read'
     """
-    linked = _ADDRESS.sub(r'<a href="\g<0>">\g<0></a>', plain(text))
+    linked = _ADDRESS.sub(r'<a href="\g<0>">\g<words></a>', plain(text))
     return _QUOTED.sub(lambda match: f"<code>{match[1] or match[2]}</code>", linked)
 
 

@@ -53,12 +53,48 @@ function compareValues(a, b) {
   return String(a).localeCompare(String(b), 'en', { numeric: true });
 }
 
+// Downloads are data URLs made on a click, so that they work from a disk and do not enlarge the page.
+const fileName = (text, suffix) =>
+  `${text.toLowerCase().replace(/[^a-z0-9]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'su3d-bench'}.${suffix}`;
+function save(name, url) {
+  h('a', { href: url, download: name }).click();
+}
+function downloadButton(what, title, make) {
+  return h('p', { class: 'get' }, h('button', { type: 'button', class: 'download', 'aria-label': `Download ${what}: ${title}`,
+    onclick: make }, `Download ${what}`));
+}
+function csvButton(title, lines) {
+  // A leading apostrophe keeps spreadsheets from running a text as a formula.
+  const cell = (value) => (isNumber(value) ? String(value)
+    : `"${String(value ?? '').replace(/^(?=[=+\-@\t\r])/, "'").replaceAll('"', '""')}"`);
+  return downloadButton('CSV', title, () => {
+    const text = lines().map((line) => line.map(cell).join(',')).join('\r\n');
+    save(fileName(title, 'csv'), `data:text/csv;charset=utf-8,${encodeURIComponent(`\ufeff${text}\r\n`)}`);
+  });
+}
+
+// A box that scrolls sideways, with a line above it where it does.
+const overflowing = new ResizeObserver((entries) => {
+  for (const box of new Set(entries.map((one) => one.target.closest('.wide')))) {
+    if (box?.isConnected) box.previousElementSibling.hidden = box.scrollWidth <= box.clientWidth + 1;
+  }
+});
+function scrollBox(label, node, classes = 'wide') {
+  const box = h('div', { class: classes, tabindex: '0', role: 'region', 'aria-label': label }, node);
+  overflowing.observe(box);
+  overflowing.observe(node);
+  return [h('p', { class: 'scrolls', hidden: true }, '↔ Scroll sideways to see all of it'), box];
+}
+
 // Stays in place when the table scrolls horizontally.
 const captionOf = (text) => h('caption', null, h('span', null, text));
 
 // A sortable table; with `filter`, a search field filters its rows. Columns: {label, title, value(row), show(row), num,
-// best}; with `onRow`, rows can be selected by mouse and keyboard. At most `most` of the matching rows are shown.
-function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, onRow, foot, most = Infinity }) {
+// best}; with `onRow`, rows can be selected by mouse and keyboard. At most `most` of the matching rows are shown. The
+// download `file` has all rows, numbers in full precision (ratios as fractions), and `hidden` columns.
+function dataTable({
+  caption, columns, rows, filter, tall, sortBy, descending, onRow, foot, file = caption, hidden = [], most = Infinity,
+}) {
   const state = { column: sortBy === undefined ? null : sortBy, down: !!descending, text: '' };
   const body = h('tbody');
   const headers = columns.map((column, index) =>
@@ -74,8 +110,9 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
     box.append(h('div', { class: 'toolbar' },
       h('div', { class: 'field' }, h('label', { for: input.id }, `Filter ${filter}`), input), counter));
   }
-  const classes = tall ? 'wide tall' : 'wide';
-  box.append(h('div', { class: classes, tabindex: '0', role: 'region', 'aria-label': caption }, node));
+  const all = [...columns.filter((column) => !column.isOnlyShown), ...hidden];
+  box.append(...scrollBox(caption, node, tall ? 'wide tall' : 'wide'), csvButton(file,
+    () => [all.map((column) => column.label), ...rows.map((row) => all.map((column) => column.value(row)))]));
 
   function sort(index) {
     state.down = state.column === index ? !state.down : !!columns[index].num;
@@ -185,5 +222,29 @@ function linePlot({ label, lines, xLabel, yLabel }) {
   const dash = (style) => svg('svg', { width: 30, height: 8, 'aria-hidden': 'true' },
     svg('line', { class: `line l${style}`, x1: 0, x2: 30, y1: 4, y2: 4, 'stroke-dasharray': DASHES[style] }));
   const key = h('ul', { class: 'key' }, lines.map((one) => h('li', null, dash(one.style % 8), one.name)));
-  return h('div', null, key, h('div', { class: 'wide' }, plot));
+  return h('div', null, key, scrollBox(label, plot), downloadButton('PNG', label, () => savePlot(label, plot, lines)));
+}
+
+// The picture of a plot with its key, at twice the size of the screen.
+function savePlot(label, plot, lines) {
+  const { width, height } = plot.viewBox.baseVal, tall = height + 18 * lines.length + 6, copy = plot.cloneNode(true);
+  const parts = [...plot.querySelectorAll('*')];
+  [...copy.querySelectorAll('*')].forEach((part, k) => {  // an image has no style sheet
+    const style = getComputedStyle(parts[k]);
+    for (const name of ['fill', 'stroke', 'stroke-width', 'font-size', 'font-family']) part.setAttribute(name, style[name]);
+  });
+  const ink = getComputedStyle(document.body).color, paths = [...plot.querySelectorAll('path')];
+  copy.prepend(svg('rect', { width, height: tall, fill: getComputedStyle(document.body).backgroundColor }));
+  lines.forEach((one, k) => copy.append(
+    svg('line', { x1: 62, x2: 92, y1: height + 18 * k + 6, y2: height + 18 * k + 6, 'stroke-width': 1.8,
+      stroke: getComputedStyle(paths[k]).stroke, 'stroke-dasharray': DASHES[one.style % 8] }),
+    svg('text', { x: 98, y: height + 18 * k + 10, fill: ink, 'font-size': 12, 'font-family': 'sans-serif' }, one.name)));
+  fill(copy, { viewBox: `0 0 ${width} ${tall}`, width: 2 * width, height: 2 * tall, xmlns: SVG }, []);
+  const image = new Image();
+  image.onload = () => {
+    const canvas = h('canvas', { width: 2 * width, height: 2 * tall });
+    canvas.getContext('2d').drawImage(image, 0, 0);
+    save(fileName(label, 'png'), canvas.toDataURL('image/png'));
+  };
+  image.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
 }

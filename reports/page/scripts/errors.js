@@ -60,7 +60,8 @@ function confusionTables(one, most) {
       wish: wishOf(one, label(truth), label(called)) }))
     .sort((a, b) => b.n - a.n);
   return [
-    h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Confusion matrix' }, table),
+    ...scrollBox('Confusion matrix', table), csvButton(`confusion ${nameOf(one)} ${one.protocol}`, () => [
+      ['ground truth', 'prediction', 'points'], ...one.cells.map(([truth, called, n]) => [label(truth), label(called), n])]),
     h('h3', null, 'Largest confusions'),
     dataTable({ caption: 'Ground-truth class, wrong predicted class, number of points', rows: wrong,
       filter: 'classes', tall: wrong.length > 10, most: MAX_PAIRS,
@@ -110,12 +111,21 @@ function errorsSection() {
       draw();
     }
     function draw() {
-      place.replaceChildren(h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Cost of errors' },
-        errorsTable(explained(), protocols.protocol(), metric.input.value)),
-      h('div', null, noteList([...new Set(DATA.errors.flatMap((one) => one.remarks))])));
+      const table = errorsTable(explained(), protocols.protocol(), metric.input.value);
+      place.replaceChildren(...scrollBox('Cost of errors', table),
+        csvButton(`cost of errors ${protocols.protocol()} ${metric.input.value}`,
+          () => errorsLines(explained(), metric.input.value)),
+        h('div', null, noteList([...new Set(DATA.errors.flatMap((one) => one.remarks))])));
     }
     refresh();
   });
+}
+
+function errorsLines(all, name) {
+  const costs = (one) => Object.entries(one.causes).map(([cause, { gains, n }]) => [cause, gains[name], n]);
+  const stages = (one) => Object.entries(one.stages).map(([stage, values]) => [`score with GT ${stage}`, values[name]]);
+  return [['method', 'kind', name, 'errors'], ...all.flatMap((one) => [['score', one.values[name]], ...costs(one),
+    ['interaction', one.overlap[name]], ['remaining', one.rest[name]], ...stages(one)].map((line) => [nameOf(one), ...line]))];
 }
 
 function errorsTable(all, protocol, name) {
@@ -138,13 +148,15 @@ function errorsTable(all, protocol, name) {
     return [toGallery(cost, wish, `Worst errors: ${cause}, ${nameOf(one)}`), h('br'), h('small', null, amount(one, n))];
   };
   const stages = [...new Set(all.flatMap((one) => Object.keys(one.stages)))];
+  const costs = (cause) => Math.max(...all.map((one) => one.causes[cause].gains[name] || 0));
+  const causes = Object.keys(all[0].causes).sort((a, b) => costs(b) - costs(a));
   return h('table', null,
     captionOf(`${protocol}: ${name} in per cent, and gains in percentage points`),
     h('thead', null, h('tr', null, h('th', { scope: 'col' }, 'Kind of error'),
       all.map((one) => h('th', { scope: 'col', class: 'num' }, nameOf(one))))),
     h('tbody', null,
       row('Score', null, (one) => percent(one.values[name])),
-      Object.keys(all[0].causes).map((cause) => row(cause, about[cause], (one) => costOf(one, cause))),
+      causes.map((cause) => row(cause, about[cause], (one) => costOf(one, cause))),
       row('Interaction', 'all corrected together, minus the sum of the gains',
         (one) => signed(one.overlap[name])),
       row('Remaining', LEFT[all[0].kind] || 'lost even if every kind is corrected', (one) => signed(one.rest[name])),

@@ -197,15 +197,20 @@ function summaryTable(rows) {
       one.ceiling && one.ceiling[metric]),
   });
   const marks = metrics.some((metric) => best[metric] !== null);
+  const interval = (metric, end) => ({ label: `${metric} ${end ? 'high' : 'low'}`,
+    value: (one) => (one.result && one.result.intervals[metric] ? one.result.intervals[metric][end] : null) });
   const ceilings = (one) => metrics.map((metric) => metricText(metric, one.ceiling[metric])).join(' / ');
   return dataTable({
     caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean over scenes'}`
       + `${marks ? '; best in bold' : ''}`,
     rows,
+    file: `${rows[0].protocol} summary`,
+    hidden: metrics.flatMap((metric) => [interval(metric, 0), interval(metric, 1),
+      { label: `${metric} ceiling`, value: (one) => one.ceiling && one.ceiling[metric] }]),
     columns: [
       { label: 'Method', value: nameOf },
       ...metrics.map(column),
-      { label: 'Ground-truth ceiling', title: 'Score of the ground truth evaluated as a prediction', num: true,
+      { label: 'Ground-truth ceiling', isOnlyShown: true, title: 'Score of the ground truth evaluated as a prediction', num: true,
         value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
         show: (one) => (one.ceiling ? ceilings(one) : '–') },
       { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },

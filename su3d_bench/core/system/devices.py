@@ -76,6 +76,16 @@ def device_for(device: str, job_index: int) -> str:
     return device
 
 
+def gpu_memory_bytes(device: str) -> list[int]:
+    """The total memory of each GPU that jobs use with ``device``; empty for the CPU."""
+    if device == CPU:
+        return []
+    device_for(device, 0)  # raises if there is no such GPU
+    cuda = require("torch", f"device '{device}'").cuda
+    numbers = range(cuda.device_count()) if device == "cuda" else [int(device.partition(":")[2])]
+    return [int(cuda.get_device_properties(number).total_memory) for number in numbers]
+
+
 def precision_for(precision: str, device: str) -> str:
     """The precision to use on ``device``; ``auto`` is float16 if the GPU supports it, and float32 on the CPU."""
     if precision != "auto":

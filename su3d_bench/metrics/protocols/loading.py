@@ -7,7 +7,7 @@ one-line errors that name the file and the key.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.arguments import typed
+from su3d_bench.core.errors import ConfigError, counted, suggest
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
 from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules, TransferRules
@@ -135,6 +136,7 @@ def read_original(file: Path, table: Mapping[str, Any]) -> Original:
 
 RULES = Path(__file__).parents[1] / "rules"  # one folder per dataset
 CLASS_TABLES = RULES / "classes"  # no protocols
+ALL_PROTOCOLS = "all"  # requests every default protocol
 HEADING = ""  # key of the comments above the first rule of a file
 _KEY = re.compile(r"(\w+)\s*=")
 _SECTION = re.compile(r"\[(\w+)\]")
@@ -314,12 +316,24 @@ def protocols_for(dataset: str) -> list[str]:
     return [rules.name for rules in known if rules.by_default and dataset in rules.datasets]
 
 
+def headline_protocols(dataset: Any) -> tuple[str, ...]:
+    """The protocol that scores a dataset by default, as a tuple; empty if the dataset declares none."""
+    name: str | None = getattr(dataset, "headline_protocol", None)
+    return () if name is None else (name,)
+
+
+def more_protocols_line(names: Collection[str], how: str = "--all-protocols") -> str:
+    """A line on ``names``, protocols that fit but were not scored, and ``how`` to score them."""
+    return f"{counted(len(names), 'more protocol')} {'applies' if len(names) == 1 else 'apply'}: {how}"
+
+
 def not_comparable_with(rules: ProtocolRules) -> list[str]:
     """Protocols whose values are not comparable with those of ``rules``: it names them, or they name it."""
     naming = [name for name in protocol_names() if rules.name in load_protocol(name).not_comparable_with]
     return sorted({*rules.not_comparable_with, *naming})
 
 
+@typed
 def load_protocol(name: str) -> ProtocolRules:
     """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``.
 

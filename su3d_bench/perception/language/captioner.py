@@ -34,7 +34,9 @@ STRATEGY = (
 )
 
 # Settings of the language model that affect a caption; times, prices and limits do not.
-CAPTION_SETTINGS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
+CAPTION_SETTINGS = {
+    "vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px", "reasoning_effort",
+}  # fmt: skip
 logger = logging.getLogger(__name__)
 
 
@@ -77,6 +79,7 @@ class Captioner:
                 temperature=config.temperature,
                 seed=config.seed,
                 image_detail=config.image_detail,
+                reasoning_effort=config.reasoning_effort,
                 form=CaptionForm,
             )
             for crop in crops

@@ -6,22 +6,24 @@ import base64
 import dataclasses
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from su3d_bench.core.digests import digest_bytes, digest_json
 from su3d_bench.core.files.atomic import json_text, make_folder, write_bytes, write_error, write_text
 from su3d_bench.core.files.locks import hold_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.perception.unit_costs import PRICES
 from su3d_bench.store.run_folder import check_no_links
 
 Purpose = Literal["caption", "refine", "ask", "judge"]
@@ -85,6 +87,7 @@ class ChatRequest:
     temperature: float = 0.0
     seed: int | None = 0
     image_detail: str = "auto"
+    reasoning_effort: str = ""
     form: type[BaseModel] | None = None
 
     def record(self) -> dict[str, Any]:
@@ -99,6 +102,7 @@ class ChatRequest:
             "max_answer_tokens": self.max_answer_tokens,
             "temperature": self.temperature,
             "seed": self.seed,
+            **({"reasoning_effort": self.reasoning_effort} if self.reasoning_effort else {}),
         }
 
     @cached_property
@@ -117,6 +121,7 @@ class ChatRequest:
             "messages": messages,
             "temperature": self.temperature,
             "max_tokens": self.max_answer_tokens,
+            **({"reasoning_effort": self.reasoning_effort} if self.reasoning_effort else {}),
         }
         if self.form is not None:
             schema = {"name": self.form.__name__, "strict": True, "schema": self.form.model_json_schema()}
@@ -158,32 +163,42 @@ Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 class Price(BaseModel):
-    """US dollars per million tokens."""
+    """US dollars per million tokens; ``date`` and ``source`` of the price."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     input_usd: float = Field(ge=0, allow_inf_nan=False)
     output_usd: float = Field(ge=0, allow_inf_nan=False)
+    date: str = ""
+    source: str = ""
 
 
-# OpenAI's price list of November 2023: 0.01 US dollars for 1,000 tokens in, 0.03 for 1,000 out, for both models.
-_GPT4_TURBO = Price(input_usd=10.0, output_usd=30.0)
+# "current": OpenAI's replacement for its GPT-4 models, which reads images; without reasoning it takes a temperature.
+# "paper": the models of section IV-A; OpenAI has withdrawn both since.
+PRESETS: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        "current": {"vision_model": "gpt-6-luna", "text_model": "gpt-6-luna", "reasoning_effort": "none"},
+        "paper": {"vision_model": "gpt-4-vision-preview", "text_model": "gpt-4-1106-preview", "reasoning_effort": ""},
+    }
+)
 
 
 class LanguageConfig(BaseModel):
     """Which models are used, timeouts, and what a command may spend.
 
     ``base_url`` empty: ``$OPENAI_BASE_URL``, otherwise the service of OpenAI. The key is only read from the environment
-    variable ``key_variable``. ``budget_tokens``, ``budget_usd`` and ``requests_per_minute`` 0: no limit.
+    variable ``key_variable``. ``preset``: the defaults of ``vision_model``, ``text_model`` and ``reasoning_effort``
+    (empty: not sent). ``budget_tokens``, ``budget_usd`` and ``requests_per_minute`` 0: no limit.
     """
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     base_url: str = ""
     key_variable: str = Field(default="OPENAI_API_KEY", pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}$")
-    # The paper's models (section IV-A); OpenAI has withdrawn both since.
-    vision_model: str = Field(default="gpt-4-vision-preview", min_length=1, max_length=200)
-    text_model: str = Field(default="gpt-4-1106-preview", min_length=1, max_length=200)
+    preset: Literal["current", "paper"] = "current"
+    vision_model: str = Field(default=PRESETS["current"]["vision_model"], min_length=1, max_length=200)
+    text_model: str = Field(default=PRESETS["current"]["text_model"], min_length=1, max_length=200)
+    reasoning_effort: str = Field(default=PRESETS["current"]["reasoning_effort"], pattern=r"^[a-z]{0,20}$")
     temperature: float = Field(default=0.0, ge=0, le=2)  # 0: the paper's
     # Sent if a server accepts it; the paper names none.
     seed: int | None = Field(default=0, ge=0, lt=2**31)
@@ -202,7 +217,13 @@ class LanguageConfig(BaseModel):
     max_failures_in_a_row: int = Field(default=5, ge=1)
     budget_tokens: int = Field(default=0, ge=0)
     budget_usd: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    prices: dict[str, Price] = {"gpt-4-vision-preview": _GPT4_TURBO, "gpt-4-1106-preview": _GPT4_TURBO}
+    prices: dict[str, Price] = {name: Price(**one) for name, one in PRICES.items()}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_preset(cls, values: Any) -> Any:
+        known = isinstance(values, dict) and PRESETS.get(str(values.get("preset", "current")))
+        return {**known, **values} if known else values
 
     @field_validator("base_url")
     @classmethod

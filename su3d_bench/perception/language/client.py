@@ -23,7 +23,7 @@ from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Rep
 HOSTED = "https://api.openai.com/v1"
 NO_KEY = "none"  # local servers need no key, but the client library requires some text
 MAX_TOKENS = 100_000_000  # per request; no model reads or writes that many
-OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens", "response_format")
+OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens", "response_format", "reasoning_effort")
 PLACE = "(key)"
 MIN_KEY_LENGTH = 8  # shorter keys are not secret: "none", "EMPTY", "test"
 KEY_LIKE = re.compile(r"\b(?:sk|pk|key|gsk|hf)[-_][A-Za-z0-9_\-*]{6,}", re.IGNORECASE)

@@ -32,9 +32,10 @@ _REFUSAL = re.compile(
 )
 _FENCE = re.compile(r"```[a-zA-Z]*")
 # Name: X, Description: Y, with or without quotes, on one line or two
+_COLON = rf"[{_QUOTE}]*[ \t]*(?::|[ \t][-–—]+[ \t])"
 _LABELLED = re.compile(
-    rf"\b(?:name|object)[{_QUOTE}]*[ \t]*:\s*(?P<name>[^\n:]{{1,80}}?)[,;\s{_QUOTE}]*"
-    rf"\b(?:description|caption)[{_QUOTE}]*[ \t]*:\s*(?P<caption>[^\n]{{1,2000}})",
+    rf"\b(?:name|object){_COLON}\s*(?P<name>[^\n:]{{1,80}}?)[.,;\s{_QUOTE}]*"
+    rf"\b(?:description|caption){_COLON}\s*(?P<caption>[^\n]{{1,2000}})",
     re.IGNORECASE,
 )
 _QUOTED_PAIR = re.compile(
@@ -49,12 +50,21 @@ _NO_NAME = frozenset(
     (
         "is", "are", "was", "be", "am", "i", "you", "we", "it", "its", "they", "cannot", "could", "would", "should",
         "not", "no", "sorry", "based", "list", "given", "names", "name", "assign", "description", "unknown", "none",
-        "null", "error", "unclear", "which", "that", "this", "there", "because", "however", "since", "as", "if",
-        "please", "sure", "here", "unidentified", "unidentifiable", "unrecognized", "unrecognised", "unspecified",
+        "null", "error", "nothing", "which", "that", "this", "there", "because", "however", "since", "as", "if",
+        "please", "sure", "here",
     )
 )  # fmt: skip
-_KEY = re.compile(r"^\s*(?:name|object)\s*:", re.IGNORECASE)
-_NO_OBJECT = frozenset({"object", "objects", "thing", "item", "image", "n/a"})
+_UNNAMED = re.compile(
+    r"\b(un(identif|recogni[sz]|determin|detect|defin|specif|nam|clear|seen)|indetermin|indistinct|indiscern)"
+)
+# What precedes the name in an answer without a description: a key, or the beginning of a sentence.
+_LEAD = re.compile(
+    rf"^[\s{_QUOTE}]*(?:(?:name|object){_COLON}|(?:(?:this|it|the (?:object|image|item))"
+    r"(?: (?:is|appears to be|looks like|shows)|['’]s)\b))",
+    re.IGNORECASE,
+)
+# Last words of names that name nothing: "unidentified object", "blurry item".
+_NO_OBJECT = frozenset({"object", "objects", "thing", "things", "item", "items", "image", "n/a"})
 _KEYS_OF_ERRORS = frozenset({"error", "message", "refusal", "reason", "status"})
 # Ids have 64 bits: a part of a segment has an id of about a dozen digits (opensu3d/postprocess.py).
 _ID = r"\d{1,18}(?!\d)"
@@ -117,11 +127,13 @@ def described(text: str) -> Described | None:
             if (found := next(filter(None, (_pair(*pair) for pair in pairs)), None)) is not None:
                 return found
     patterns = [_LABELLED, _QUOTED_PAIR, *([] if is_refusal(plain) else [_BARE_PAIR])]
-    unlabelled = _KEY.sub("", plain)
-    for match in (match for pattern in patterns for each in (plain, unlabelled) for match in pattern.finditer(each)):
+    unlabelled = _LEAD.sub("", plain)
+    for match in (match for pattern in patterns for each in (unlabelled, plain) for match in pattern.finditer(each)):
         if (found := _pair(match["name"], match["caption"])) is not None:
             return found
-    name = None if is_refusal(plain) or "\n" in plain.strip() else clean_name(unlabelled)
+    if unlabelled != plain:  # what follows the sentence or line of the name describes the object
+        unlabelled = re.split(r"\n|[.;]\s", unlabelled.strip(), maxsplit=1)[0]
+    name = None if is_refusal(plain) or "\n" in unlabelled.strip() else clean_name(unlabelled)
     return None if name is None else Described(name, "")
 
 
@@ -129,7 +141,8 @@ def chosen_name(text: str, names: Sequence[str]) -> str | None:
     """The name chosen by an answer: one of ``names``, in their spelling, or a short noun phrase of its own."""
     plain = _FENCE.sub("", text[:MAX_READ]).strip()
     label = next((value["name"] for value in _json_objects(plain) if isinstance(value.get("name"), str)), plain)
-    lines = [_NAME_LEAD.sub("", line.strip(_QUOTE + " ")) for line in label.splitlines() if line.strip()]
+    stripped = [_LEAD.sub("", line).strip(_QUOTE + " ") for line in label.splitlines() if line.strip()]
+    lines = [_NAME_LEAD.sub("", line) for line in stripped]
     by_words: dict[tuple[str, ...], str] = {}
     for name in names:
         by_words.setdefault(words(name), name)
@@ -186,7 +199,7 @@ def clean_name(text: str) -> str | None:
     name = re.sub(r"^(?:an?|the|some)\s+", "", name).replace("**", "").replace("`", "")
     parts = re.findall(r"[^\W\d_]+", name)
     is_short = len(name) <= MAX_NAME_CHARACTERS and len(name.split()) <= MAX_NAME_WORDS
-    if not parts or not is_short or set(parts) & _NO_NAME or name in _NO_OBJECT:
+    if not parts or not is_short or set(parts) & _NO_NAME or name.split()[-1] in _NO_OBJECT or _UNNAMED.search(name):
         return None
     return None if not name.isprintable() or re.search(r"[{}\[\]<>|\\=:;?!\"]", name) else name
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -29,8 +30,9 @@ from su3d_bench.perception.models.masks import grounded_sam
 from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
 from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
-from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
+from su3d_bench.perception.models.onnx import OnnxManifest, Provider, has_provider, open_session, wrong_files
 
+_log = logging.getLogger(__name__)
 RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
     "torch": ("torch", "transformers"),
@@ -227,10 +229,20 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
             tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
-            return grounded_sam.OnnxRamTagger(
-                partial(open_session, files.weights), tags, content_key(*files.digests().values())
-            )
+            provider, index = provider_for(models, device)
+            key = [] if provider == "cpu" else [provider]
+            load = partial(open_session, files.weights, provider, index)
+            return grounded_sam.OnnxRamTagger(load, tags, content_key(*key, *files.digests().values()))
     return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
+
+
+def provider_for(models: ModelsConfig, device: str) -> tuple[Provider, int]:
+    """The configured provider and GPU of exported models, otherwise that of ``device`` if onnxruntime has it."""
+    provider = models.provider or ("cpu" if device == CPU else "cuda")
+    if models.provider is None and not has_provider(provider):
+        _log.info("exported RAM++ runs on the CPU: this onnxruntime has no CUDA provider")
+        provider = "cpu"
+    return provider, 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
 
 
 def _skip_missing(tagger: str) -> AbstractContextManager[None]:

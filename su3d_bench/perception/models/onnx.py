@@ -19,6 +19,13 @@ PROVIDERS: dict[Provider, str] = {
 }
 
 
+def has_provider(provider: Provider) -> bool:
+    """Whether the installed onnxruntime has ``provider``."""
+    import onnxruntime
+
+    return PROVIDERS[provider] in onnxruntime.get_available_providers()
+
+
 class OnnxManifest(BaseModel):
     """The fields read from every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more fields.
 

@@ -81,7 +81,7 @@ def test_labels_are_compared_with_the_lexicon() -> None:
 
 
 def test_refined_names_are_the_given_ones() -> None:
-    right = RefinedNames(NAMES, "the model m of su3d-bench runs refine, names of 5 views")
+    right = RefinedNames(NAMES, "the model m of the refiner, names of 5 views")
     prediction = named(("couch",) * len(NAMES))
     assert (values(prediction, lambda _: right)["label n"], values(prediction, lambda _: right)["label n'"]) == (0, 1)
     assert "n': the model m" in " ".join(score_scene(RULES, truth(lambda _: right), prediction, None).warnings)
@@ -192,7 +192,7 @@ def test_label_file_is_used_only_with_its_own_map(tmp_path: Path) -> None:
     records = records_of(job, prediction, tops, [RefinedName("sofa", "model", "")] * 8, "model", "m", 5, FilterConfig())
     write_records(job, records)
     found = refined_names(job, prediction)
-    source = "the model m of su3d-bench runs refine, names of 5 views"
+    source = "the model m of the refiner, names of 5 views"
     assert found == RefinedNames(("sofa",) * 8, source, ("",) * 8)
     assert set(refined_digest(job)) == {"refined"}
     write_bytes(job.prediction, b"another map")

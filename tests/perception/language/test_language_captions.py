@@ -51,6 +51,13 @@ class Spoken:
         ("chair", "chair", ""),
         ("object: chair - a wooden chair", "chair", "a wooden chair"),
         ("Object: office chair", "office chair", ""),
+        ("Object: a chair.", "chair", ""),
+        ("**chair**", "chair", ""),
+        ("`Object': `chair'", "chair", ""),
+        ("This is a chair. It is made of wood.", "chair", ""),
+        ("The image shows a chair: it's wooden", "chair", "it's wooden"),
+        ("Name - chair, Description - wooden", "chair", "wooden"),
+        ("label maker: white, on a desk", "label maker", "white, on a desk"),
     ],
 )  # fmt: skip
 def test_name_and_description_are_parsed_from_each_format(text: str, name: str, caption: str) -> None:
@@ -63,6 +70,8 @@ def test_name_and_description_are_parsed_from_each_format(text: str, name: str, 
         "", "   ", "I'm sorry, I can't help with that.", "I cannot: determine what it is", "`name':`description'",
         '{"error": "cannot identify"}', "{" * 5000, "unknown: the object is not visible", "\x1b[31m", "?" * 9000,
         "As an AI, I cannot see images.", "Unidentified object", "`Unidentified object':`A blurred shape'",
+        "I cannot identify the object", "unknown", "Unknown object", "object: unknown", "undetectable", "nothing",
+        "Object: Undefined - blurry", "A blurry object", "The object is unidentifiable.", "mystery item",
     ],
 )  # fmt: skip
 def test_refusals_echoes_and_noise_give_no_caption(text: str) -> None:
@@ -82,6 +91,9 @@ def test_refusals_echoes_and_noise_give_no_caption(text: str) -> None:
         ("I would call it a sofa", "sofa"),
         ("furniture", "furniture"),
         ("Name: settee", "settee"),
+        ("Object: a settee.", "settee"),
+        ("Unidentified object", None),
+        ("unknown", None),
         ("I'm sorry, I can't do that.", None),
         ("Based on the list, this seems to be upholstery, but I cannot say.", None),
         ("It could be a sofa or a trash can, it is hard to say.", None),
@@ -124,7 +136,10 @@ def test_each_crop_is_sent_with_the_paper_prompt() -> None:
     assert [(one.name, one.caption, one.source) for one in captions] == [("lamp", "A lit lamp.", "model")] * 2
     request = model.requests[0]
     assert request.text == "Give name and description to the object. Output e.g. `name':`description'"
-    assert (request.model, request.temperature) == ("gpt-4-vision-preview", 0.0)
+    assert (request.model, request.temperature, request.reasoning_effort) == ("gpt-6-luna", 0.0, "none")
+    papers = Captioner(model, LanguageConfig(preset="paper")).requests(crops)[0]
+    assert (papers.model, papers.reasoning_effort) == ("gpt-4-vision-preview", "")
+    assert "reasoning_effort" not in papers.body() and papers.key != request.key
     assert captions[0].key != captions[1].key
 
 

@@ -18,7 +18,7 @@ from synthetic_sheets import made
 from su3d_bench.cli.main import main
 from su3d_bench.human_eval.scores import ReviewItem, review_items_page
 from su3d_bench.human_eval.sets import PAGE, write_sheets
-from su3d_bench.reports.pictures.items import png_bytes
+from su3d_bench.reports.pictures.items import jpeg_bytes
 
 LONG = "the chair with a very long name that was given to it by nobody in particular and goes on"
 
@@ -40,9 +40,9 @@ def page_of_annotation(folder: Path) -> Path:
 
 def page_of_second_looks(folder: Path) -> Path:
     """The list of items to review of ``sheets score``."""
-    (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
+    (folder / "item-1.jpg").write_bytes(jpeg_bytes(np.full((400, 1200, 3), 90, np.uint8)))
     look = ReviewItem(
-        "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.png",),
+        "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.jpg",),
         {"annotator-1": "right", "annotator-2": "wrong"}, "right", "annotators disagree",
     )  # fmt: skip
     page = folder / "review_items.html"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,9 @@ import chromium
 import pytest
 import runs_page
 from chromium import Chromium, needs_chromium
-from page_checks import WHOLE, complaints
+from page_checks import DESKTOP, PHONE, WHOLE, complaints, seen_as
+from PIL import Image
+from waiting import wait_until
 
 pytestmark = needs_chromium
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
@@ -66,6 +69,32 @@ def test_header_sorts_in_both_directions_by_mouse_and_keyboard(browser: Chromium
     assert [float(value.split()[0]) for value in runs_page.column(browser, "summary", 1)] == sorted(values)
 
 
+def test_every_table_and_plot_is_downloaded_without_a_server(browser: Chromium, tmp_path: Path) -> None:
+    browser.downloads_to(tmp_path)
+    browser.run("document.querySelectorAll('#summary .get button')[0].click()")
+    browser.run("document.querySelectorAll('#errors .get button')[0].click()")
+    browser.run("document.querySelectorAll('#timing .get button')[0].click()")
+    wait_until(lambda: len([*tmp_path.glob("*.csv")]) == 2 and len([*tmp_path.glob("*.png")]) == 1, "no files", 60)
+    (table,) = tmp_path.glob("*summary.csv")
+    head, *rows = csv.reader(table.read_text(encoding="utf-8-sig").splitlines())
+    assert head[0] == "Method" and {"mAcc", "mAcc low", "mAcc high", "mAcc ceiling"} <= set(head) and len(rows) == 3
+    assert all(0 <= float(row[head.index("mAcc")]) <= 1 for row in rows)
+    (plot,) = tmp_path.glob("*.png")
+    with Image.open(plot) as image:
+        assert image.width == 2 * 760 and len(image.convert("RGB").getcolors(1 << 20) or ()) > 10
+    n_parts = browser.run("document.querySelectorAll('#main .wide').length")
+    assert browser.run("document.querySelectorAll('#main .get button').length") == n_parts
+
+
+def test_tables_that_scroll_sideways_say_so(browser: Chromium) -> None:
+    shown = "[...document.querySelectorAll('#summary .scrolls')].map((one) => !one.hidden)"
+    scrolls = "[...document.querySelectorAll('#summary .wide')].map((one) => one.scrollWidth > one.clientWidth + 1)"
+    for size in (PHONE, DESKTOP):
+        with seen_as(browser, size=size):
+            browser.until(f"JSON.stringify({shown}) === JSON.stringify({scrolls})")
+            assert any(browser.run(shown)) is (size == PHONE)
+
+
 # Operates the k-th control of a kind in a section; returns whether it could (a select with one option cannot change).
 OPERATE = """(part, kind, k) => {
   const one = document.querySelectorAll(`${part} ${kind}`)[k];
@@ -91,9 +120,9 @@ def test_each_control_changes_its_section(browser: Chromium, part: str) -> None:
         runs_page.choose(
             browser, part, "Method", next(one for one in runs_page.options(browser, part, "Method") if "noise" in one)
         )
-    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort, .to-gallery)"):
+    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort, .to-gallery, .download)"):
         for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
-            is_of_view = part == "maps" and kind == "button:not(.sort, .to-gallery)"
+            is_of_view = part == "maps" and kind == "button:not(.sort, .to-gallery, .download)"
             if is_of_view:  # so that the picture differs from the view of the whole map
                 runs_page.press(browser, "#maps canvas", "ArrowLeft")
             before, seen = browser.run(shown), runs_page.picture(browser) if is_of_view else b""

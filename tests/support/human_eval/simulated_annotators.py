@@ -108,10 +108,10 @@ def as_csv(rows: Sequence[AnswerRow], separator: str = ",") -> str:
     return text.getvalue()
 
 
-def workbook(rows: Sequence[AnswerRow], header_at: int = 1) -> bytes:
+def workbook(rows: Sequence[AnswerRow], header_at: int = 1, columns: Sequence[str] = ANSWER_COLUMNS) -> bytes:
     """The rows as a workbook, possibly with instructions above its header."""
     book = openpyxl.Workbook()
-    for k, name in enumerate(ANSWER_COLUMNS, 1):
+    for k, name in enumerate(columns, 1):
         for number, value in enumerate((name, *(getattr(row, name) for row in rows)), header_at):
             book.active.cell(number, k).value = value
     stream = io.BytesIO()

@@ -12,7 +12,7 @@ from su3d_bench.core.errors import printable
 from su3d_bench.human_eval.drafts import Draft
 from su3d_bench.human_eval.items import ASKS, Key, SheetKind
 from su3d_bench.human_eval.sets import GeneratedSheets, make_sheets
-from su3d_bench.reports.pictures.items import png_bytes
+from su3d_bench.reports.pictures.items import jpeg_bytes
 
 METHODS = ("collector", "collector@noise_m=0.0", "collector@drop=1")
 HOSTILE = (
@@ -53,7 +53,7 @@ def drafts_of(kind: SheetKind, texts: Sequence[str]) -> list[Draft]:
 def painted_png(draft: Draft) -> bytes:
     """A picture with a colour determined by the draft's text."""
     shade = np.frombuffer(draft.text.encode()[:3].ljust(3), np.uint8)
-    return png_bytes(np.tile(shade, (60, 80, 1)).astype(np.uint8))
+    return jpeg_bytes(np.tile(shade, (60, 80, 1)).astype(np.uint8))
 
 
 def made(

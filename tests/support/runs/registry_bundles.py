@@ -28,7 +28,8 @@ def painted_bundle(
     """``folder/name.zip``: variants of the painted collector; it uses its own code, so verifiers reject it."""
     named = [f"{COLLECTOR}{method}" for method in methods]
     painted_run(folder / "runs" / name, "--quiet", *more, methods=named, scenes=scenes)
-    bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], printed)
+    stated = {"trained_on": printed, "authors": printed, "link": "https://example.org/method" if printed else ""}
+    bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], **stated)
     return folder / f"{name}.zip"
 
 

@@ -24,7 +24,7 @@ SHORTEST_PX, LONGEST_PX = 800, 1333
 
 
 class BoxConfig(BaseModel):
-    """Which boxes count; the defaults are the paper's (section IV-A: box and text 0.25, IoU 0.4).
+    """Which boxes count; the defaults are the paper's (section III-A: box and text 0.25, IoU 0.4).
 
     ``names``: a box is named by its matching ``phrase``, as in the Grounded-SAM demonstrations; by the first tag that
     contains the phrase's ``first-word``, otherwise by the first of all tags, as in ConceptGraphs; or by the whole
