@@ -139,14 +139,18 @@ def geometric_edges(
 ) -> Edges:
     """The first relation of each ordered pair of named boxes (K, 2, 3), if it is a predicate.
 
-    In the order of ``RELATIONS``. ``sure`` excludes those of ``Relations.doubtful``.
+    In the order of ``RELATIONS``. ``sure`` excludes those of ``Relations.doubtful``, and has every fact once: neither
+    "under" as the reverse of "on" or "above", nor "next to" from the larger object.
     """
     relations = Relations(boxes, [last_word(name) for name in names])
     asked: list[Relation] = [name for name in RELATIONS if name in predicates]
     edges: Edges = {}
     for name in asked:
         holds: BoolArray = relations.of(name)
-        kept = holds & ~relations.doubtful(name) if sure else holds
+        kept = relations.facts(name) & ~relations.doubtful(name) if sure else holds
+        if sure and name == "next to":
+            faces = relations.faces
+            kept &= (faces[:, None] < faces[None]) | np.triu(faces[:, None] == faces[None])
         for pair in np.argwhere(holds).tolist():
             edges.setdefault((pair[0], pair[1]), list(predicates).index(name) if kept[tuple(pair)] else -1)
     return {pair: place for pair, place in edges.items() if place >= 0}
@@ -238,6 +242,9 @@ class RelationMetric(Metric[RelationCounts]):
             edges: Edges = {}
             for pair, place in zip(own.edges.tolist(), best.tolist(), strict=True):
                 edges.setdefault((pair[0], pair[1]), place)
+            for (a, b), place in list(edges.items()) if rules.relations == "geometric" else ():
+                if place >= 0 and rules.predicates[place] == "next to":
+                    edges.setdefault((b, a), place)
             return edges, None
         related = np.flatnonzero((called >= 0) & (masks.sizes > 0))
         if len(related) > MAX_RELATED:

@@ -45,7 +45,8 @@ CONTAINERS = frozenset(
 SHELVES = frozenset({"shelf", "bookshelf", "bookcase", "rack"})
 SEATS = frozenset({"sofa", "couch", "loveseat", "chair", "armchair", "recliner", "bench", "stool", "bed", "futon"})
 FIXTURES = frozenset({"window", "door", "vent", "switch", "plug", "outlet", "socket", "blinds", "blind", "radiator"})
-BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove"})  # "under the sink" is in its cabinet
+# "Under the sink" is in its cabinet.
+BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove", "countertop", "worktop"})
 FLOORS = frozenset({"floor", "ground"})
 SURFACES = FLOORS | {"wall", "ceiling", "roof"}  # of the room itself
 BAND = 1.25  # a relation is doubtful if a threshold lower or higher by this factor changes it
@@ -75,6 +76,7 @@ class Relations:
         self._is_fixture = np.array([name in FIXTURES for name in names], bool)
         self._is_thing = np.array([name not in SURFACES for name in names], bool)
         self._is_floor = np.array([name in FLOORS for name in names], bool)
+        self._is_built_in = np.array([name in BUILT_IN for name in names], bool)
         self._slack = slack
 
     def __len__(self) -> int:
@@ -83,6 +85,29 @@ class Relations:
     def of(self, relation: Relation) -> BoolArray:
         """Which pairs (K, K) are in ``relation``."""
         return np.asarray(getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation)))
+
+    def usual(self, relation: Relation) -> BoolArray:
+        """The pairs (K, K) for which people say so: not a window above a bed, nor a sink on a countertop."""
+        is_usual = np.ones((len(self), len(self)), bool)
+        if relation in ("above", "under"):
+            is_usual &= ~(self._is_fixture[:, None] | self._is_fixture[None])
+        if relation == "above":  # a picture is above the cabinet, not above the candle on it
+            is_usual &= ~(self.holders.any(axis=1) & ~self._is_built_in)[None]
+        is_built_in = {"on": self._is_built_in[:, None], "under": self._is_built_in[None]}.get(relation, np.False_)
+        return np.asarray(is_usual & ~is_built_in)
+
+    @cached_property
+    def faces(self) -> Float64Array:
+        """Square metres (K,): the product of the two longest sides."""
+        return np.asarray(np.prod(np.sort(self._boxes[:, 1] - self._boxes[:, 0], axis=1)[:, 1:], axis=1))
+
+    def facts(self, relation: Relation) -> BoolArray:
+        """The usual pairs (K, K) in ``relation`` that do not repeat another relation.
+
+        "Under" is not the reverse of "on" or "above": the first is beneath the second and does not carry it.
+        """
+        holds = self.of(relation) & self.usual(relation)
+        return np.asarray(holds & ~(self.on | self.above).T if relation == "under" else holds)
 
     def doubtful(self, relation: Relation) -> BoolArray:
         """The pairs (K, K) that a slightly different threshold, or another reading of the word, would change."""
@@ -166,9 +191,10 @@ class Relations:
     @cached_property
     def _is_over(self) -> BoolArray:
         """Half of the first, or its centre, is over the footprint of the second."""
-        share = self._shared(OVER_PAD_M) / self._area[:, None]
+        pad_m = OVER_PAD_M * self._slack
+        share = self._shared(pad_m) / self._area[:, None]
         centre = self._boxes.mean(axis=1)[:, None, :2]
-        low, high = self._boxes[:, 0, :2] - OVER_PAD_M, self._boxes[:, 1, :2] + OVER_PAD_M
+        low, high = self._boxes[:, 0, :2] - pad_m, self._boxes[:, 1, :2] + pad_m
         has_centre = ((centre >= low[None]) & (centre <= high[None])).all(axis=2)
         return np.asarray((share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack)))
 

@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.english import is_plural, with_article, words
+from su3d_bench.core.english import is_countable, is_plural, last_word, with_article, words
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
-from su3d_bench.numerics.relations import gap_m
-from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES
-from su3d_bench.questions.generator import TWICE, generate, is_flat
+from su3d_bench.numerics.relations import BUILT_IN, FLAT_M, gap_m
+from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT
+from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, is_flat, may_be_confused
 from su3d_bench.questions.model import KINDS, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 
@@ -40,7 +40,7 @@ def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, max_objects: 
     """The text chains of at most ``max_objects`` objects of a scene, over its ground-truth instances."""
     owner = truth.instance.astype(np.int64)
     owner[owner <= 0] = -1
-    cases = chains_of(generate(scene, objects), objects, max_objects)
+    cases = chains_of(generate(scene, objects, both=True), objects, max_objects)
     source = f"chains made from {truth.source}"
     return QueryTruth(truth.points, owner, cases, truth.variant, source, truth.labels.space)
 
@@ -65,7 +65,7 @@ def _chains(questions: Sequence[Question], objects: SceneMap) -> Iterator[tuple[
     """Each object with three chains, and the chains with the most specific text first."""
     name_of = {question.text: question for question in questions if question.kind == INSTANCE}
     for thing in objects.objects:
-        coarse = name_of.get(thing.name)
+        coarse = name_of.get(thing.name) if is_countable(thing.name) else None
         fine = [] if coarse is None else _meaning(thing.id, questions)
         if coarse is not None and len(fine) >= CHAINS_EACH:
             yield thing, [[one, coarse] for one in fine[:CHAINS_EACH]]
@@ -102,7 +102,6 @@ def _tags(question: Question) -> frozenset[str]:
 
 MIN_HEIGHT_RATIO = 1.5  # ours: the height ratio from which taller is undisputed
 LEAD_M, FAR_M = 0.5, 1.5  # ours: the margin of the closer one; the distance from which it is clearly not next to it
-MAX_UNQUOTED_WORDS = 3  # words of a text that needs no quotation marks in a question
 MAX_PER_TEMPLATE = 4  # questions of one template about one object
 
 
@@ -123,7 +122,7 @@ def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -
     """
     grounding: dict[str, Any] = {}
     asked: dict[str, Any] = {}
-    questions = generate(scene, objects)
+    questions = generate(scene, objects, both=True)
     cases = {case.text: case for case in chains_of(questions, objects)}
     for thing, chains in _chains(questions, objects):
         texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
@@ -183,7 +182,9 @@ def _digest(text: str) -> bytes:
 
 def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """All questions about an object referred to by an unambiguous text."""
-    it = f"the {text}" if len(text.split()) <= MAX_UNQUOTED_WORDS else f"'the {text}'"
+    name, _, where = text.partition(f"{thing.name} ")
+    verb = "are" if is_plural(thing.name) else "is"
+    it = f"the {text}" if name or where.startswith("with ") else f"the {thing.name} that {verb} {where}"
     colours = sorted(set(thing.caption.split()) & COLOURS)
     if len(colours) == 1:
         yield ChainQuestion(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
@@ -192,15 +193,18 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
         for word, answer in ((colours[0], "Yes"), (other, "No")):
             yield ChainQuestion(f"Is {it} {word}?", answer, "appearance", colours[0])
     alone = [other for other in objects.objects if _is_alone(other, objects) and other.id != thing.id]
-    yield from _support_question(thing, it, objects)
-    yield from _measured(thing, it, alone)
+    if name:
+        yield from _support_question(thing, it, objects)
+    yield from _measured(thing, it, alone, objects)
     yield from _beside(thing, it, alone, objects)
-    yield from _existing(thing, it, objects)
+    if "next to" not in text:
+        yield from _existing(thing, it, objects)
 
 
 def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
     """Whether an object is the only one of its name and clearly visible."""
-    return thing.is_query_target and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
+    is_one = is_countable(thing.name) and not is_plural(thing.name)
+    return thing.is_query_target and is_one and len(_called(thing.name, objects)) == 1
 
 
 def _called(name: str, objects: SceneMap) -> list[MapObject]:
@@ -218,7 +222,7 @@ def _support_question(thing: MapObject, it: str, objects: SceneMap) -> Iterator[
         yield ChainQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
 
 
-def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[ChainQuestion]:
+def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
     """Height and size comparisons with a clear margin, between completely observed objects."""
     ways = 0
     for other in sorted(alone, key=lambda other: _digest(f"{it} {other.name}")):
@@ -226,10 +230,12 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator
             return
         high, low = float(thing.size[2]), float(other.size[2])
         volumes = float(np.prod(thing.size)), float(np.prod(other.size))
-        if max(high, low) >= MIN_HEIGHT_RATIO * min(high, low):
+        built_in = {last_word(thing.name), last_word(other.name)} & BUILT_IN
+        is_level = not built_in and objects.are_in_one_place(thing, other)
+        if is_level and max(high, low) >= MIN_HEIGHT_RATIO * min(high, low) > FLAT_M:
             answer = "Taller" if high > low else "Shorter"
             text = f"Is {it} taller or shorter than the {other.name}?"
-        elif max(volumes) >= TWICE * min(volumes) and not (is_flat(thing) or is_flat(other)):
+        elif max(volumes) >= TWICE * min(volumes) and _has_volume(thing) and _has_volume(other):
             answer = "Larger" if volumes[0] > volumes[1] else "Smaller"
             text = f"Is {it} larger or smaller than the {other.name}?"
         else:
@@ -238,10 +244,15 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator
         yield ChainQuestion(text, answer, "geometry", f"{answer} {other.name}")
 
 
+def _has_volume(thing: MapObject) -> bool:
+    """Whether its volume is a meaningful size."""
+    return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
+
+
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object is next to another, and which of two is closer by a clear margin."""
     for other in alone:
-        if objects.is_doubtful("next to", thing, other):
+        if objects.is_doubtful("next to", thing, other) or "next to" in it:
             continue
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
@@ -266,7 +277,8 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQue
         if any(objects.is_doubtful("next to", other, thing) for other in others):
             continue
         plain = [other.is_query_target for other, holds in zip(others, is_next, strict=True) if holds]
-        is_far = all(gap_m(thing.box, other.box) > FAR_M for other in others)
+        alike = (other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name))
+        is_far = all(gap_m(thing.box, other.box) > FAR_M for other in alike)
         answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1

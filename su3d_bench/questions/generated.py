@@ -24,23 +24,22 @@ from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
-from su3d_bench.numerics.relations import Relation, gap_m
+from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
-from su3d_bench.questions.generator import extreme_of, is_flat
+from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
 from su3d_bench.questions.model import Answer
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
-MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of the longest side compared
+MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of its distance and the longest side
 LEVEL_M = 0.75  # objects whose centres differ more in height are not compared by distance
 FAR_M = 1.5  # minimum distance of objects in questions with the answer no
 MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
-PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated per row or pile
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",)})  # annotated per pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
-CENTRES = ", measured between centres"
 Random = np.random.Generator
 
 
@@ -112,7 +111,7 @@ class _Drafts:
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
         single = [one for one in self._things if self._n_of[one.name] == 1]
-        single = [one for one in single if not is_plural(one.name) and not one.is_cut]
+        single = [one for one in single if is_countable(one.name) and not is_plural(one.name) and not one.is_cut]
         self._single = [single[k] for k in sorted(random.permutation(len(single))[:MAX_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
@@ -139,18 +138,19 @@ class _Drafts:
         for reference in self._single:
             for name, n in self._n_of.items():
                 several = [thing for thing in self._things if thing.name == name]
-                if n > 1 and _leads(several, reference, sign):
+                if n > 1 and is_countable(name) and _leads(several, reference, sign):
                     verb = "are" if is_plural(name) else "is"
                     words = of_two if n == 2 else of_more
-                    yield _Draft(f"Which {name} {verb} {words} the {reference.name}{CENTRES}?", 1 / n, 1 / n)
+                    yield _Draft(f"Which {name} {verb} {words} the {reference.name}?", 1 / n, 1 / n)
 
     def _nearest(self) -> Iterator[_Draft]:
         for reference in self._single:
             others = [thing for thing in self._all if thing is not reference]
             ranked = sorted(others, key=partial(_away_m, reference))
-            if len(ranked) > 1 and _leads(ranked[:2], reference, 1):
+            is_clear = len(ranked) > 1 and not self._scene.is_of(ranked[0], reference)
+            if is_clear and _leads(ranked[:2], reference, 1) and _leads_by_gap(ranked, reference, 1):
                 share = 1 / len(others)
-                yield _Draft(f"Which object is closest to the {reference.name}{CENTRES}?", share, share)
+                yield _Draft(f"Which object is closest to the {reference.name}?", share, share)
 
     def _distances(self) -> Iterator[_Draft]:
         pairs = [(a, b, _away_m(a, b)) for a, b in combinations(self._single, 2)]
@@ -160,19 +160,26 @@ class _Drafts:
             yield _Draft(f"What is the distance between the centres of the {a.name} and the {b.name}?", share, share)
 
     def _counts(self) -> Iterator[_Draft]:
-        """Counts for every name, and for equally many absent names."""
-        counted = {name: len(noun_objects(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
+        """Counts for every name, and for some absent names, unless other objects might be called so."""
         absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
-        absent = [name for name in absent if _is_counted(name) and not noun_objects(name, self._scene).objects]
+        names = [name for name in (*self._n_of, *absent) if _is_counted(name) and self._is_distinct(name)]
+        n_of = {name: len(noun_objects(name, self._scene).objects) for name in names}
+        counted = {name: n for name, n in n_of.items() if name in self._n_of}
+        absent = [name for name, n in n_of.items() if not n]
         counted |= {absent[k]: 0 for k in self._random.permutation(len(absent))[: max(1, len(counted) // 4)]}
         of_value = Counter(counted.values())
         for name, n in counted.items():
             yield _Draft(f"How many {plural(name)} are there?", of_value[n] / len(counted), 1.0, str(n))
 
+    def _is_distinct(self, name: str) -> bool:
+        """Whether no object might be called so except those that the solver finds by the name."""
+        meant = noun_objects(name, self._scene).objects
+        return not any(may_be_confused(name, thing.name) for thing in self._all if thing not in meant)
+
     def _largest(self) -> Iterator[_Draft]:
         for name, n in self._n_of.items():
             named = [thing for thing in self._things if thing.name == name]
-            if n < 2 or any(map(is_flat, named)) or not all(thing.is_whole for thing in named):
+            if n < 3 or any(map(is_flat, named)) or not all(thing.is_whole for thing in named):
                 continue
             if extreme_of(named, 1) is not None:
                 yield _Draft(f"Which {name} is the largest?", 1 / n, 1 / n)
@@ -181,7 +188,7 @@ class _Drafts:
         for reference in self._single:
             for a, b in combinations([thing for thing in self._single if thing is not reference], 2):
                 if _leads([a, b], reference, 1):
-                    text = f"Which is closer to the {reference.name}{CENTRES}, the {a.name} or the {b.name}?"
+                    text = f"Which is closer to the {reference.name}, the {a.name} or the {b.name}?"
                     yield _Draft(text, 0.5, 0.5, "first" if _away_m(a, reference) < _away_m(b, reference) else "second")
 
     def _between(self) -> Iterator[_Draft]:
@@ -198,7 +205,7 @@ class _Drafts:
     def _what(self, relation: Relation) -> Iterator[_Draft]:
         for reference in self._single:
             pairs = [(thing, reference) for thing in self._all if thing is not reference]
-            if not all(self._scene.is_usual(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
+            if not self._are_facts(relation, pairs):
                 continue
             related = [pair for pair in pairs if self._holds(relation, *pair)]
             if related and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
@@ -207,29 +214,34 @@ class _Drafts:
 
     def _is(self, relation: Relation) -> Iterator[_Draft]:
         """Whether an object of a name is in a relation; negative examples are far away."""
-        subjects = {
-            a.name for a in self._things if any(self._holds(relation, a, b) for b in self._single if a is not b)
-        }
+        # a table is on a rug, but on nothing else
+        holders = [thing for thing in self._single if thing.size[2] > FLAT_M]
+        subjects = {a.name for a in self._things if any(self._holds(relation, a, b) for b in holders if a is not b)}
         for reference in self._single:
             pairs_of = {
                 name: [(a, reference) for a in self._things if a.name == name]
                 for name in self._n_of
-                if name != reference.name
+                if name != reference.name and (relation != "next to" or self._scene.is_located_by(name, reference.name))
             }
             is_locked = {name: any(self._holds(relation, *pair) for pair in pairs) for name, pairs in pairs_of.items()}
             for name, pairs in pairs_of.items():
-                is_far = all(gap_m(a.box, b.box) > FAR_M for a, b in pairs)
+                alike = [thing for thing in self._all if may_be_confused(name, thing.name)]
+                is_far = all(gap_m(thing.box, reference.box) > FAR_M for thing in alike)
                 is_sure = not any(self._scene.is_doubtful(relation, *pair) for pair in pairs)
-                is_sure &= all(self._scene.is_usual(relation, *pair) for pair in pairs)
+                is_sure &= self._are_facts(relation, pairs)
                 if is_sure and (is_locked[name] or (is_far and name in subjects and any(is_locked.values()))):
                     verb, noun = ("Are", name) if is_plural(name) else ("Is", with_article(name))
                     text = f"{verb} there {noun} {relation} the {reference.name}?"
                     yield _Draft(text, 0.5, 0.5, "yes" if is_locked[name] else "no")
 
+    def _are_facts(self, relation: Relation, pairs: Iterable[tuple[MapObject, MapObject]]) -> bool:
+        """Whether every pair in the relation is natural and repeats no other relation."""
+        return all(self._scene.is_fact(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair))
+
     def _holds(self, relation: Relation, a: MapObject, b: MapObject) -> bool:
         """Whether the relation holds in common usage: a cushion within the box of a sofa is on it, not in it."""
         is_also_on = relation == "in" and self._scene.holds("on", a, b)
-        return self._scene.holds(relation, a, b) and not is_also_on
+        return self._scene.is_fact(relation, a, b) and not is_also_on
 
     def _sides(self) -> Iterator[_Draft]:
         for a, b in combinations(self._single, 2):
@@ -246,16 +258,23 @@ def _away_m(a: MapObject, b: MapObject) -> float:
 
 
 def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
-    """Whether the nearest object (farthest, ``sign`` -1) leads by a clear margin, all at a similar height."""
+    """Whether the nearest object (farthest, ``sign`` -1) leads clearly, between centres and between sides."""
     heights = [thing.centroid[2] for thing in (*things, reference)]
     if any(thing.is_cut for thing in things):
         return False
     if len(things) < 2 or max(heights) - min(heights) > LEVEL_M:
         return False
-    ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))[:2]
-    sides = [float(thing.size.max()) for thing in (*ranked, reference)]
-    lead_m = abs(_away_m(ranked[1], reference) - _away_m(ranked[0], reference))
-    return lead_m >= max(MARGIN_M, MARGIN_SHARE * max(sides))
+    ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))
+    sides = [float(thing.size.max()) for thing in (*ranked[:2], reference)]
+    first_m, second_m = sorted(_away_m(thing, reference) for thing in ranked[:2])
+    margin_m = max(MARGIN_M, MARGIN_SHARE * max(first_m, *sides))
+    return second_m - first_m >= margin_m and _leads_by_gap(ranked, reference, sign)
+
+
+def _leads_by_gap(ranked: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
+    """Whether the first object also leads in the distance from side to side, which others may have in mind."""
+    first, *others = [sign * gap_m(thing.box, reference.box) for thing in ranked]
+    return min(others) - first >= MARGIN_M
 
 
 RANDOM, POPULAR, ADVERSARIAL = SAMPLINGS
@@ -288,12 +307,12 @@ def presence_questions(
 
 
 def absent_names(truth: GroundTruth, objects: SceneMap) -> tuple[str, ...]:
-    """The classes of the label set that match no object of the scene, however small."""
+    """The classes of the label set that nobody would name an object of the scene by, however small."""
     ids = np.unique(truth.semantic)
     there = {plain_name(truth.labels.name_of(int(class_id))) for class_id in ids[ids > 0]}
     there |= {thing.name for thing in objects.objects}
     names = dict.fromkeys(plain_name(name) for name in truth.labels.names)
-    return tuple(name for name in names if _is_name(name) and not any(_may_be(name, known) for known in there))
+    return tuple(name for name in names if _is_name(name) and not any(may_be_confused(name, known) for known in there))
 
 
 def _is_name(name: str) -> bool:

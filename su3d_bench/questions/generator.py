@@ -12,7 +12,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations
 from pathlib import Path
 
@@ -21,6 +21,7 @@ import numpy as np
 from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
+from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
 from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
@@ -43,11 +44,14 @@ class _Asked:
     name: str = ""
 
 
-def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
-    """The questions of all kinds, at most ``per_kind`` of each, drawn deterministically by a digest of the text."""
+def generate(scene: str, objects: SceneMap, per_kind: int | None = None, *, both: bool = False) -> tuple[Question, ...]:
+    """The questions of all kinds, at most ``per_kind`` of each, drawn deterministically by a digest of the text.
+
+    ``both``: a relation describes each of its two objects, not only one ("table with a cup on it").
+    """
     right: dict[tuple[str, str, str], set[int]] = {}
     doubtful: set[str] = set()
-    for asked in _texts(objects):
+    for asked in (*_texts(objects), *_relations(objects, both=both)):
         if asked.answers:
             right.setdefault((asked.kind, asked.text, asked.name), set()).update(asked.answers)
         else:
@@ -89,9 +93,29 @@ def accuracy_by_name(question: Question, objects: SceneMap) -> float:
 
 @cache
 def _table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it."""
+    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it; ``confused``: groups."""
     table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
     return {phrase: tuple(entries) for phrase, entries in table[section].items()}
+
+
+@lru_cache(maxsize=65_536)
+def may_be_confused(one: str, other: str) -> bool:
+    """Whether people may use one of two names for an object of the other.
+
+    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
+
+    >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
+    (True, True, False)
+    """
+    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
+
+
+@cache
+def _heads(name: str) -> frozenset[str]:
+    """The head noun of a name, the name, its synonyms, and the groups of these."""
+    names = (last_word(name), name, *SYNONYMS.get(name.replace(" ", "-"), ()))
+    heads = {" ".join(words(one)) for one in names}
+    return frozenset(heads | {group for group, nouns in _table("confused").items() if not heads.isdisjoint(nouns)})
 
 
 def _texts(objects: SceneMap) -> Iterator[_Asked]:
@@ -108,7 +132,6 @@ def _texts(objects: SceneMap) -> Iterator[_Asked]:
     yield from _sizes(objects)
     yield from _adjectives(objects)
     yield from _looks(objects)
-    yield from _relations(objects)
     yield from _between(objects)
 
 
@@ -140,12 +163,14 @@ def is_flat(thing: MapObject) -> bool:
 
 
 def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
-    """The largest (``sign`` 1) or smallest (-1), if it leads twofold in volume and in its longest side, else None."""
+    """The largest (``sign`` 1) or smallest (-1) in every side, if it leads twofold in volume and visibly in length."""
     ranked = sorted(things, key=lambda thing: -sign * float(np.prod(thing.size)))
-    volumes, sides = ([measure(thing.size) for thing in ranked] for measure in (np.prod, np.max))
+    volumes = [np.prod(thing.size) for thing in ranked]
     if len(ranked) < 2 or max(volumes[:2]) < TWICE * min(volumes[:2]):
         return None
-    return ranked[0] if all(sign * (sides[0] - side) > 0 for side in sides[1:]) else None
+    first, *others = [np.sort(thing.size) for thing in ranked]  # a floor lamp is not larger than a wide one
+    lead = np.array([1.0, 1.0, LEAD**sign])
+    return ranked[0] if all((sign * (first - lead * other) >= 0).all() for other in others) else None
 
 
 def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
@@ -214,21 +239,27 @@ def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Itera
             yield _Asked("property", f"{less} {name}", (ids[0],), name)
 
 
-def _relations(objects: SceneMap) -> Iterator[_Asked]:
-    """Relations that hold with certainty; if a pair of these names is doubtful, the text is not asked."""
+def _relations(objects: SceneMap, *, both: bool) -> Iterator[_Asked]:
+    """Relations that hold with certainty, each once; if a pair of these names is doubtful, the text is not asked."""
     things = objects.objects
     for relation in RELATIONS:
         if relation == "near":
             continue
-        related, doubtful = objects.relations.of(relation), objects.doubtful[relation]
+        related, doubtful = objects.relations.facts(relation), objects.doubtful[relation]
+        is_usual = objects.relations.usual(relation)
         if relation == "in":
             related = related & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
         for a, b in np.argwhere(related | doubtful).tolist():
             subject, other = things[a], things[b]
             text = f"{subject.name} {relation} {with_article(other.name)}"
-            if subject.name != other.name and objects.is_usual(relation, subject, other):
-                is_sure = not doubtful[a, b] and other.is_query_target
+            is_asked = subject.name != other.name and is_usual[a, b]
+            is_sure = not doubtful[a, b] and other.is_query_target
+            if is_asked and (both or relation != "next to" or objects.is_located_by(subject.name, other.name)):
                 yield _Asked("relative", text, (subject.id,) if is_sure else (), subject.name)
+            if is_asked and both and relation == "on":
+                text = f"{other.name} with {with_article(subject.name)} on it"
+                is_sure &= subject.is_query_target
+                yield _Asked("relative", text, (other.id,) if is_sure else (), other.name)
 
 
 def _between(objects: SceneMap) -> Iterator[_Asked]:

@@ -19,7 +19,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
-from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, RELATIONS, SURFACES, Relation, Relations
+from su3d_bench.numerics.relations import RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
 
@@ -101,25 +101,29 @@ class SceneMap:
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object is between two others; objects on or in one of them, or under it, are not."""
-        return geometry.is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.is_between(thing.box, first.box, second.box) and not self.is_of(thing, first, second)
 
     def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object could be called between two others."""
-        return geometry.may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.may_be_between(thing.box, first.box, second.box) and not self.is_of(thing, first, second)
 
-    def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
+    def is_of(self, thing: MapObject, *ends: MapObject) -> bool:
         """Whether an object is one of ``ends``, or on or in one, or the reverse."""
         pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
         return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
-    @staticmethod
-    def is_usual(relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether the relation is natural for such objects: windows, blinds and vents are above everything."""
-        if relation not in ("above", "under"):
-            return True
-        if relation == "under" and last_word(other.name) in BUILT_IN:
-            return False
-        return {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
+    def is_fact(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether the relation holds, is natural, and does not repeat another one ("under" for "on")."""
+        return bool(self.relations.facts(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def is_located_by(self, name: str, other: str) -> bool:
+        """Whether a ``name`` is said to be next to an ``other``, which is the larger of the two, and not the reverse.
+
+        Source: Talmy 1983, How language structures space: a reference object is larger and easier to see.
+        """
+        faces = [(self.objects[row].name, face) for row, face in enumerate(self.relations.faces.tolist())]
+        own, others = (max(face for called, face in faces if called == one) for one in (name, other))
+        return (own, name) < (others, other)
 
     def are_in_one_place(self, *things: MapObject) -> bool:
         """Whether objects are on one support, all on the floor, or all hang."""

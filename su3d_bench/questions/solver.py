@@ -258,7 +258,8 @@ class Solver:
         return objects
 
     def _has_no(self, noun: str) -> str:
-        return f"the map has no '{noun}'{scene_map.name_suggestion(noun, self._scene)}"
+        hint = "" if read_phrase(noun).relation else scene_map.name_suggestion(noun, self._scene)
+        return f"the map has no '{noun}'{hint}"
 
     def _related_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``thing`` has the ``relation``."""
@@ -312,7 +313,8 @@ class Solver:
         elif abs(ranked[1][0] - distance_m) < CLOSE_CALL_M:
             self._note(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away, between centres")
         rest = "".join(f"; {thing.shown} {away_m:.2f} m" for away_m, thing, _ in ranked[1:4])
-        end = "farthest from" if question.farthest else "closest to"
+        degree = "er" if len(ranked) == 2 else "est"
+        end = f"farth{degree} from" if question.farthest else f"clos{degree} to"
         text = f"{best.shown} is {end} {reference.shown}: {distance_m:.2f} m between centres{rest}"
         return text, (best,), (reference,), None
 
@@ -418,7 +420,7 @@ def _nearest_pair(first: Objects, second: Objects) -> tuple[float, MapObject, Ma
 def _shown(phrase: Phrase) -> str:
     if phrase.relation is None:
         return phrase.head
-    return f"{phrase.head} {phrase.relation} {' and '.join(_shown(other) for other in phrase.others)}"
+    return f"{phrase.head} {phrase.relation} {' and '.join(f'the {_shown(other)}' for other in phrase.others)}"
 
 
 def _listed(objects: Objects) -> str:

@@ -84,7 +84,7 @@ def llm(server: ChatServer, *more: str) -> list[str]:
 def test_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", "ask", SCENE, "Which sink is closer to bed?"]) == 0
     printed = capsys.readouterr()
-    assert printed.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
+    assert printed.out == "sink #30 is closer to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
     picture = job.pictures / "ask-which-sink-is-closer-to-bed.png"
     assert f"picture: {picture}" in printed.err
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -168,6 +168,27 @@ def test_ambiguous_relation_is_doubtful() -> None:
         assert inner.on[0, 1] and inner.doubtful("on")[0, 1] == is_doubtful == inner.doubtful("under")[1, 0], name
 
 
+def test_facts_are_usual_and_stated_once() -> None:
+    counter, sink, vase = (
+        box(0, 0, 0, 2, 0.6, 0.9),
+        box(0.2, 0.1, 0.9, 0.5, 0.4, 0.2),
+        box(1.2, 0.42, 0.9, 0.1, 0.1, 0.3),
+    )
+    names = ["countertop", "sink", "vase", "picture", "floor"]
+    relations = Relations(np.array([counter, sink, vase, box(1, 0.55, 1.3, 0.5, 0.03, 0.5), FLOOR]), names)
+    assert relations.on[1, 0] and relations.on[2, 0] and relations.above[3, 2]
+    assert np.argwhere(relations.facts("on")).tolist() == [[2, 0]]  # a sink is built in
+    assert relations.under[0, 2] and not relations.facts("under").any()
+    assert not relations.facts("above").any()  # it hangs above the countertop, not above what stands there
+
+
+def test_above_beside_the_edge_is_doubtful() -> None:
+    lamp, clock = box(0.01, 0.02, 0, 0.41, 0.42, 1.63), box(0.33, 0, 1.85, 0.36, 0.04, 0.36)
+    for aside, is_doubtful in ((0.0, True), (-0.15, False)):  # its centre is 0.09 m beside the lamp, or above it
+        relations = Relations(np.array([moved(clock, x=aside), lamp, FLOOR]), ["clock", "lamp", "floor"])
+        assert relations.above[0, 1] and relations.doubtful("above")[0, 1] == is_doubtful
+
+
 def test_between_requires_the_line_and_the_same_height() -> None:
     a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.5, -0.5, 0, 1, 1, 1)
     middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)

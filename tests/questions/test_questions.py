@@ -46,9 +46,46 @@ def test_sizes_compare_with_others_of_the_name() -> None:
 
 def test_relations_come_from_boxes() -> None:
     assert ASKED["relative by name", "vase on a table"] == (3,)
-    assert ASKED["relative by name", "rug under a table"] == (1,)
     assert ASKED["relative by name", "chair next to a table"] == (4,)
-    assert ASKED["relative by name", "table under a vase"] == (2,)
+
+
+def test_each_relation_is_asked_once_and_both_ways_for_chains() -> None:
+    doubled = {"table under a vase", "rug under a table", "table next to a chair", "table with a vase on it"}
+    assert doubled.isdisjoint(text for _, text in ASKED)
+    both = {one.text: one.answers for one in generate("a/b", THINGS, both=True)}
+    assert both["table with a vase on it"] == both["table next to a chair"] == (2,)
+    tucked = placed(11, "box", (0.7, 0.7, 0.0), (0.3, 0.3, 0.3))
+    beneath = SceneMap((*(thing for thing in THINGS.objects if thing.name not in ("rug", "chair")), tucked))
+    assert {one.text: one.answers for one in generate("a/b", beneath)}["box under a table"] == (11,)
+    texts = {one.text for one in generate_questions(beneath, n_each=99)}
+    assert "What is under the table?" in texts and "What is under the vase?" not in texts
+
+
+def test_largest_needs_three_objects_and_a_visible_lead() -> None:
+    def asked(*sides: float) -> set[str]:
+        boxes = [placed(k, "box", (3.0 * k, 0, 0), (side, side, 0.5)) for k, side in enumerate(sides, 1)]
+        return {one.text for one in generate_questions(SceneMap(tuple(boxes)), n_each=9) if one.kind == "largest"}
+
+    assert asked(1.0, 0.5, 0.5) == {"Which box is the largest?"}
+    assert asked(1.0, 0.5) == asked(1.0, 0.9, 0.5) == set()
+
+
+def test_objects_are_not_counted_or_denied_if_another_may_have_the_name() -> None:
+    desk = placed(11, "desk", (9, 9, 0), (1.2, 0.6, 0.7))
+    alone, beside = (
+        {one.text for one in generate_questions(scene, n_each=99) if one.answer.value in (0, 1)}
+        for scene in (THINGS, SceneMap((*THINGS.objects, desk)))
+    )
+    assert "How many tables are there?" in alone and "How many tables are there?" not in beside
+    assert "How many beds are there?" in beside and not any("pillow" in text for text in alone | beside)
+
+
+def test_closest_object_leads_between_centres_and_between_sides() -> None:
+    bin_, small = placed(1, "bin", (0, 0, 0), (0.4, 0.4, 0.4)), placed(2, "cabinet", (1.0, 0, 0), (0.4, 0.4, 0.7))
+    for x, is_asked in ((0.9, False), (3.0, True)):  # from its side, 0.5 m and 2.6 m from the bin; the small one 0.6 m
+        large = placed(3, "cabinet", (x, 0, 0), (3.0, 0.4, 0.7))
+        texts = {one.text for one in generate_questions(SceneMap((bin_, small, large)), n_each=99)}
+        assert ("Which cabinet is closer to the bin?" in texts) is is_asked
 
 
 def test_object_between_two_unique_objects_is_asked() -> None:

@@ -82,7 +82,7 @@ def test_generated_chains_describe_only_their_object_and_begin_with_its_name() -
     objects = known_objects(truth, 100)
     made = chain_truth("made/a", truth, objects)
     assert isinstance(made, QueryTruth) and (made.space, made.variant) == ("replica", "mesh-vertices")
-    cases = chains_of(generate("made/a", objects), objects)
+    cases = chains_of(generate("made/a", objects, both=True), objects)
     assert made.queries == cases and {case.text for case in cases if case.tags == CLASS} == {"table"}
     n_objects = len({place.object for case in cases for place in case.places})
     for case in cases:
@@ -93,7 +93,7 @@ def test_generated_chains_describe_only_their_object_and_begin_with_its_name() -
                 assert case.tags == CLASS
     places = [place for case in cases for place in case.places]
     assert len(places) == len(set(places)) == 2 * 3 * n_objects
-    few = chains_of(generate("made/a", objects), objects, 1)
+    few = chains_of(generate("made/a", objects, both=True), objects, 1)
     assert {place.object for case in few for place in case.places} == {0}
 
 

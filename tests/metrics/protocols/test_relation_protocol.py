@@ -127,6 +127,7 @@ def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() ->
     boxes = np.array([[[0, 0, 0], [1, 1, 0.7]], [[0.4, 0.4, 0.7], [0.6, 0.6, 1.0]], [[3, 0, 0], [4, 1, 0.7]]])
     names = ("table", "lamp", "table")
     assert geometric_edges(boxes, names, ("under", "on")) == {(1, 0): 1, (0, 1): 0}
+    assert geometric_edges(boxes, names, RELATIONS, sure=True) == {(1, 0): RELATIONS.index("on")}  # not also under
     boxes[1, :, 2] += 0.035  # just within reach of the top: with a slightly different threshold it is not
     assert geometric_edges(boxes, names, ("on",)) == {(1, 0): 0}
     assert geometric_edges(boxes, names, ("on",), sure=True) == {}
