@@ -16,7 +16,8 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.reports.pictures import canvas
-from su3d_bench.reports.pictures.items import OUTLINE, draw_outline, png_bytes
+from su3d_bench.formats.images import png_bytes
+from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
 
 PALE_GREY = 232
 RENDERED = 1.5  # render scale; a room fills only a part of a corner view

@@ -256,7 +256,7 @@ def _content(scene: str, value: Any) -> Content:
         if len(arrays) > 3:
             raise PredictionError(f"{scene}: {len(arrays)} arrays; expected (masks, scores, classes)")
         return matrix_masks(scene, arrays[0], *(None if one is None else np.asarray(one) for one in arrays[1:]))
-    found = in_stored_form(value)
+    found: Content = in_stored_form(value)
     if fault := validation_error(found):
         raise PredictionError(f"{scene}: {fault}")
     return found

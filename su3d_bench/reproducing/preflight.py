@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
-from su3d_bench.core.errors import ModelMissing, Su3dError, counted
+from su3d_bench.core.errors import DataError, ModelMissing, Su3dError, counted
+from su3d_bench.core.interfaces import HasSurface
 from su3d_bench.core.system.devices import require_installed
 from su3d_bench.core.version import documentation
 from su3d_bench.fetching.sources import built_in
@@ -22,7 +23,6 @@ from su3d_bench.perception.models.loading import PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig, models_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
 from su3d_bench.runs.executors import ELSEWHERE
-from su3d_bench.runs.frame_loop import surface_of
 from su3d_bench.runs.job import Part, build_method
 from su3d_bench.runs.plan import asks_language_model, method_part, named_method
 from su3d_bench.runs.scenes import data_root
@@ -126,7 +126,9 @@ def _surface(run: RecipeRun, dataset: Any, scene: str, how: str) -> Iterator[Nee
     if not asking:
         return
     try:
-        surface_of(dataset, scene)
+        if not isinstance(dataset, HasSurface):
+            raise DataError(f"{run.dataset}/{scene}: the dataset has no mesh")
+        dataset.surface(scene)
     except Su3dError as error:
         remark = f"{error}; required by {', '.join(asking)}"
         yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_available=False, how=how, remark=remark)

@@ -446,7 +446,13 @@ def evaluate_predictions(
             name = re.sub(r"[^A-Za-z0-9-]+", "-", method).strip("-").lower()
             folder = out / RUNS / f"{dataset}-predictions-{name}"
             scenes = _scenes(mine, asked, dataset)
-            request = Request((given.place,), dataset, None, None, fitting, scenes, None, given.text_features)
+            request = Request(
+                (given.place,),
+                dataset=dataset,
+                protocols=fitting,
+                scenes=scenes,
+                text_features=given.text_features,
+            )
             evaluate_methods({method: request}, folder)
             folders.append(folder)
     return folders
