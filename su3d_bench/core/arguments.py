@@ -46,7 +46,7 @@ def fault(annotation: str, value: Any, known: Mapping[str, Any]) -> str | None:
         elif get_origin(own) is Literal:
             fits = isinstance(value, str) and value in get_args(own)
             word = f"one of {', '.join(map(repr, get_args(own)))}"
-        elif isinstance(own, UnionType) and not any(map(get_origin, get_args(own))):
+        elif name not in _KINDS and isinstance(own, UnionType) and not any(map(get_origin, get_args(own))):
             fits = isinstance(value, own)
         elif getattr(own, "_is_protocol", False):  # any object of a class may have its members
             fits = type(value).__module__ != "builtins"
