@@ -15,8 +15,8 @@ from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
-from su3d_bench.reports.pictures import canvas
 from su3d_bench.formats.images import png_bytes
+from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
 
 PALE_GREY = 232
