@@ -70,7 +70,7 @@
   }
 
   // The first choice of every question is the favourable one.
-  const allRight = () => choose(Object.fromEntries(sheet.items[at].asks.map((name) => [name, asks.get(name).choices[0]])));
+  const markRight = () => choose(Object.fromEntries(sheet.items[at].asks.map((name) => [name, asks.get(name).choices[0]])));
 
   function undo() {
     const last = history.pop();
@@ -217,7 +217,7 @@
   byId("next").addEventListener("click", () => go(1));
   byId("open").addEventListener("click", goToOpen);
   byId("undo").addEventListener("click", undo);
-  byId("right").addEventListener("click", allRight);
+  byId("right").addEventListener("click", markRight);
   byId("comment").addEventListener("input", () => {
     comments[sheet.items[at].id] = byId("comment").value;
     save();
@@ -238,7 +238,7 @@
     const name = currentAsk(item);
     const choice = asks.get(name).choices[Number(event.key) - 1];
     if (choice !== undefined) choose({ [name]: choice });
-    else if (event.key === "a" || event.key === "A") allRight();
+    else if (event.key === "a" || event.key === "A") markRight();
     else if (event.key === "c" || event.key === "C") byId("comment").focus();
     else if (event.key === "ArrowLeft") go(-1);
     else if (event.key === "ArrowRight") go(1);

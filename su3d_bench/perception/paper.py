@@ -24,7 +24,7 @@ from su3d_bench.perception.models.masks.grounded_sam import (
     SamRegions,
 )
 
-# opensu3d.tex, section IV-A.
+# OpenSU3D, section III-A.
 PAPER_ENCODER, PAPER_SEGMENTER = "clip-vit-h-14", "sam-vit-h"
 PAPER_VISION_MODEL = PRESETS["paper"]["vision_model"]
 

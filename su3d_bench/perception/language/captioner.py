@@ -18,12 +18,12 @@ from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Rep
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.parsing import CaptionForm, described, is_refusal
 
-# opensu3d.tex, section III-A.
+# OpenSU3D, section II-A.
 DESCRIBE = "Give name and description to the object. Output e.g. `name':`description'"
-# opensu3d.tex, section III-C. The paper prints no more; the answer format is ours, so that the reply can be parsed.
+# OpenSU3D, section II-B1. The paper prints no more; the answer format is ours, so that the reply can be parsed.
 REFINE = "assign a single name to the object based on a given list of names"
 REFINE_FORM = "Answer with that name alone."
-# opensu3d.tex, section III-E, the six points of the prompting strategy.
+# OpenSU3D, section II-D, the six points of the prompting strategy.
 STRATEGY = (
     "Use `Name' & `Description' to understand object.",
     "Use `ID' to refer object.",
@@ -99,7 +99,7 @@ class Captioner:
 
 
 def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:
-    """The model's caption, or the tagger's name and "an {object} in a scene" (the paper's section IV-B)."""
+    """The model's caption, or the tagger's name and "an {object} in a scene" (the paper's section III-A3)."""
     description = None if reply.failure else described(reply.text)
     if description is None:
         name = tagger_name.strip() or "object"

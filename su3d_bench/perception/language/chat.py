@@ -174,7 +174,7 @@ class Price(BaseModel):
 
 
 # "current": OpenAI's replacement for its GPT-4 models, which reads images; without reasoning it takes a temperature.
-# "paper": the models of section IV-A; OpenAI has withdrawn both since.
+# "paper": the models of section III-A; OpenAI has withdrawn both since.
 PRESETS: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
         "current": {"vision_model": "gpt-6-luna", "text_model": "gpt-6-luna", "reasoning_effort": "none"},
