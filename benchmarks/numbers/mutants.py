@@ -59,7 +59,6 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points", *_EVERY),
     "metrics/semantic/top_k.py": ("test_metrics_scannetpp", *_EVERY),
     "metrics/relations.py": ("test_relation_protocol", *_EVERY),
-    "metrics/matching/memory.py": ("analysis/test_rule_attribution", "analysis/test_rule_attribution_pairs"),
     "metrics/protocols/loading.py": ("test_originals",),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg", "opensu3d/test_device_results"),

@@ -1,4 +1,4 @@
-"""Plots of times, memory and scores of runs, the cost of errors, and the effect of rules; readable in grey."""
+"""Plots of times, memory and scores of runs and the cost of errors; readable in grey."""
 
 from __future__ import annotations
 
@@ -331,50 +331,3 @@ def _without_frame(axes: Any, label: str) -> None:
     axes.tick_params(axis="y", length=0)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
-
-
-@figure_style()
-def draw_walk(apart: Mapping[str, Any], path: Path, width: Width = "17cm") -> None:
-    """Write the plot as PDF, PNG or SVG.
-
-    One panel per metric, from the first protocol (top) to the second (bottom).
-    """
-    walk = apart["walk"]
-    names = list(walk["start"])
-    figure, all_axes = _figure(width, *[0.7 + 2.2 * LINE_IN * (len(walk["steps"]) + 2)] * len(names))
-    for axes, name in zip(all_axes, names, strict=True):
-        _draw_shift(axes, apart, name, WIDTHS_IN[width] / min(len(names), PANELS_PER_ROW[width]))
-    caption = f"Scores of {walk['method']} in {walk['run']} from {apart['first']} to {apart['second']}, rule by rule"
-    write_figure(figure, path, caption)
-
-
-def _draw_shift(axes: Any, apart: Mapping[str, Any], name: str, width_in: float) -> None:
-    """Draw a metric from the first to the second protocol; the rule of each bar is above it."""
-    walk = apart["walk"]
-    start, end = 100 * walk["start"][name], 100 * walk["end"][name]
-    places = [start]
-    for step in walk["steps"]:
-        places.append(places[-1] + 100 * step["adds"][name]["share"])
-    low, high = min([*places, end]), max([*places, end])
-    span = max(1.0, high - low)
-    for row, step in enumerate(walk["steps"], 1):
-        change = places[row] - places[row - 1]
-        style = {"facecolor": COLOURS[0]} if change >= 0 else {"facecolor": COLOURS[4], "hatch": "////"}
-        axes.barh(row, change, left=places[row - 1], height=0.4, edgecolor="black", **style)
-        axes.plot([places[row - 1]] * 2, [row - 0.8, row + 0.2], color="0.6", linewidth=0.6)
-        text = signed(step["adds"][name]["share"])
-        axes.text(max(places[row - 1 : row + 1]) + 0.03 * span, row, text, va="center")
-    axes.plot([places[-1]] * 2, [len(places) - 0.8, len(places)], color="0.6", linewidth=0.6)
-    for row, value in ((0, start), (len(places), end)):
-        axes.plot(value, row, "D", color="black", markersize=5)  # not a bar, because the axis does not start at 0
-        axes.text(value + 0.03 * span, row, f"{value:.1f}", va="center", fontweight="bold")
-    axes.set_xlim(low - 0.1 * span, high + 0.3 * span)
-    axes.set_ylim(len(places) + 0.4, -0.9)
-    axes.set_yticks([])
-    labels = [apart["first"], *(", ".join(step["rules"]) for step in walk["steps"]), apart["second"]]
-    most = int(0.9 * width_in * LETTERS_PER_INCH)
-    for row, label in enumerate(labels):
-        shown = drawable(label if len(label) <= most else label[: most - 3] + "...")
-        free = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
-        axes.text(low - 0.09 * span, row - 0.5, shown, va="center", bbox=free)
-    _without_frame(axes, f"{name} (%), {end - start:+.1f} points")

@@ -8,7 +8,6 @@ from typing import Any
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
-from su3d_bench.metrics.protocols.mixtures import CONSTANT_RULES
 from su3d_bench.reports.tables.model import few_scenes
 
 HEADER = ["p", "adjusted p", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
@@ -148,46 +147,16 @@ def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Ta
 
 
 MAX_RULE_CHARACTERS = 60  # characters
-SUM = "contribution of a rule in percentage points (Shapley value: mean over all orders); the sum is the difference"
-DRAWN = "contribution of a rule in percentage points (Shapley value: {n} random orders, ± standard error); exact sum"
 
 
-def rules_tables(apart: Mapping[str, Any]) -> list[Table | Prose]:
-    """Return the rules that differ and, if a prediction was given, the contribution of each rule to the difference."""
-    first, second = apart["first"], apart["second"]
-    if not apart["differing"]:
+def rules_tables(difference: Mapping[str, Any]) -> list[Table | Prose]:
+    """Return the rules in which two protocols differ, with the value of each."""
+    first, second = difference["first"], difference["second"]
+    if not difference["differing"]:
         return [Prose((f"{first} and {second}: no rule that affects the numbers differs",))]
     rows = [["rule", first, second]]
-    rows += [[one["rule"], *_sides(one["rule"], one["first"], one["second"])] for one in apart["differing"]]
-    parts: list[Table | Prose] = [text_table("rules", rows, heading=f"{first} and {second}")]
-    return parts if apart["walk"] is None else [*parts, _walk_table(apart)]
-
-
-def _walk_table(apart: Mapping[str, Any]) -> Table:
-    walk = apart["walk"]
-    names = list(walk["start"])
-    rows = [["", *(cell for name in names for cell in (name, "range"))]]
-    rows.append([apart["first"], *(cell for name in names for cell in (percent(walk["start"][name]), ""))])
-    rows += [
-        [", ".join(step["rules"]), *(cell for name in names for cell in _share_cells(step["adds"][name]))]
-        for step in walk["steps"]
-    ]
-    rows.append([apart["second"], *(cell for name in names for cell in (percent(walk["end"][name]), ""))])
-    n = walk["n_orders"]
-    notes = [
-        f"{SUM if n is None else DRAWN.format(n=n)}; range: its smallest and largest contribution in any order",
-        "rules in one row depend on each other and are changed together",
-    ]
-    if any(one["rule"] in CONSTANT_RULES for one in apart["differing"]):
-        notes.append("both use the encoder of the run")
-    title = f"{walk['run']}: {walk['method']}, {counted(len(walk['scenes']), 'scene')}"
-    return text_table("walk", rows, heading=title, notes=notes)
-
-
-def _share_cells(share: Mapping[str, Any]) -> tuple[str, str]:
-    error = share["standard_error"]
-    about = f" ± {percent(error)}" if error else ""
-    return signed(share["share"]) + about, f"{signed(share['least'])} to {signed(share['most'])}"
+    rows += [[one["rule"], *_sides(one["rule"], one["first"], one["second"])] for one in difference["differing"]]
+    return [text_table("rules", rows, heading=f"{first} and {second}")]
 
 
 def _sides(rule: str, first: Any, second: Any) -> list[str]:

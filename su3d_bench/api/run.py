@@ -177,11 +177,11 @@ def evaluate(
     """Score existing predictions with the dataset's headline protocol if that fits, otherwise or with
     ``protocols="all"`` with all that fit, as ``su3d-bench evaluate``.
 
-    ``predictions`` is a folder, a file or several of them; or for each scene its map, ``{"scene0011_00": map}``: as a
-    method returns it, or ``(masks, scores, classes)`` with masks (N, M) over the N ground-truth points, M scores and M
-    class ids. For several methods it is a mapping, ``{"mine": folder, "theirs": folder}``. The keywords are the
-    options of the command. Returns the numbers; with ``out`` they are written there and returned as a ``Run``, which
-    also has ``instances``, ``errors`` and ``compare``.
+    ``predictions`` is a folder, a file or several of them; or a run, of which all methods are scored; or for each scene
+    its map, ``{"scene0011_00": map}``: as a method returns it, or ``(masks, scores, classes)`` with masks (N, M) over
+    the N ground-truth points, M scores and M class ids. For several methods it is a mapping, ``{"mine": folder,
+    "theirs": folder}``. The keywords are the options of the command. Returns the numbers; with ``out`` they are written
+    there and returned as a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
 
     Raises ``PredictionError`` for predictions that cannot be scored, ``DataError`` for missing ground truth,
     ``ConfigError`` for an invalid request, ``StoreError`` if ``out`` contains another run.
@@ -197,6 +197,7 @@ def evaluate(
     from su3d_bench.evaluation.evaluate import warnings_of
     from su3d_bench.evaluation.run_output import evaluate_methods
     from su3d_bench.predictions.formats import IN_MEMORY
+    from su3d_bench.predictions.run_predictions import methods_of
 
     place = None if out is None else Path(out)
     named: Mapping[Any, Any] = predictions if isinstance(predictions, Mapping) else {default_name(place): predictions}
@@ -204,6 +205,8 @@ def evaluate(
         raise ConfigError("evaluate: no predictions; pass a folder, files, maps by scene, or a mapping of methods")
     if all(map(_is_map, named.values())):
         named = {default_name(place): named}
+    if isinstance(predictions, str | Path) and (methods := methods_of(Path(predictions))):
+        named = dict.fromkeys(methods, predictions)
     requests: dict[str, Request] = {}
     for method, given in named.items():
         contents = {str(scene): _content(scene, one) for scene, one in given.items()} if _are_maps(given) else None
@@ -220,6 +223,7 @@ def evaluate(
             text_features=_path(text_features),
             confidences=confidences,
             queries=_path(queries),
+            method=str(method),
         )
     evaluated = evaluate_methods(requests, place)
     remarks = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, perception_config
-from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
+from su3d_bench.cli.output import answer_either, answer_tables, remark
 from su3d_bench.core.errors import ConfigError, shown, suggest
 
 if TYPE_CHECKING:
@@ -32,12 +31,10 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("--list-texts", "print the texts that are encoded, one per line")
     parser.shared("--queries")
-    parser = add_verb(actions, "diff", call_diff, data=True)
+    parser = add_verb(actions, "diff", call_diff)
     parser.option("name PROTOCOL", "protocol, or .toml file")
     parser.option("other PROTOCOL", "protocol to compare with")
-    parser.option("--run RUN", "run folder (or RUN:METHOD; scored under both, for the effect of each rule)", type=str)
-    parser.option("--out FIGURE", ".pdf, .png or .svg plot of the effect of each rule (with --run)")
-    parser.shared("--width", "--jobs", "--format")
+    parser.shared("--format")
     parser = add_verb(actions, "texts", call_texts)
     parser.option("--protocol PROTOCOL", "protocol to use (or .toml file)", required=True)
     parser.option("--encoder ENCODER", "encoder to use (embedded, or from models list; default: the protocol's)")
@@ -95,32 +92,21 @@ def _plain(stated: ResolvedOriginal | None) -> dict[str, Any] | None:
 
 
 def call_diff(arguments: argparse.Namespace) -> None:
-    """Show the rules in which two protocols differ, and with --run the effect of each.
+    """Show the rules in which two protocols differ.
 
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
-    su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --run runs/demo --out steps.png
+    su3d-bench protocols diff rooms-instance replica-openmask3d --json
     """
-    from su3d_bench.analysis.rule_attribution import RuleStepper, rules_apart
+    from dataclasses import asdict
+
+    from su3d_bench.metrics.protocols.differences import differing
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.comparison import rules_tables
 
-    if arguments.out is not None and arguments.run is None:
-        raise ConfigError("protocols diff: --out needs --run")
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
-    apart = rules_apart(first, second)
-    if arguments.run is not None:
-        walker = RuleStepper.of(first, second, arguments.run)
-        with progress(len(walker.scenes), is_quiet=arguments.quiet) as report:
-            walk = walker.walk(arguments.jobs or os.cpu_count() or 1, report)
-        apart = rules_apart(first, second, walk)
-    value = apart.to_json()
+    found = [asdict(one) for one in differing(first, second)]
+    value = {"schema": 2, "first": first.name, "second": second.name, "differing": found}
     answer_tables(arguments, value, rules_tables(value))
-    if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots import draw_walk
-
-        show()  # the plot is slower than the tables
-        draw_walk(value, arguments.out, arguments.width)
-        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
 
 
 def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 
@@ -30,10 +29,6 @@ POWER = 0.8
 MAX_SCENES = 100_000  # the search stops here
 MIN_SEEDS = 3  # with two, if seeds matter, the interval over scenes and seeds has a coverage of only 85 %
 MIN_SCENES = 6  # with fewer, no pattern of signs has a p below 0.05: 2 / 2^5 = 0.0625
-
-EXACT_STEPS = 8  # up to this number all subsets of steps are evaluated: 256 values
-N_ORDERS = 200  # orders drawn for more steps
-Value = Callable[[int], float]  # a function of the steps whose bits are set
 
 
 def _group_of_scene(n_scenes: int) -> Int64Array:
@@ -467,74 +462,3 @@ def variance_range(variance: Variance) -> tuple[Variance, Variance]:
     n_free = variance.n_scenes - 1
     ends = [n_free / float(chdtri(n_free, tail)) for tail in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)]
     return variance.scaled(ends[0]), variance.scaled(ends[1])
-
-
-@dataclass(frozen=True)
-class Share:
-    """The Shapley value ``share`` of one step, with the ``least`` and the ``most`` that it adds in any order.
-
-    The contribution of a step depends on the steps before it; its share is the mean over the orders of the steps
-    (Shapley 1953, "A value for n-person games"). ``standard_error``: of the drawn orders, 0 if all orders were used.
-    """
-
-    share: float
-    least: float
-    most: float
-    standard_error: float
-
-
-def choices(n_steps: int, seed: int = 0) -> list[int]:
-    """The sets of steps, as bits, whose values ``shares`` needs.
-
-    >>> choices(2)
-    [0, 1, 2, 3]
-    """
-    if n_steps <= EXACT_STEPS:
-        return list(range(1 << n_steps))
-    return sorted({bits for order in _orders(n_steps, seed) for bits in _sets_on_the_way(order)})
-
-
-def shares(n_steps: int, value: Value, seed: int = 0) -> list[Share]:
-    """The share of each step in ``value(all) - value(none)``, which is their sum except for rounding.
-
-    Exact for at most ``EXACT_STEPS`` steps; otherwise over ``N_ORDERS`` orders drawn with ``seed``.
-
-    >>> [one.share for one in shares(2, lambda bits: {0: 0.0, 1: 1.0, 2: 2.0, 3: 5.0}[bits])]
-    [2.0, 3.0]
-    """
-    if n_steps > EXACT_STEPS:
-        return _drawn(n_steps, value, seed)
-    # The fraction of all orders in which exactly these steps come before another one.
-    weights = [1 / (n_steps * math.comb(n_steps - 1, size)) for size in range(n_steps)]
-    found = []
-    for step in range(n_steps):
-        added = [
-            (value(bits | 1 << step) - value(bits), weights[bits.bit_count()])
-            for bits in range(1 << n_steps)
-            if not bits >> step & 1
-        ]
-        share = math.fsum(difference * weight for difference, weight in added)
-        found.append(Share(share, min(added)[0], max(added)[0], 0.0))
-    return found
-
-
-def _drawn(n_steps: int, value: Value, seed: int) -> list[Share]:
-    added: list[list[float]] = [[] for _ in range(n_steps)]
-    for order in _orders(n_steps, seed):
-        for step, (before, after) in zip(order, pairwise(_sets_on_the_way(order)), strict=True):
-            added[step].append(value(after) - value(before))
-    root = math.sqrt(N_ORDERS)
-    return [Share(math.fsum(one) / N_ORDERS, min(one), max(one), float(np.std(one, ddof=1)) / root) for one in added]
-
-
-def _orders(n_steps: int, seed: int) -> list[list[int]]:
-    generator = np.random.default_rng(seed)
-    return [generator.permutation(n_steps).tolist() for _ in range(N_ORDERS)]
-
-
-def _sets_on_the_way(order: Sequence[int]) -> list[int]:
-    """The sets of steps along an order, from none to all."""
-    found = [0]
-    for step in order:
-        found.append(found[-1] | 1 << step)
-    return found

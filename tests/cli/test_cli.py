@@ -415,7 +415,6 @@ def test_every_figure_has_its_printed_width_and_8_pt_type(width_cm: int, capsys:
         "query ask painted/a 'How many chairs are there?' --run runs/one --method collector",
         f"datasets show {PAINTED}/a",
         "report attribution runs/one",
-        "protocols diff rooms-semantic replica-mesh-ex6 --run runs/one",
         "sheets pictures runs/one --texts sofa",
         "sheets pictures runs/one --draw labels",
         "sheets pictures runs/one --draw reasoning --texts 'How many chairs are there?'",

@@ -72,7 +72,7 @@ CASES: dict[str, list[list[str]]] = {
     "methods new": [["hostile_method.py"], [HOSTILE]],
     "methods show": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
     "protocols show": [["rules.toml"], ["query-ap", "--list-texts", "--queries", "lines.txt"]],
-    "protocols diff": [["rules.toml", "rooms-semantic", "--run", "RUN:METHOD", "--jobs", "1"]],
+    "protocols diff": [["rules.toml", "rooms-semantic"]],
     "protocols texts": [["--protocol", "rules.toml", "--encoder", "embedded", "--out", f"out/{IN_A_PATH}.npz"]],
     "runs export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"]],
 }  # fmt: skip

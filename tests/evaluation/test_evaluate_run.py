@@ -14,6 +14,7 @@ from painted import Painted
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
 
+import su3d_bench
 from su3d_bench import load_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
@@ -133,6 +134,8 @@ def test_predictions_in_two_formats_have_equal_values_in_every_command(
     assert main([*again, "--quiet"]) == 0
     found = json.loads(Path("again.json").read_text())["protocols"]["rooms-instance"]["metrics"]["ap"]
     assert found == documents["mine"]["protocols"]["rooms-instance"]["per_scene"]["a"]["ap"]
+    of_run = su3d_bench.evaluate(RUN, dataset=PAINTED, protocols=PROTOCOLS[1:]).metrics
+    assert sorted(set(of_run["method"])) == ["mine", "theirs"]
     assert main(["evaluate", RUN, "--dataset", PAINTED, *PROTOCOLS, "--json", "every.json", "--quiet"]) == 0
     every = json.loads(Path("every.json").read_text())["methods"]
     assert {name: one["protocols"] for name, one in every.items()} == {

@@ -12,14 +12,12 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, IntArray
 from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching import transfer
-from su3d_bench.metrics.matching.memory import remembered
 from su3d_bench.metrics.matching.nearest import are_same_points
 from su3d_bench.metrics.matching.nearest import nearest as nearest_points
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 
-@remembered
 def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, int]]:
     """Pairs of masks, the lower first, whose IoU is above ``iou``.
 

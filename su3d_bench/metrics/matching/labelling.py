@@ -14,7 +14,6 @@ from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
-from su3d_bench.metrics.matching.memory import remembered
 from su3d_bench.metrics.matching.rows import rows_of
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -134,7 +133,6 @@ def text_features(
     return np.asarray(directions.reshape(len(names), n_prompts, -1).mean(axis=1))
 
 
-@remembered
 def _encoded(encoder: Encoder, texts: list[str]) -> Float32Array:
     return encoder.encode_texts(texts)
 
@@ -184,7 +182,6 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
     return product
 
 
-@remembered
 def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> Int64Array:
     """For each row of ``features`` (K, D) the row of ``text`` (C, D) of highest cosine, the first on ties.
 

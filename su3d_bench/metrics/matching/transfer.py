@@ -7,8 +7,7 @@ import numpy as np
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
-from su3d_bench.metrics.matching.memory import is_remembering, remembered
-from su3d_bench.metrics.matching.nearest import Candidates, Points, are_same_points, nearest
+from su3d_bench.metrics.matching.nearest import Points, are_same_points, nearest
 from su3d_bench.metrics.matching.rows import first_rows
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
@@ -25,7 +24,6 @@ def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array
     return np.unique(members[first_rows(np.column_stack([owner, voxel[members]]))])
 
 
-@remembered
 def transfer_masks(
     points: Points, masks: Masks, targets: Points, cap_m: float | None = None, voxel_m: float = 0.0
 ) -> Masks:
@@ -89,35 +87,10 @@ def transfer_values(
         value[own], distance[own] = values[own], 0.0
         missing = wanted & ~own
     rows = np.flatnonzero(missing)
-    if is_remembering():
-        distance[rows], nearest_index = _asked(points[order], targets, cap_m).nearest(rows)
-    else:
-        distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
+    distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
     reached = rows[nearest_index >= 0]
     value[reached] = values[order][nearest_index[nearest_index >= 0]]
     return value, distance
-
-
-class _Asked:
-    """The nearest of some points for the targets of a scene, each searched only once."""
-
-    def __init__(self, points: Points, targets: Points, cap_m: float) -> None:
-        self._candidates, self._targets, self._cap_m = Candidates(points), targets, cap_m
-        self._is_known = np.zeros(len(targets), bool)
-        self._distance, self._index = np.empty(len(targets)), np.empty(len(targets), np.int64)
-        self.nbytes = 17 * len(targets) + 64 * len(points)
-
-    def nearest(self, rows: Int64Array) -> tuple[Float64Array, Int64Array]:
-        """``nearest`` for the targets ``rows``."""
-        new = rows[~self._is_known[rows]]
-        self._distance[new], self._index[new] = self._candidates.nearest(self._targets[new], self._cap_m)
-        self._is_known[new] = True
-        return self._distance[rows], self._index[rows]
-
-
-@remembered
-def _asked(points: Points, targets: Points, cap_m: float) -> _Asked:
-    return _Asked(points, targets, cap_m)
 
 
 def n_farther(distance: Float64Array) -> Int64Array:

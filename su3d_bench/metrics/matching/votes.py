@@ -14,12 +14,10 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
-from su3d_bench.metrics.matching.memory import is_remembering, remembered
 from su3d_bench.metrics.matching.nearest import MAX_TIED, ROUNDING_M, Points, Search, ball_tree, without_crowds
 from su3d_bench.metrics.matching.rows import row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours in memory at once
-_MAX_KEPT = 12_000_000  # cached neighbours, of 16 bytes each, if they may be needed again
 
 
 def transfer_votes(
@@ -46,14 +44,6 @@ def transfer_votes(
     wanted_rows = np.flatnonzero(wanted)
     if not len(points) or not len(wanted_rows):
         return value, distance
-    if is_remembering() and len(targets) * neighbours <= _MAX_KEPT:
-        # another protocol needs other targets, and other values of the points
-        place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours, search)
-        place = place_of_all[wanted_rows]
-        votes = np.where(all_distances <= cap_m, values[all_indices], -1)
-        value[wanted_rows], distance[wanted_rows] = _most_votes(votes)[place], all_distances.min(axis=1)[place]
-        distance[distance > cap_m] = np.inf
-        return value, distance
     places, place_of_target = _distinct_places(targets[wanted_rows])
     of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
     found = _Search(points, neighbours, search)
@@ -66,19 +56,6 @@ def transfer_votes(
     value[wanted_rows], distance[wanted_rows] = of_place[place_of_target], nearest_m[place_of_target]
     distance[distance > cap_m] = np.inf
     return value, distance
-
-
-@remembered
-def _neighbours_of_all(
-    points: Points, targets: Points, neighbours: int, search: Search
-) -> tuple[Int64Array, Float64Array, Int64Array]:
-    """The row of every target's position, and for each position the distances and indices of its nearest points."""
-    places, place_of_target = _distinct_places(targets)
-    neighbours_of = _Search(points, neighbours, search)
-    step = max(1, _MAX_CELLS // (neighbours + 1))
-    found = [neighbours_of.nearest(places[start : start + step]) for start in range(0, len(places), step)]
-    distances, indices = (np.concatenate(each) for each in zip(*found, strict=True))
-    return place_of_target, distances, indices
 
 
 def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:
