@@ -293,11 +293,8 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = 
 def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
     """Return the bars of a panel, the most costly kind of error first."""
     value = protocol["values"][metric] or 0.0
-    n_scored = protocol["n_scored"]
-    n_of = {
-        kind: counted(cause["n"], "error") if n_scored is None else f"{n_text(cause['n'], n_scored)} of points"
-        for kind, cause in protocol["causes"].items()
-    }
+    n, causes = protocol["n_scored"], protocol["causes"].items()
+    n_of = {k: f"{n_text(c['n'], n)} of points" if n is not None else counted(c["n"], "error") for k, c in causes}
     gains = {kind: cause["gains"][metric] for kind, cause in protocol["causes"].items()}
     order = sorted(gains, key=lambda kind: -(gains[kind] or 0.0))
     bars = [(f"{kind}\n{n_of[kind]}", gains[kind] or 0.0, "gain", signed(gains[kind])) for kind in order]
