@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from su3d_bench.core.errors import printable
+from su3d_bench.core.errors import counted, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.formats.tables.table import signed
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
@@ -293,11 +293,11 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = 
 def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
     """Return the bars of a panel, the most costly kind of error first."""
     value = protocol["values"][metric] or 0.0
-    n_of = {kind: n_text(cause["n"], protocol["n_scored"]) for kind, cause in protocol["causes"].items()}
+    n, causes = protocol["n_scored"], protocol["causes"].items()
+    n_of = {k: f"{n_text(c['n'], n)} of points" if n is not None else counted(c["n"], "error") for k, c in causes}
     gains = {kind: cause["gains"][metric] for kind, cause in protocol["causes"].items()}
     order = sorted(gains, key=lambda kind: -(gains[kind] or 0.0))
-    what = "errors" if protocol["n_scored"] is None else "of points"
-    bars = [(f"{kind}\n{n_of[kind]} {what}", gains[kind] or 0.0, "gain", signed(gains[kind])) for kind in order]
+    bars = [(f"{kind}\n{n_of[kind]}", gains[kind] or 0.0, "gain", signed(gains[kind])) for kind in order]
     bars += [
         (shown, protocol[name][metric] or 0.0, "left", signed(protocol[name][metric])) for name, shown in LEFT.items()
     ]

@@ -134,7 +134,7 @@ def scores_of(value: object, n_masks: int, where: str) -> Float64Array:
 
 def classes_of(value: object, n_masks: int, where: str) -> Int32Array:
     """Class numbers, one per mask, from an array of integers or of integral floats."""
-    classes = array_of(value, f"{where}: {n_masks} masks, but the classes are", "one per mask", "iuf", n_masks)
+    classes = array_of(value, f"{where}: {n_masks} masks, but the classes are", "one number per mask", "iuf", n_masks)
     numbers = classes.astype(np.float64)
     is_whole = (np.abs(numbers) < 1 << 31) & (numbers == np.floor(numbers))
     if not is_whole.all():
