@@ -201,7 +201,7 @@ def _shown(value: float | None, pair: tuple[float | None, float | None], *, is_c
     if value is None:
         return NOT_MEASURED
     if is_cost:
-        return f"{value:.3g}"
+        return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
     one, other = pair
     if one is None or other is None or one == other:
         return f"{100 * value:.1f}"

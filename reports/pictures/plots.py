@@ -58,8 +58,8 @@ def draw_timing(
 ) -> list[Path]:
     """Write the plots as PNG and PDF and return their paths.
 
-    ``update-cost`` over map points, ``update-course`` over updates, ``memory``, ``stages`` and, if intermediate maps
-    were scored, ``anytime``.
+    ``update-cost`` over map points (if a method counts them), ``update-course`` over updates, ``memory``, ``stages``
+    and, if intermediate maps were scored, ``anytime``.
     """
     figures = {
         "update-cost": _update_cost(times, warm_up, POINTS, width),
@@ -67,6 +67,8 @@ def draw_timing(
         "memory": _memory(times, width),
         "stages": _stages(times, warm_up, width),
     }
+    if not figures["update-cost"].axes[0].lines:
+        del figures["update-cost"]
     if _curves(anytime):
         figures["anytime"] = _anytime(anytime, width)
     paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}

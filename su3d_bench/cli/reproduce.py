@@ -48,7 +48,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--dry-run")
     parser.option("--rehearse", "run on synthetic rooms in the datasets' file layouts, with embedded perception")
     parser.option("--rooms ROOM...", "rooms of the rehearsal (default: set by the recipe)")
-    parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160")
+    parser.option("--room-settings KEY=VALUE...", "settings of the rooms, such as n_frames=80 width=160 height=120")
     parser.option(
         "--predictions METHOD=PREDICTIONS...", "predictions of several methods (not implemented here)", default=[]
     )

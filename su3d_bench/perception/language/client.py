@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError, printable
-from su3d_bench.core.system.devices import require
+from su3d_bench.core.system.devices import require, require_installed
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, ReplyStore, check_address, n_tokens
 
 HOSTED = "https://api.openai.com/v1"
@@ -310,12 +310,13 @@ def _address_of(config: LanguageConfig) -> str:
 
 
 def check_key(config: LanguageConfig) -> None:
-    """Raises ``ModelMissing`` if the hosted service is used without a key."""
+    """Raises ``ModelMissing`` if the hosted service is used without a key, or if its client library is missing."""
     if _address_of(config) == HOSTED and not _key_of(config):
         raise ModelMissing(
             f"${config.key_variable} is not set; set it to the key of {urlsplit(HOSTED).netloc}, or use your own "
-            "server with --base-url or --set perception.language.base_url=URL"
+            "server with $OPENAI_BASE_URL or --set perception.language.base_url=URL"
         )
+    require_installed("openai", "a language model")
 
 
 def _key_of(config: LanguageConfig) -> str:
