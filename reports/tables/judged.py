@@ -205,7 +205,7 @@ SUBJECTS = {
 }
 JUDGES = {"people": "annotators", "automatic": "ground truth"}
 GROUND_TRUTH_NOTE = "Ground-truth rows: the same items, judged automatically if the ground truth covers them"
-QUESTION_NOTE = "A question counts by its worst rating; arguable: questions rated arguable or better"
+QUESTION_NOTE = "A question counts by its worst rating; arguable: questions whose worst rating is arguable"
 SHOWN_TESTS = 60  # pairs of methods per metric; scores.json has all
 
 

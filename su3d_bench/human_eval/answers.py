@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, nearest, printable, some, suggest
+from su3d_bench.core.errors import DataError, counted, nearest, printable, some, suggest
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import read_bytes
@@ -139,8 +139,14 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow], *, is_partial: bool =
     first: dict[tuple[str, str, str], str] = {}
     judgements, faults = [], []
     comments: dict[str, dict[str, str]] = {}
+    of_other_sets: set[tuple[str, str]] = set()
     for row in rows:
         place = (row.annotator, row.item_id, row.question)
+        if row.sheet_id != sheet.id:  # one line for each file, not for each row
+            source = (row.at.rpartition(": row ")[0], row.sheet_id)
+            if source in of_other_sets:
+                continue
+            of_other_sets.add(source)
         fault = _fault(sheet, row, items, shares)
         if fault is None and row.comment:
             of_item = comments.setdefault(row.item_id, {})
@@ -162,8 +168,9 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow], *, is_partial: bool =
         missing = [item_id for item_id in share for ask in items[item_id].asks if (name, item_id, ask) not in first]
         if name in answered and missing and not is_partial:
             faults.append(
-                f"annotator '{printable(name, 40)}': {len(missing)} answers are missing "
-                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); complete them, pass all files or use --partial"
+                f"annotator '{printable(name, 40)}': {counted(len(missing), 'missing answer')} "
+                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); complete the sheet, "
+                "pass all files or use --partial"
             )
     order = {item.id: k for k, item in enumerate(sheet.items)}
     names = [ask.name for ask in sheet.asks]

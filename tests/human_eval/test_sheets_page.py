@@ -112,6 +112,18 @@ def test_one_key_answers_all_questions_of_an_item(tmp_path: Path, browser: Chrom
 
 
 @needs_chromium
+def test_enlarged_picture_is_wider_than_its_pane(tmp_path: Path, browser: Chromium) -> None:
+    _, page = written(tmp_path, "annotation", TEXTS)
+    browser.open(page)
+    ratio = "document.getElementById('image').width / document.getElementById('picture').clientWidth"
+    assert browser.run(ratio) <= 1
+    browser.press("z")
+    assert browser.run(ratio) > 2
+    browser.press("z")
+    assert browser.run(ratio) <= 1
+
+
+@needs_chromium
 def test_comments_survive_reload_and_are_read_as_written(tmp_path: Path, browser: Chromium) -> None:
     both, page = written(tmp_path, "annotation", TEXTS)
     browser.open(page)
