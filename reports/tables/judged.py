@@ -54,6 +54,8 @@ def judged_table(
     rows = [row for row in results if row.kind == layout.kind]
     if not any(row.per_scene for row in rows):
         have = ", ".join(dict.fromkeys(row.protocol for row in results))
+        if rows:
+            raise ConfigError(f"Table {number}: no scene has a score under {have}; 'runs show RUN' lists the failures")
         wanted = " or ".join(f"{dataset}-{layout.kind}" for dataset in ("rooms", "replica", "scannet"))
         raise ConfigError(
             f"Table {number}: needs protocol {wanted}, or scores of sheets of kind {layout.kind}; found {have}"

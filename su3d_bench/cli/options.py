@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
         if action.choices is not None and value not in action.choices:
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             if isinstance(action, argparse._SubParsersAction):
-                name = action.dest
+                name = "command"
                 if value == "help":
                     self.print_help()
                     self.exit()

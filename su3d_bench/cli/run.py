@@ -101,6 +101,8 @@ def execute(plan: Plan, arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     if line := cache_warning():
         remark(f"su3d-bench: {line}", quiet=arguments.quiet)
+    if arguments.out is None:
+        remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.place.name}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)

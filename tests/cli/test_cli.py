@@ -151,7 +151,7 @@ def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
     [
         ("run rooms/living0 --method oracle", "run: unknown argument '--method'; did you mean '--methods'?"),
         ("evaluate p --table-format csv", "evaluate: unknown argument '--table-format'; did you mean '--format'?"),
-        ("rum", "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
+        ("rum", "unknown command 'rum'; did you mean 'run'? known: run, ablate, "),
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
