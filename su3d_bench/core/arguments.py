@@ -79,7 +79,7 @@ def several(name: str, value: Any, kind: Any = str) -> tuple[Any, ...]:
     found = tuple(value) if is_sequence(value) else (value,)
     for one in found:
         if not isinstance(one, kind) or (isinstance(one, str) and "\0" in one):
-            raise ConfigError(f"{name}: expected one name or several, not {printable(repr(one), 60)}")
+            raise ConfigError(f"{name}: expected a name, a path or several, not {printable(repr(one), 60)}")
     return found
 
 

@@ -72,14 +72,17 @@ def check_members(n: int, where: str) -> None:
 
 
 def column_members(matrix: NDArray[Any], where: str) -> list[Int32Array]:
-    """The nonzero rows of each column of a matrix (points, masks)."""
+    """The nonzero rows of each column of a matrix (points, masks); ``PredictionError`` for values between 0 and 1."""
     n_points, n_masks = matrix.shape
     check_sizes(n_points, n_masks, where)
     parts: list[list[Int32Array]] = [[] for _ in range(n_masks)]
     n = 0
     n_rows = max(1, min(ROWS_AT_ONCE, VALUES_AT_ONCE // max(n_masks, 1)))
     for start in range(0, n_points, n_rows):
-        part = np.ascontiguousarray((matrix[start : start + n_rows] != 0).T)
+        values = matrix[start : start + n_rows]
+        if values.dtype.kind == "f" and ((values > 0) & (values < 1)).any():
+            raise PredictionError(f"{where}: the masks have values between 0 and 1; apply a threshold to them first")
+        part = np.ascontiguousarray((values != 0).T)
         check_members(n := n + int(np.count_nonzero(part)), where)
         for k in range(n_masks):
             parts[k].append((np.flatnonzero(part[k]) + start).astype(np.int32))

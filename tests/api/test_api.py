@@ -226,7 +226,7 @@ def test_failed_scenes_raise_an_error_and_the_others_are_kept(tmp_path: Path, mo
         (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions; pass a folder"),
         (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), "confidences is 'files'; expected one of"),  # type: ignore[call-overload]
         (lambda: su3d.evaluate("x", datset="rooms"), "evaluate: got an unexpected keyword argument 'datset'"),  # type: ignore[call-overload]
-        (lambda: su3d.run("rooms/living0", su3d), "methods: expected one name or several, not <module"),  # type: ignore[arg-type]
+        (lambda: su3d.run("rooms/living0", su3d), "methods: expected a name, a path or several, not <module"),  # type: ignore[arg-type]
         (lambda: su3d.run("rooms/living0", dict), "'Config' is missing; a method has Config, finish"),
         (lambda: su3d.load_run("nowhere"), "nowhere: contains no run.json"),
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
