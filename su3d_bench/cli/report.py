@@ -196,7 +196,8 @@ def call_instances(arguments: argparse.Namespace) -> None:
 def _add_claims(verbs: Verbs) -> None:
     parser = add_verb(verbs, "claims", call_claims)
     parser.shared("runs", "--methods", "--device", "--format")
-    parser.option("--kinds KIND...", "kinds of text queries (default: all)", choices=QUERY_KINDS, default=QUERY_KINDS)
+    kinds = "kinds of questions, such as retrieval or property (default: all)"
+    parser.option("--question-kinds KIND...", kinds, choices=QUERY_KINDS, default=QUERY_KINDS)
     parser.option("--out FILE", "file to write (default: print)", type=output_path)
 
 
@@ -204,14 +205,14 @@ def call_claims(arguments: argparse.Namespace) -> None:
     """Measure what the OpenSU3D paper claims in words: spread of similarities, largest instance, labels, sizes.
 
     su3d-bench report claims runs/my-run
-    su3d-bench report claims runs/my-run --kinds relative --format latex --out claims.tex
+    su3d-bench report claims runs/my-run --question-kinds relative --format latex --out claims.tex
     """
     from su3d_bench.analysis.claims import claims_of, claims_table
     from su3d_bench.runs.verify import read_checked
 
     runs = [read_checked(path) for path in arguments.runs]
     with output.progress(sum(len(run.scenes) for run in runs), is_quiet=arguments.quiet) as report:
-        chosen = arguments.methods, arguments.kinds, arguments.device or "cpu"
+        chosen = arguments.methods, arguments.question_kinds, arguments.device or "cpu"
         found = [claims for run in runs for claims in claims_of(run, *chosen, report)]
     output.answer_or_write(arguments, [{**vars(one), "means": one.means} for one in found], [claims_table(found)])
 

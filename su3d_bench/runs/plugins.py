@@ -15,7 +15,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 from pydantic import BaseModel
 
-from su3d_bench.core import maps, types
+from su3d_bench.core import arguments, maps, types
 from su3d_bench.core.errors import PlugInError, Su3dError, printable, user_code_line
 from su3d_bench.core.interfaces import ABILITIES, INTERFACES
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
@@ -31,6 +31,7 @@ FORMS: dict[str, type] = {
     **dict.fromkeys(("indices", "views", "instance", "semantic", "every_semantic"), np.int32),
     **dict.fromkeys(("triangles", "instance_of_triangle", "segments"), np.int32),
 }
+TYPE_FILES = tuple(module.__file__ for module in (arguments, maps, types))  # whose errors concern the values passed
 # Arrays that a ground truth or mesh must have, and the shape of a row of each.
 ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
     GroundTruth: {"points": (3,), "semantic": (), "instance": ()},
@@ -180,7 +181,7 @@ def checked_method(method: Any) -> Any:
 
 def attribute_of(method: Any, name: str, without: Any = None) -> Any:
     """The property ``name`` of a method; ``without`` if it has none."""
-    value = getattr(method, name, without)
+    value = _called(name, getattr, (method, name, without), {})
     if not is_built_in(type(method)) and hasattr(method, name):
         known = inspect.getattr_static(type(method), name, None)
         place = place_of(type(method), name, known.fget if isinstance(known, property) else known)
@@ -232,7 +233,7 @@ def _called(place: str, function: Callable[..., Any], words: Sequence[Any], name
             raise PlugInError(f"{place}: {error}") from error
         raise
     except Su3dError as error:
-        is_of_types = traceback.extract_tb(error.__traceback__)[-1].filename in (types.__file__, maps.__file__)
+        is_of_types = traceback.extract_tb(error.__traceback__)[-1].filename in TYPE_FILES
         if is_of_types and not isinstance(error, PlugInError) and (line := user_code_line(error)):
             raise PlugInError(f"{line}: {error}") from error
         raise

@@ -172,7 +172,7 @@ def test_run_without_questions_gives_sizes_and_reasons(
     run = painted_run(tmp_path / "run")
     see_painted(monkeypatch)
     capsys.readouterr()
-    assert main(["report", "claims", str(run), "--format", form, "--kinds", "relative"]) == 0
+    assert main(["report", "claims", str(run), "--format", form, "--question-kinds", "relative"]) == 0
     out = capsys.readouterr().out
     assert "size per instance" in out and "no queries" in out and "no correlation" in out
     if form == "csv":
