@@ -13,7 +13,7 @@ answer, or if no frame shows the answer clearly. Templates are ours.
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -124,11 +124,11 @@ def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -
     asked: dict[str, Any] = {}
     questions = generate(scene, objects, both=True)
     cases = {case.text: case for case in chains_of(questions, objects)}
-    for thing, chains in _chains(questions, objects):
-        texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
-        made = _drawn(thing, texts, objects)
-        if len(made) < CHAINS_EACH or (max_objects is not None and sum(map(len, asked.values())) == max_objects):
-            continue
+    chains_by_id = {thing.id: chains for thing, chains in _chains(questions, objects)}
+    candidates = {key: _candidates(objects.by_id(key), chains, objects) for key, chains in chains_by_id.items()}
+    for object_id, made in _balanced(candidates, max_objects).items():
+        thing, chains = objects.by_id(object_id), chains_by_id[object_id]
+        texts, key = [chain[0].text for chain in chains], str(object_id - 1)
         known = {word for text in texts for word in words(text)}
         grounding.setdefault(thing.name, {})[key] = {
             f"chain_{number}": [_entry(cases[one.text]) for one in chain] for number, chain in enumerate(chains, 1)
@@ -158,17 +158,50 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[ChainQuestion]:
-    """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
-    # a text with the words that determine an answer reveals it
-    asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
-    every = [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
+def _candidates(thing: MapObject, chains: Sequence[Sequence[Question]], objects: SceneMap) -> list[ChainQuestion]:
+    """The questions about an object by the texts of its chains; none that reveals its answer."""
+    asked = ((one, chain[0].text) for chain in chains for one in questions_about(thing, chain[0].text, objects))
+    return [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
+
+
+def _balanced(
+    candidates: Mapping[int, Sequence[ChainQuestion]], max_objects: int | None
+) -> dict[int, list[ChainQuestion]]:
+    """Three questions each of at most ``max_objects`` objects by id.
+
+    Of each tag, yes is the answer as often as no, and the first of two alternatives as often as the second: the surplus
+    is dropped by a digest, and others are drawn, until there is none.
+    """
+    dropped: set[tuple[int, str]] = set()
+    while True:
+        left = {key: [one for one in every if (key, one.text) not in dropped] for key, every in candidates.items()}
+        drawn = ((key, _drawn(key, every)) for key, every in left.items())
+        kept = dict(islice((entry for entry in drawn if len(entry[1]) == CHAINS_EACH), max_objects))
+        sides = defaultdict[tuple[str, bool], tuple[list[tuple[int, str]], ...]](lambda: ([], []))
+        asked = ((key, one) for key, made in kept.items() for one in made)
+        for key, one in sorted(asked, key=lambda entry: _digest(entry[1].text)):
+            if (side := _side(one)) is not None:
+                sides[one.tag, " or " in one.text][side].append((key, one.text))
+        surplus = {entry for a, b in sides.values() for entry in (*a[len(b) :], *b[len(a) :])}
+        if not surplus:
+            return kept
+        dropped |= surplus
+
+
+def _side(one: ChainQuestion) -> bool | None:
+    """Whether the answer is yes or the first of two alternatives; None if it is neither of two."""
+    before, either, _ = one.text.rpartition(" or ")
+    return before.lower().endswith(f" {one.answer.lower()}") if either else {"Yes": True, "No": False}.get(one.answer)
+
+
+def _drawn(object_id: int, every: Sequence[ChainQuestion]) -> list[ChainQuestion]:
+    """Three questions, of different kinds if possible, by a digest of their texts."""
     turn = Counter[str]()
     ranked = []
-    unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
+    unwanted = {tag: ("Yes", "No")[_digest(f"{object_id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
     for one in sorted(every, key=lambda one: (one.answer == unwanted[one.tag], _digest(one.text))):
         turn[one.tag] += 1
-        ranked.append((turn[one.tag], _digest(f"{thing.id} {one.tag}"), one))
+        ranked.append((turn[one.tag], _digest(f"{object_id} {one.tag}"), one))
     ranked.sort(key=lambda entry: entry[:2])
     drawn: dict[tuple[str, str], ChainQuestion] = {}
     for _, _, one in ranked:
@@ -196,7 +229,7 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
     if name:
         yield from _support_question(thing, it, objects)
     yield from _measured(thing, it, alone, objects)
-    yield from _beside(thing, it, alone, objects)
+    yield from _beside(thing, it, alone, objects, is_plain=not where)
     if "next to" not in text:
         yield from _existing(thing, it, objects)
 
@@ -249,27 +282,39 @@ def _has_volume(thing: MapObject) -> bool:
     return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
-def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
-    """Whether an object is next to another, and which of two is closer by a clear margin."""
-    for other in alone:
-        if objects.is_doubtful("next to", thing, other) or "next to" in it:
+def _beside(
+    thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap, *, is_plain: bool
+) -> Iterator[ChainQuestion]:
+    """Whether an object is next to another, and which of two is closer by a clear margin.
+
+    The former only if its text ``is_plain``: "the bowl that is on a shelf next to the pan" has two meanings.
+    """
+    for other in alone if is_plain else ():
+        if objects.is_doubtful("next to", thing, other):
             continue
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
             answer = "Yes" if is_next else "No"
             yield ChainQuestion(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
-    ranked = sorted(alone, key=lambda other: gap_m(thing.box, other.box))
+    apart = (other for other in alone if not objects.is_of(other, thing))
+    ranked = sorted(apart, key=lambda other: gap_m(thing.box, other.box))
     for near, far in zip(ranked[:MAX_PER_TEMPLATE], reversed(ranked), strict=False):
         if gap_m(thing.box, far.box) - gap_m(thing.box, near.box) < LEAD_M or near is far:
             continue
-        first, second = sorted((near.name, far.name), key=lambda name: _digest(f"{it} {name}"))
-        text = f"Which is closer to {it}, the {first} or the {second}?"
-        yield ChainQuestion(text, near.name.capitalize(), "spatial", near.name)
+        for first, second in ((near.name, far.name), (far.name, near.name)):
+            text = f"Which is closer to {it}, the {first} or the {second}?"
+            yield ChainQuestion(text, near.name.capitalize(), "spatial", near.name)
 
 
 def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object with a name is next to an object; the answer is no if all such objects are far away."""
-    names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
+    names = sorted(
+        {
+            other.name
+            for other in objects.objects
+            if other is not thing and other.is_query_target and not is_plural(other.name)
+        }
+    )
     ways = Counter[str]()
     for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):
         others = [other for other in _called(name, objects) if other.id != thing.id]

@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
 from su3d_bench.core.english import last_word, with_article, words
-from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
 from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
-from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects, word_table
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: questions with a larger share of answer objects are too general
@@ -91,23 +89,17 @@ def accuracy_by_name(question: Question, objects: SceneMap) -> float:
     return min(1.0, len(question.answers) / max(1, len(named)))
 
 
-@cache
-def _table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it; ``confused``: groups."""
-    table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
-    return {phrase: tuple(entries) for phrase, entries in table[section].items()}
-
-
 @lru_cache(maxsize=65_536)
 def may_be_confused(one: str, other: str) -> bool:
-    """Whether people may use one of two names for an object of the other.
+    """Whether people may use the first name for an object with the second, or for a part of it.
 
-    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
+    They are synonyms, share a head noun, or are in one of the groups ``confused`` or ``parts`` of words.toml.
 
     >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
     (True, True, False)
     """
-    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
+    alike = _heads(one).union(word_table("parts").get(one, ()))
+    return is_called(one, other) or is_called(other, one) or not alike.isdisjoint(_heads(other))
 
 
 @cache
@@ -115,7 +107,7 @@ def _heads(name: str) -> frozenset[str]:
     """The head noun of a name, the name, its synonyms, and the groups of these."""
     names = (last_word(name), name, *SYNONYMS.get(name.replace(" ", "-"), ()))
     heads = {" ".join(words(one)) for one in names}
-    return frozenset(heads | {group for group, nouns in _table("confused").items() if not heads.isdisjoint(nouns)})
+    return frozenset(heads | {group for group, nouns in word_table("confused").items() if not heads.isdisjoint(nouns)})
 
 
 def _texts(objects: SceneMap) -> Iterator[_Asked]:
@@ -123,11 +115,11 @@ def _texts(objects: SceneMap) -> Iterator[_Asked]:
     names = sorted({thing.name for thing in objects.objects})
     for name in names:
         yield _Asked("instance", name, _ids(objects, name))
-    for name, others in _table("names").items():
+    for name, others in word_table("names").items():
         if name in names:
             for other in others:
                 yield _Asked("instance", other, _ids(objects, other))
-    for phrase, classes in _table("uses").items():
+    for phrase, classes in word_table("uses").items():
         yield _Asked("affordance", phrase, tuple(thing for name in classes for thing in _called(objects, name)))
     yield from _sizes(objects)
     yield from _adjectives(objects)
@@ -203,7 +195,7 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
         for word in sorted({word for _, looks in known for word in looks.words}):
             answers = tuple(thing.id for thing, looks in known if word in looks.words)
             if len(answers) == sum(word in looks.maybe for _, looks in known) and _none_is_more(word, known):
-                others = [other for other in _table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
+                others = [other for other in word_table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
                 for called in (name, *others):
                     yield _Asked("property", f"{word} {called}", answers, name)
         if last_word(name) not in WITHOUT_SIZE and not any(thing.is_cut for thing in named):
