@@ -87,7 +87,8 @@ def generate_questions(
     for kind, drafts in _Drafts(scene, random, with_sides=eye is not None).of_kinds().items():
         for draft in _drawn(drafts, n_each, random):
             answer = solver.answer(draft.text)
-            is_seen = all(thing.is_query_target for thing in scene.objects if thing.shown in answer.text)
+            mentioned = [one for one in scene.objects if one.id in answer.object_ids or one.shown in answer.text]
+            is_seen = all(thing.is_query_target for thing in mentioned)
             if answer.is_decided and is_seen:
                 questions.append(GeneratedQuestion(draft.text, kind, answer, draft.by_chance, draft.by_name))
     return tuple(questions)
