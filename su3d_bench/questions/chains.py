@@ -158,30 +158,29 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
+_Asked = Sequence[ChainQuestion]
+
+
 def _candidates(thing: MapObject, chains: Sequence[Sequence[Question]], objects: SceneMap) -> list[ChainQuestion]:
     """The questions about an object by the texts of its chains; none that reveals its answer."""
     asked = ((one, chain[0].text) for chain in chains for one in questions_about(thing, chain[0].text, objects))
     return [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
 
 
-def _balanced(
-    candidates: Mapping[int, Sequence[ChainQuestion]], max_objects: int | None
-) -> dict[int, list[ChainQuestion]]:
-    """Three questions each of at most ``max_objects`` objects by id.
+def _balanced(candidates: Mapping[int, _Asked], max_objects: int | None) -> dict[int, list[ChainQuestion]]:
+    """Three questions each of objects by id; of each tag, both of two answers are equally frequent.
 
-    Of each tag, yes is the answer as often as no, and the first of two alternatives as often as the second: the surplus
-    is dropped by a digest, and others are drawn, until there is none.
+    The surplus, by a digest, is dropped, and other questions are drawn, until there is none.
     """
     dropped: set[tuple[int, str]] = set()
     while True:
-        left = {key: [one for one in every if (key, one.text) not in dropped] for key, every in candidates.items()}
-        drawn = ((key, _drawn(key, every)) for key, every in left.items())
-        kept = dict(islice((entry for entry in drawn if len(entry[1]) == CHAINS_EACH), max_objects))
+        left = ((key, [one for one in every if (key, one.text) not in dropped]) for key, every in candidates.items())
+        drawn = ((key, made) for key, every in left if len(made := _drawn(key, every)) == CHAINS_EACH)
+        kept = dict(islice(drawn, max_objects))
         sides = defaultdict[tuple[str, bool], tuple[list[tuple[int, str]], ...]](lambda: ([], []))
-        asked = ((key, one) for key, made in kept.items() for one in made)
-        for key, one in sorted(asked, key=lambda entry: _digest(entry[1].text)):
-            if (side := _side(one)) is not None:
-                sides[one.tag, " or " in one.text][side].append((key, one.text))
+        asked = ((key, one, side) for key, made in kept.items() for one in made if (side := _side(one)) is not None)
+        for key, one, side in sorted(asked, key=lambda entry: _digest(entry[1].text)):
+            sides[one.tag, " or " in one.text][side].append((key, one.text))
         surplus = {entry for a, b in sides.values() for entry in (*a[len(b) :], *b[len(a) :])}
         if not surplus:
             return kept
@@ -229,7 +228,7 @@ def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[
     if name:
         yield from _support_question(thing, it, objects)
     yield from _measured(thing, it, alone, objects)
-    yield from _beside(thing, it, alone, objects, is_plain=not where)
+    yield from _beside(thing, it, alone, objects)
     if "next to" not in text:
         yield from _existing(thing, it, objects)
 
@@ -282,15 +281,10 @@ def _has_volume(thing: MapObject) -> bool:
     return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
-def _beside(
-    thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap, *, is_plain: bool
-) -> Iterator[ChainQuestion]:
-    """Whether an object is next to another, and which of two is closer by a clear margin.
-
-    The former only if its text ``is_plain``: "the bowl that is on a shelf next to the pan" has two meanings.
-    """
-    for other in alone if is_plain else ():
-        if objects.is_doubtful("next to", thing, other):
+def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
+    """Whether an object is next to another, and which of two is closer by a clear margin."""
+    for other in alone:  # "the bowl that is on a shelf next to the pan" has two meanings
+        if objects.is_doubtful("next to", thing, other) or {"that", "with"} & set(it.split()):
             continue
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
@@ -308,13 +302,8 @@ def _beside(
 
 def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object with a name is next to an object; the answer is no if all such objects are far away."""
-    names = sorted(
-        {
-            other.name
-            for other in objects.objects
-            if other is not thing and other.is_query_target and not is_plural(other.name)
-        }
-    )
+    seen = {other.name for other in objects.objects if other.is_query_target and other.id != thing.id}
+    names = [name for name in sorted(seen) if not is_plural(name)]
     ways = Counter[str]()
     for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):
         others = [other for other in _called(name, objects) if other.id != thing.id]

@@ -27,16 +27,8 @@ from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
 from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
-from su3d_bench.questions.model import Answer
-from su3d_bench.questions.scene_map import (
-    MapObject,
-    SceneMap,
-    is_called,
-    is_clear_name,
-    is_room_surface,
-    noun_objects,
-    plain_name,
-)
+from su3d_bench.questions.model import Answer, word_table
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
 MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # lead of the closest: metres, and fraction of its distance and the longest side
@@ -46,8 +38,7 @@ MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
-# Annotated per pile; and blinds, of which one set has many.
-PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",), ("blind",)})
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",), ("blind",)})  # as sets
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 Random = np.random.Generator
 
@@ -327,8 +318,8 @@ def absent_names(truth: GroundTruth, objects: SceneMap) -> tuple[str, ...]:
 
 
 def _is_name(name: str) -> bool:
-    is_known = bool(name) and name not in _NO_NAMES and not name.startswith("other ")
-    return is_known and is_clear_name(name) and not is_room_surface(name)
+    is_known = name not in ("", *_NO_NAMES, *word_table("unclear")["names"])
+    return is_known and not name.startswith("other ") and not is_room_surface(name)
 
 
 @lru_cache(maxsize=65_536)

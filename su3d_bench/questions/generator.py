@@ -21,8 +21,8 @@ from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
-from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
-from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects, word_table
+from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question, word_table
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: questions with a larger share of answer objects are too general

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -17,13 +16,13 @@ from su3d_bench.core.english import last_word, words
 from su3d_bench.core.errors import PredictionError, nearest, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
 from su3d_bench.numerics.relations import RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
+from su3d_bench.questions.model import word_table
 
 MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may have texts of any length
 
@@ -57,18 +56,6 @@ class MapObject:
     def size(self) -> Float64Array:
         sides: Float64Array = self.box[1] - self.box[0]
         return sides
-
-
-@cache
-def word_table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """A section of words.toml, such as ``names``: class -> its other names."""
-    table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
-    return {phrase: tuple(entries) for phrase, entries in table[section].items()}
-
-
-def is_clear_name(name: str) -> bool:
-    """Whether people use this class name for its objects."""
-    return name not in word_table("unclear")["names"]
 
 
 def is_room_surface(name: str) -> bool:
@@ -335,7 +322,9 @@ def known_objects(
             continue
         sight = None if seen is None else seen.get(known.id)
         is_query_target = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
-        is_query_target &= is_clear_name(known.name) and not any(name.endswith(f" {known.name}") for name in names)
+        is_query_target &= known.name not in word_table("unclear")["names"] and not any(
+            name.endswith(f" {known.name}") for name in names
+        )
         is_cut = whole is None and sight is not None and sight.is_cut
         looks = None
         if whole is None and seen is not None:
