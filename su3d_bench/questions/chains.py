@@ -158,16 +158,13 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-_Asked = Sequence[ChainQuestion]
-
-
 def _candidates(thing: MapObject, chains: Sequence[Sequence[Question]], objects: SceneMap) -> list[ChainQuestion]:
     """The questions about an object by the texts of its chains; none that reveals its answer."""
     asked = ((one, chain[0].text) for chain in chains for one in questions_about(thing, chain[0].text, objects))
     return [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
 
 
-def _balanced(candidates: Mapping[int, _Asked], max_objects: int | None) -> dict[int, list[ChainQuestion]]:
+def _balanced(candidates: Mapping[int, list[ChainQuestion]], max_objects: int | None) -> dict[int, list[ChainQuestion]]:
     """Three questions each of objects by id; of each tag, both of two answers are equally frequent.
 
     The surplus, by a digest, is dropped, and other questions are drawn, until there is none.
@@ -307,13 +304,13 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQue
     ways = Counter[str]()
     for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):
         others = [other for other in _called(name, objects) if other.id != thing.id]
-        is_next = [objects.holds("next to", other, thing) for other in others]
+        beside = [other for other in others if objects.holds("next to", other, thing)]
         if any(objects.is_doubtful("next to", other, thing) for other in others):
             continue
-        plain = [other.is_query_target for other, holds in zip(others, is_next, strict=True) if holds]
         alike = (other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name))
         is_far = all(gap_m(thing.box, other.box) > FAR_M for other in alike)
-        answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
+        is_next = any(other.is_query_target for other in beside)
+        answer = "Yes" if is_next else "No" if is_far and not beside else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1
             yield ChainQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)

@@ -262,9 +262,7 @@ def _away_m(a: MapObject, b: MapObject) -> float:
 def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
     """Whether the nearest object (farthest, ``sign`` -1) leads clearly, between centres and between sides."""
     heights = [thing.centroid[2] for thing in (*things, reference)]
-    if any(thing.is_cut for thing in things):
-        return False
-    if len(things) < 2 or max(heights) - min(heights) > LEVEL_M:
+    if len(things) < 2 or any(thing.is_cut for thing in things) or max(heights) - min(heights) > LEVEL_M:
         return False
     ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))
     sides = [float(thing.size.max()) for thing in (*ranked[:2], reference)]
