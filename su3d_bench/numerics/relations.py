@@ -119,7 +119,7 @@ class Relations:
         if relation == "above":
             sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, None, :2]
             # only the depth of a thin object on a wall may be beside the other
-            answer |= self.above & ~self._has_centre_over(OVER_PAD_M * (2 * sides < sides[..., ::-1]))
+            answer |= self.above & ~self._has_centre_over(np.where(2 * sides < sides[..., ::-1], OVER_PAD_M, 0.0))
         if relation == "next to":
             answer |= loose.may_be_next_to & ~self.next_to
         return answer

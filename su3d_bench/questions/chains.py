@@ -27,8 +27,8 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import BUILT_IN, FLAT_M, gap_m
-from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT
-from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, is_flat, may_be_confused
+from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT, is_flat
+from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, may_be_confused
 from su3d_bench.questions.model import KINDS, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 
@@ -178,10 +178,9 @@ def _balanced(candidates: Mapping[int, list[ChainQuestion]], max_objects: int | 
         asked = ((key, one, side) for key, made in kept.items() for one in made if (side := _side(one)) is not None)
         for key, one, side in sorted(asked, key=lambda entry: _digest(entry[1].text)):
             sides[one.tag, " or " in one.text][side].append((key, one.text))
-        surplus = {entry for a, b in sides.values() for entry in (*a[len(b) :], *b[len(a) :])}
-        if not surplus:
+        dropped.update(entry for a, b in sides.values() for entry in (*a[len(b) :], *b[len(a) :]))
+        if all(len(a) == len(b) for a, b in sides.values()):
             return kept
-        dropped |= surplus
 
 
 def _side(one: ChainQuestion) -> bool | None:
@@ -198,9 +197,8 @@ def _drawn(object_id: int, every: Sequence[ChainQuestion]) -> list[ChainQuestion
     for one in sorted(every, key=lambda one: (one.answer == unwanted[one.tag], _digest(one.text))):
         turn[one.tag] += 1
         ranked.append((turn[one.tag], _digest(f"{object_id} {one.tag}"), one))
-    ranked.sort(key=lambda entry: entry[:2])
     drawn: dict[tuple[str, str], ChainQuestion] = {}
-    for _, _, one in ranked:
+    for _, _, one in sorted(ranked, key=lambda entry: entry[:2]):
         drawn.setdefault((one.tag, one.hint), one)
     return list(drawn.values())[:CHAINS_EACH]
 
@@ -275,7 +273,7 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Sc
 
 def _has_volume(thing: MapObject) -> bool:
     """Whether its volume is a meaningful size."""
-    return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
+    return not is_flat(thing.size) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:

@@ -26,7 +26,8 @@ from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
-from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
+from su3d_bench.questions.appearance import is_flat
+from su3d_bench.questions.generator import extreme_of, may_be_confused
 from su3d_bench.questions.model import Answer, word_table
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
@@ -181,7 +182,7 @@ class _Drafts:
     def _largest(self) -> Iterator[_Draft]:
         for name, n in self._n_of.items():
             named = [thing for thing in self._things if thing.name == name]
-            if n < 3 or any(map(is_flat, named)) or not all(thing.is_whole for thing in named):
+            if n < 3 or any(is_flat(thing.size) for thing in named) or not all(thing.is_whole for thing in named):
                 continue
             if extreme_of(named, 1) is not None:
                 yield _Draft(f"Which {name} is the largest?", 1 / n, 1 / n)
