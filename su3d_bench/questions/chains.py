@@ -307,8 +307,7 @@ def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQue
             continue
         alike = (other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name))
         is_far = all(gap_m(thing.box, other.box) > FAR_M for other in alike)
-        is_next = any(other.is_query_target for other in beside)
-        answer = "Yes" if is_next else "No" if is_far and not beside else ""
+        answer = "Yes" if any(other.is_query_target for other in beside) else "No" if is_far and not beside else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1
             yield ChainQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)
