@@ -116,6 +116,10 @@ class Relations:
         if relation in ("on", "under"):
             is_within = self._stands_inside & ~self._rests_on_top & ~self._carries_inside[None]
             answer |= is_within if relation == "on" else is_within.T
+        if relation == "above":
+            sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, None, :2]
+            # only the depth of a thin object on a wall may be beside the other
+            answer |= self.above & ~self._has_centre_over(np.where(2 * sides < sides[..., ::-1], OVER_PAD_M, 0.0))
         if relation == "next to":
             answer |= loose.may_be_next_to & ~self.next_to
         return answer
@@ -193,10 +197,13 @@ class Relations:
         """Half of the first, or its centre, is over the footprint of the second."""
         pad_m = OVER_PAD_M * self._slack
         share = self._shared(pad_m) / self._area[:, None]
-        centre = self._boxes.mean(axis=1)[:, None, :2]
-        low, high = self._boxes[:, 0, :2] - pad_m, self._boxes[:, 1, :2] + pad_m
-        has_centre = ((centre >= low[None]) & (centre <= high[None])).all(axis=2)
+        has_centre = self._has_centre_over(pad_m)
         return np.asarray((share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack)))
+
+    def _has_centre_over(self, pad_m: Float64Array | float) -> BoolArray:
+        """The centre of the first is over the footprint of the second grown by ``pad_m``, (K, 1, 2) or for all."""
+        centre, low, high = self._boxes.mean(axis=1)[:, None, :2], self._boxes[:, 0, :2], self._boxes[:, 1, :2]
+        return np.asarray(((centre >= low - pad_m) & (centre <= high + pad_m)).all(axis=2))
 
     @cached_property
     def _hangs_in_front(self) -> BoolArray:

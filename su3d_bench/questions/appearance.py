@@ -225,6 +225,12 @@ MIN_LONG_M = 1.0  # minimum to be long or tall in general; a smaller object may 
 SQUARE, MAYBE_SQUARE = 1.1, 1.25
 
 
+def is_flat(sides: Float64Array) -> bool:
+    """Whether an object with these sides (3,) is so flat that its volume is not a meaningful size."""
+    least, middle, _ = sorted(sides.tolist())
+    return bool(least < FLAT_SHARE * middle)
+
+
 @dataclass(frozen=True, eq=False)
 class Appearance:
     """``sides`` (3,): length, width and height in metres along the object's own axes, with length >= width.
@@ -235,12 +241,6 @@ class Appearance:
     sides: Float64Array
     words: frozenset[str]
     maybe: frozenset[str]
-
-    @property
-    def is_flat(self) -> bool:
-        """Whether its volume is not a meaningful size."""
-        least, middle, _ = sorted(self.sides.tolist())
-        return bool(least < FLAT_SHARE * middle)
 
 
 def appearance_of(name: str, points: Float64Array, sight: Sight | None, *, is_cut: bool) -> Appearance:
@@ -332,9 +332,9 @@ def measure_of(name: str, looks: Appearance, word: str) -> float | None:
     length, width, height = map(float, looks.sides)
     least, middle, longest = sorted((length, width, height))
     if word == "large":
-        return middle * longest if looks.is_flat or last_word(name) in SOFT else least * middle * longest
+        return middle * longest if is_flat(looks.sides) or last_word(name) in SOFT else least * middle * longest
     if last_word(name) in SOFT:
         return None
     if word in ("long", "wide"):
         return length if (length >= height) == (word == "long") else None
-    return None if height < FLAT_M or (looks.is_flat and height == least) else height
+    return None if height < FLAT_M or (is_flat(looks.sides) and height == least) else height

@@ -13,7 +13,7 @@ answer, or if no frame shows the answer clearly. Templates are ours.
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -27,8 +27,8 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import BUILT_IN, FLAT_M, gap_m
-from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT
-from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, is_flat, may_be_confused
+from su3d_bench.questions.appearance import COLOURS, SHAPES, SIZES, SOFT, is_flat
+from su3d_bench.questions.generator import TWICE, WITHOUT_SIZE, generate, may_be_confused
 from su3d_bench.questions.model import KINDS, Question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 
@@ -124,11 +124,11 @@ def metadata_of(scene: str, objects: SceneMap, max_objects: int | None = None) -
     asked: dict[str, Any] = {}
     questions = generate(scene, objects, both=True)
     cases = {case.text: case for case in chains_of(questions, objects)}
-    for thing, chains in _chains(questions, objects):
-        texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
-        made = _drawn(thing, texts, objects)
-        if len(made) < CHAINS_EACH or (max_objects is not None and sum(map(len, asked.values())) == max_objects):
-            continue
+    chains_by_id = {thing.id: chains for thing, chains in _chains(questions, objects)}
+    candidates = {key: _candidates(objects.by_id(key), chains, objects) for key, chains in chains_by_id.items()}
+    for object_id, made in _balanced(candidates, max_objects).items():
+        thing, chains = objects.by_id(object_id), chains_by_id[object_id]
+        texts, key = [chain[0].text for chain in chains], str(object_id - 1)
         known = {word for text in texts for word in words(text)}
         grounding.setdefault(thing.name, {})[key] = {
             f"chain_{number}": [_entry(cases[one.text]) for one in chain] for number, chain in enumerate(chains, 1)
@@ -158,20 +158,47 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[ChainQuestion]:
-    """Three questions, of different kinds if possible, by a digest of their texts; yes as often as no."""
-    # a text with the words that determine an answer reveals it
-    asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
-    every = [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
+def _candidates(thing: MapObject, chains: Sequence[Sequence[Question]], objects: SceneMap) -> list[ChainQuestion]:
+    """The questions about an object by the texts of its chains; none that reveals its answer."""
+    asked = ((one, chain[0].text) for chain in chains for one in questions_about(thing, chain[0].text, objects))
+    return [one for one, text in asked if not set(words(one.hint)) & set(words(text))]
+
+
+def _balanced(candidates: Mapping[int, list[ChainQuestion]], max_objects: int | None) -> dict[int, list[ChainQuestion]]:
+    """Three questions each of objects by id; of each tag, both of two answers are equally frequent.
+
+    The surplus, by a digest, is dropped, and other questions are drawn, until there is none.
+    """
+    dropped: set[tuple[int, str]] = set()
+    while True:
+        left = ((key, [one for one in every if (key, one.text) not in dropped]) for key, every in candidates.items())
+        drawn = ((key, made) for key, every in left if len(made := _drawn(key, every)) == CHAINS_EACH)
+        kept = dict(islice(drawn, max_objects))
+        sides = defaultdict[tuple[str, bool], tuple[list[tuple[int, str]], ...]](lambda: ([], []))
+        asked = ((key, one, side) for key, made in kept.items() for one in made if (side := _side(one)) is not None)
+        for key, one, side in sorted(asked, key=lambda entry: _digest(entry[1].text)):
+            sides[one.tag, " or " in one.text][side].append((key, one.text))
+        dropped.update(entry for a, b in sides.values() for entry in (*a[len(b) :], *b[len(a) :]))
+        if all(len(a) == len(b) for a, b in sides.values()):
+            return kept
+
+
+def _side(one: ChainQuestion) -> bool | None:
+    """Whether the answer is yes or the first of two alternatives; None if it is neither of two."""
+    before, either, _ = one.text.rpartition(" or ")
+    return before.lower().endswith(f" {one.answer.lower()}") if either else {"Yes": True, "No": False}.get(one.answer)
+
+
+def _drawn(object_id: int, every: Sequence[ChainQuestion]) -> list[ChainQuestion]:
+    """Three questions, of different kinds if possible, by a digest of their texts."""
     turn = Counter[str]()
     ranked = []
-    unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
+    unwanted = {tag: ("Yes", "No")[_digest(f"{object_id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
     for one in sorted(every, key=lambda one: (one.answer == unwanted[one.tag], _digest(one.text))):
         turn[one.tag] += 1
-        ranked.append((turn[one.tag], _digest(f"{thing.id} {one.tag}"), one))
-    ranked.sort(key=lambda entry: entry[:2])
+        ranked.append((turn[one.tag], _digest(f"{object_id} {one.tag}"), one))
     drawn: dict[tuple[str, str], ChainQuestion] = {}
-    for _, _, one in ranked:
+    for _, _, one in sorted(ranked, key=lambda entry: entry[:2]):
         drawn.setdefault((one.tag, one.hint), one)
     return list(drawn.values())[:CHAINS_EACH]
 
@@ -246,40 +273,41 @@ def _measured(thing: MapObject, it: str, alone: Sequence[MapObject], objects: Sc
 
 def _has_volume(thing: MapObject) -> bool:
     """Whether its volume is a meaningful size."""
-    return not is_flat(thing) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
+    return not is_flat(thing.size) and last_word(thing.name) not in SOFT | WITHOUT_SIZE
 
 
 def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object is next to another, and which of two is closer by a clear margin."""
-    for other in alone:
-        if objects.is_doubtful("next to", thing, other) or "next to" in it:
+    for other in alone:  # "the bowl that is on a shelf next to the pan" has two meanings
+        if objects.is_doubtful("next to", thing, other) or {"that", "with"} & set(it.split()):
             continue
         is_next = objects.holds("next to", thing, other)
         if is_next or gap_m(thing.box, other.box) > FAR_M:
             answer = "Yes" if is_next else "No"
             yield ChainQuestion(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
-    ranked = sorted(alone, key=lambda other: gap_m(thing.box, other.box))
+    apart = (other for other in alone if not objects.is_of(other, thing))
+    ranked = sorted(apart, key=lambda other: gap_m(thing.box, other.box))
     for near, far in zip(ranked[:MAX_PER_TEMPLATE], reversed(ranked), strict=False):
         if gap_m(thing.box, far.box) - gap_m(thing.box, near.box) < LEAD_M or near is far:
             continue
-        first, second = sorted((near.name, far.name), key=lambda name: _digest(f"{it} {name}"))
-        text = f"Which is closer to {it}, the {first} or the {second}?"
-        yield ChainQuestion(text, near.name.capitalize(), "spatial", near.name)
+        for first, second in ((near.name, far.name), (far.name, near.name)):
+            text = f"Which is closer to {it}, the {first} or the {second}?"
+            yield ChainQuestion(text, near.name.capitalize(), "spatial", near.name)
 
 
 def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[ChainQuestion]:
     """Whether an object with a name is next to an object; the answer is no if all such objects are far away."""
-    names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
+    seen = {other.name for other in objects.objects if other.is_query_target and other.id != thing.id}
+    names = [name for name in sorted(seen) if not is_plural(name)]
     ways = Counter[str]()
     for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):
         others = [other for other in _called(name, objects) if other.id != thing.id]
-        is_next = [objects.holds("next to", other, thing) for other in others]
+        beside = [other for other in others if objects.holds("next to", other, thing)]
         if any(objects.is_doubtful("next to", other, thing) for other in others):
             continue
-        plain = [other.is_query_target for other, holds in zip(others, is_next, strict=True) if holds]
         alike = (other for other in objects.objects if other.id != thing.id and may_be_confused(name, other.name))
         is_far = all(gap_m(thing.box, other.box) > FAR_M for other in alike)
-        answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
+        answer = "Yes" if any(other.is_query_target for other in beside) else "No" if is_far and not beside else ""
         if answer and ways[answer] < MAX_PER_TEMPLATE:
             ways[answer] += 1
             yield ChainQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)

@@ -26,8 +26,9 @@ from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import PresenceQuery
 from su3d_bench.numerics.relations import FLAT_M, Relation, gap_m
 from su3d_bench.perception.embedded.lexicon import vocabulary
-from su3d_bench.questions.generator import extreme_of, is_flat, may_be_confused
-from su3d_bench.questions.model import Answer
+from su3d_bench.questions.appearance import is_flat
+from su3d_bench.questions.generator import extreme_of, may_be_confused
+from su3d_bench.questions.model import Answer, word_table
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, is_room_surface, noun_objects, plain_name
 from su3d_bench.questions.solver import Solver
 
@@ -38,7 +39,7 @@ MAX_BETWEEN = 2  # questions with more objects between two are not asked
 BETWEEN_M = 2.5  # objects farther apart are not asked about with "between"
 MAX_SINGLE = 30  # maximum number of objects with a unique name that are used: the number of triples is cubic
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess within this is correct
-PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",)})  # annotated per pile
+PILED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",), ("towel",), ("blind",)})  # as sets
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 Random = np.random.Generator
 
@@ -78,7 +79,8 @@ def generate_questions(
     for kind, drafts in _Drafts(scene, random, with_sides=eye is not None).of_kinds().items():
         for draft in _drawn(drafts, n_each, random):
             answer = solver.answer(draft.text)
-            is_seen = all(scene.by_id(object_id).is_query_target for object_id in answer.object_ids)
+            mentioned = [one for one in scene.objects if one.id in answer.object_ids or one.shown in answer.text]
+            is_seen = all(thing.is_query_target for thing in mentioned)
             if answer.is_decided and is_seen:
                 questions.append(GeneratedQuestion(draft.text, kind, answer, draft.by_chance, draft.by_name))
     return tuple(questions)
@@ -138,7 +140,8 @@ class _Drafts:
         for reference in self._single:
             for name, n in self._n_of.items():
                 several = [thing for thing in self._things if thing.name == name]
-                if n > 1 and is_countable(name) and _leads(several, reference, sign):
+                is_apart = not any(self._scene.is_of(thing, reference) for thing in several)
+                if n > 1 and is_countable(name) and is_apart and _leads(several, reference, sign):
                     verb = "are" if is_plural(name) else "is"
                     words = of_two if n == 2 else of_more
                     yield _Draft(f"Which {name} {verb} {words} the {reference.name}?", 1 / n, 1 / n)
@@ -161,7 +164,7 @@ class _Drafts:
 
     def _counts(self) -> Iterator[_Draft]:
         """Counts for every name, and for some absent names, unless other objects might be called so."""
-        absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
+        absent = [name for name in map(plain_name, vocabulary()) if _is_name(name)]
         names = [name for name in (*self._n_of, *absent) if _is_counted(name) and self._is_distinct(name)]
         n_of = {name: len(noun_objects(name, self._scene).objects) for name in names}
         counted = {name: n for name, n in n_of.items() if name in self._n_of}
@@ -179,14 +182,14 @@ class _Drafts:
     def _largest(self) -> Iterator[_Draft]:
         for name, n in self._n_of.items():
             named = [thing for thing in self._things if thing.name == name]
-            if n < 3 or any(map(is_flat, named)) or not all(thing.is_whole for thing in named):
+            if n < 3 or any(is_flat(thing.size) for thing in named) or not all(thing.is_whole for thing in named):
                 continue
             if extreme_of(named, 1) is not None:
                 yield _Draft(f"Which {name} is the largest?", 1 / n, 1 / n)
 
     def _compared(self) -> Iterator[_Draft]:
         for reference in self._single:
-            for a, b in combinations([thing for thing in self._single if thing is not reference], 2):
+            for a, b in combinations([thing for thing in self._single if not self._scene.is_of(thing, reference)], 2):
                 if _leads([a, b], reference, 1):
                     text = f"Which is closer to the {reference.name}, the {a.name} or the {b.name}?"
                     yield _Draft(text, 0.5, 0.5, "first" if _away_m(a, reference) < _away_m(b, reference) else "second")
@@ -260,9 +263,7 @@ def _away_m(a: MapObject, b: MapObject) -> float:
 def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
     """Whether the nearest object (farthest, ``sign`` -1) leads clearly, between centres and between sides."""
     heights = [thing.centroid[2] for thing in (*things, reference)]
-    if any(thing.is_cut for thing in things):
-        return False
-    if len(things) < 2 or max(heights) - min(heights) > LEVEL_M:
+    if len(things) < 2 or any(thing.is_cut for thing in things) or max(heights) - min(heights) > LEVEL_M:
         return False
     ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))
     sides = [float(thing.size.max()) for thing in (*ranked[:2], reference)]
@@ -316,7 +317,8 @@ def absent_names(truth: GroundTruth, objects: SceneMap) -> tuple[str, ...]:
 
 
 def _is_name(name: str) -> bool:
-    return bool(name) and name not in _NO_NAMES and not name.startswith("other ") and not is_room_surface(name)
+    is_known = name not in ("", *_NO_NAMES, *word_table("unclear")["names"])
+    return is_known and not name.startswith("other ") and not is_room_surface(name)
 
 
 @lru_cache(maxsize=65_536)

@@ -10,26 +10,23 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
 from su3d_bench.core.english import last_word, with_article, words
-from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.perception.embedded.lexicon import SYNONYMS
-from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, measure_of
-from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question
+from su3d_bench.questions.appearance import COLOURS, LEAD, SIZES, Appearance, is_flat, measure_of
+from su3d_bench.questions.model import BY_NAME, GENERATED_KINDS, KINDS, Question, new_question, word_table
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, noun_objects
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: questions with a larger share of answer objects are too general
 TWICE = 2.0  # ours: the volume ratio from which an object is clearly large
-FLAT_SHARE = 0.2  # ours: an object is flat if its shortest side is below this share of the next; volume is meaningless
 WITHOUT_SIZE = frozenset(("book",))  # in scans they are annotated per row
 BETWEEN_M = 2.0  # ours: objects farther apart are not asked about with "between"
 
@@ -91,23 +88,17 @@ def accuracy_by_name(question: Question, objects: SceneMap) -> float:
     return min(1.0, len(question.answers) / max(1, len(named)))
 
 
-@cache
-def _table(section: str) -> Mapping[str, tuple[str, ...]]:
-    """``names``: class -> its other names; ``uses``: purpose -> every class that serves it; ``confused``: groups."""
-    table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
-    return {phrase: tuple(entries) for phrase, entries in table[section].items()}
-
-
 @lru_cache(maxsize=65_536)
 def may_be_confused(one: str, other: str) -> bool:
-    """Whether people may use one of two names for an object of the other.
+    """Whether people may use the first name for an object with the second, or for a part of it.
 
-    They are synonyms, share a head noun, or are in one of the groups ``confused`` of words.toml.
+    They are synonyms, share a head noun, or are in one of the groups ``confused`` or ``parts`` of words.toml.
 
     >>> may_be_confused("desk", "table"), may_be_confused("tissue box", "box"), may_be_confused("sofa", "lamp")
     (True, True, False)
     """
-    return is_called(one, other) or is_called(other, one) or not _heads(one).isdisjoint(_heads(other))
+    alike = _heads(one).union(word_table("parts").get(one, ()))
+    return is_called(one, other) or is_called(other, one) or not alike.isdisjoint(_heads(other))
 
 
 @cache
@@ -115,7 +106,7 @@ def _heads(name: str) -> frozenset[str]:
     """The head noun of a name, the name, its synonyms, and the groups of these."""
     names = (last_word(name), name, *SYNONYMS.get(name.replace(" ", "-"), ()))
     heads = {" ".join(words(one)) for one in names}
-    return frozenset(heads | {group for group, nouns in _table("confused").items() if not heads.isdisjoint(nouns)})
+    return frozenset(heads | {group for group, nouns in word_table("confused").items() if not heads.isdisjoint(nouns)})
 
 
 def _texts(objects: SceneMap) -> Iterator[_Asked]:
@@ -123,11 +114,11 @@ def _texts(objects: SceneMap) -> Iterator[_Asked]:
     names = sorted({thing.name for thing in objects.objects})
     for name in names:
         yield _Asked("instance", name, _ids(objects, name))
-    for name, others in _table("names").items():
+    for name, others in word_table("names").items():
         if name in names:
             for other in others:
                 yield _Asked("instance", other, _ids(objects, other))
-    for phrase, classes in _table("uses").items():
+    for phrase, classes in word_table("uses").items():
         yield _Asked("affordance", phrase, tuple(thing for name in classes for thing in _called(objects, name)))
     yield from _sizes(objects)
     yield from _adjectives(objects)
@@ -149,17 +140,11 @@ def _sizes(objects: SceneMap) -> Iterator[_Asked]:
     """Large and small objects among those of one name, if their boxes are complete."""
     for name, n in Counter(thing.name for thing in objects.objects).items():
         named = [thing for thing in objects.objects if thing.name == name]
-        if n < 2 or not all(thing.is_whole for thing in named) or any(map(is_flat, named)):
+        if n < 2 or not all(thing.is_whole for thing in named) or any(is_flat(thing.size) for thing in named):
             continue
         for word, sign in (("large", 1), ("small", -1)):
             if (thing := extreme_of(named, sign)) is not None:
                 yield _Asked("property", f"{word} {name}", (thing.id,), name)
-
-
-def is_flat(thing: MapObject) -> bool:
-    """Whether an object is so flat that its volume is not a meaningful size."""
-    least, middle, _ = sorted(thing.size.tolist())
-    return bool(least < FLAT_SHARE * middle)
 
 
 def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
@@ -203,7 +188,7 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
         for word in sorted({word for _, looks in known for word in looks.words}):
             answers = tuple(thing.id for thing, looks in known if word in looks.words)
             if len(answers) == sum(word in looks.maybe for _, looks in known) and _none_is_more(word, known):
-                others = [other for other in _table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
+                others = [other for other in word_table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
                 for called in (name, *others):
                     yield _Asked("property", f"{word} {called}", answers, name)
         if last_word(name) not in WITHOUT_SIZE and not any(thing.is_cut for thing in named):
@@ -221,7 +206,7 @@ def _none_is_more(word: str, known: Sequence[tuple[MapObject, Appearance]]) -> b
 
 def _measured(name: str, known: Sequence[tuple[MapObject, Appearance]]) -> Iterator[_Asked]:
     """The object that is large, small, long or tall compared with every other of its name."""
-    if len(known) < 2 or len({looks.is_flat for _, looks in known}) > 1:
+    if len(known) < 2 or len({is_flat(looks.sides) for _, looks in known}) > 1:
         return
     for more, less, factor in SIZES:
         measures = [(thing.id, measure_of(thing.name, looks, more), looks.sides.max()) for thing, looks in known]
@@ -269,7 +254,8 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
         thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_query_target and not thing.is_cut
     ]
     for first, second in combinations(single, 2):
-        if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
+        is_close = objects.is_of(first, second) or objects.holds("next to", first, second)  # nothing fits between
+        if is_close or float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M:
             continue
         for thing in objects.objects:
             if objects.may_be_between(thing, first, second):
@@ -277,9 +263,3 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
                 is_sure &= objects.are_in_one_place(thing, first, second)
                 text = f"{thing.name} between the {first.name} and the {second.name}"
                 yield _Asked("relative", text, (thing.id,) if is_sure else (), thing.name)
-
-
-def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:
-    """Whether nothing can be between the two, because they are next to each other or one is on or in the other."""
-    related = any(objects.holds(name, *pair) for name in ("on", "in") for pair in ((a, b), (b, a)))
-    return related or objects.holds("next to", a, b)

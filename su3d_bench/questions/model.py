@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +16,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.matching.labelling import cosines
 from su3d_bench.opensu3d.tracking import cosine
@@ -33,6 +36,13 @@ def question_id(scene: str, kind: str, text: str) -> str:
     '3f6958fff541'
     """
     return hashlib.sha256("\0".join((scene, kind, text)).encode()).hexdigest()[:12]
+
+
+@cache
+def word_table(section: str) -> Mapping[str, tuple[str, ...]]:
+    """A section of words.toml, such as ``names``: class -> its other names."""
+    table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
+    return {phrase: tuple(entries) for phrase, entries in table[section].items()}
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from su3d_bench.numerics import relations as geometry
 from su3d_bench.numerics.relations import RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
+from su3d_bench.questions.model import word_table
 
 MAX_NAME, MAX_CAPTION = 80, 400  # characters; a hostile map may have texts of any length
 
@@ -321,7 +322,9 @@ def known_objects(
             continue
         sight = None if seen is None else seen.get(known.id)
         is_query_target = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
-        is_query_target &= not any(name.endswith(f" {known.name}") for name in names)
+        is_query_target &= known.name not in word_table("unclear")["names"] and not any(
+            name.endswith(f" {known.name}") for name in names
+        )
         is_cut = whole is None and sight is not None and sight.is_cut
         looks = None
         if whole is None and seen is not None:

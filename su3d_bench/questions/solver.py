@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.english import words
+from su3d_bench.core.english import is_plural, words
 from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.files import file_text, parse_toml
@@ -187,12 +187,12 @@ Objects = tuple[MapObject, ...]
 _Solved = tuple[str, Objects, Objects, float | int | bool | None]  # text, objects, references, value
 
 _MEASURES: dict[Size, tuple[str, Callable[[MapObject], float], bool]] = {
-    "largest": ("m³ of its box", lambda thing: float(np.prod(thing.size)), True),
-    "smallest": ("m³ of its box", lambda thing: float(np.prod(thing.size)), False),
-    "tallest": ("m tall", lambda thing: float(thing.size[2]), True),
-    "longest": ("m at its longest", lambda thing: float(thing.size[:2].max()), True),
-    "highest": ("m up", lambda thing: float(thing.centroid[2]), True),
-    "lowest": ("m up", lambda thing: float(thing.centroid[2]), False),
+    "largest": ("a box of {:.3g} m³", lambda thing: float(np.prod(thing.size)), True),
+    "smallest": ("a box of {:.3g} m³", lambda thing: float(np.prod(thing.size)), False),
+    "tallest": ("{:.3g} m tall", lambda thing: float(thing.size[2]), True),
+    "longest": ("{:.3g} m at its longest", lambda thing: float(thing.size[:2].max()), True),
+    "highest": ("{:.3g} m up", lambda thing: float(thing.centroid[2]), True),
+    "lowest": ("{:.3g} m up", lambda thing: float(thing.centroid[2]), False),
 }
 
 
@@ -260,6 +260,10 @@ class Solver:
     def _has_no(self, noun: str) -> str:
         hint = "" if read_phrase(noun).relation else scene_map.name_suggestion(noun, self._scene)
         return f"the map has no '{noun}'{hint}"
+
+    def _there_is_no(self, phrase: Phrase) -> str:
+        hint = "" if phrase.relation else scene_map.name_suggestion(phrase.head, self._scene)
+        return f"there {'are' if is_plural(phrase.head) else 'is'} no {_shown(phrase)}{hint}"
 
     def _related_objects(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``thing`` has the ``relation``."""
@@ -350,13 +354,13 @@ class Solver:
 
     def _count(self, question: Question) -> _Solved:
         things, related = self._found_or_none(question.subject)
-        text = f"{len(things)}: {_listed(things)}" if things else f"0: {self._has_no(_shown(question.subject))}"
+        text = f"{len(things)}: {_listed(things)}" if things else f"0: {self._there_is_no(question.subject)}"
         return text, things, related, len(things)
 
     def _exists(self, question: Question) -> _Solved:
         things, related = self._found_or_none(question.subject)
         if not things:
-            return f"no: {self._has_no(_shown(question.subject))}", (), (), False
+            return f"no: {self._there_is_no(question.subject)}", (), (), False
         return f"yes: {_listed(things)}", things, related, True
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
@@ -371,7 +375,7 @@ class Solver:
         phrase = Phrase(question.subject.head, question.relation, others)
         things, related = self._objects(phrase)
         if not things:
-            return f"no: no {_shown(phrase)}", self._some(question.subject), (), False
+            return f"no: {self._there_is_no(phrase)}", self._some(question.subject), (), False
         return f"yes: {_listed(things)} {question.relation} {_listed(related)}", things, related, True
 
     def _list(self, question: Question) -> _Solved:
@@ -382,18 +386,19 @@ class Solver:
             )
             self._note(f"no farther than {NEAR_M:g} m from it")
         if not things:
-            return f"nothing: {self._has_no(_shown(question.subject))}", (), (), None
+            return f"nothing: {self._there_is_no(question.subject)}", (), (), None
         return _listed(things), things, related, None
 
     def _size(self, question: Question) -> _Solved:
         assert question.size is not None
         phrases = question.options or (question.subject,)
         candidates = {thing.id: thing for phrase in phrases for thing in self._some(phrase)}
-        unit, measure, is_most = _MEASURES[question.size]
+        shown, measure, is_most = _MEASURES[question.size]
         ranked = sorted(candidates.values(), key=lambda thing: ((-1 if is_most else 1) * measure(thing), thing.id))
         best = ranked[0]
-        rest = "".join(f"; {thing.shown} {measure(thing):.3g}" for thing in ranked[1:4])
-        return f"{best.shown}: {measure(best):.3g} {unit}{rest}", (best,), (), None
+        degree = f"{question.size[:-2]}r" if len(ranked) == 2 else question.size
+        rest = "".join(f"; {thing.shown}: {shown.format(measure(thing))}" for thing in ranked[1:4])
+        return f"{best.shown} is the {degree}: {shown.format(measure(best))}{rest}", (best,), (), None
 
     def _where(self, question: Question) -> _Solved:
         things, related = self._objects(question.subject)

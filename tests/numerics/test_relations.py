@@ -184,9 +184,12 @@ def test_facts_are_usual_and_stated_once() -> None:
 
 def test_above_beside_the_edge_is_doubtful() -> None:
     lamp, clock = box(0.01, 0.02, 0, 0.41, 0.42, 1.63), box(0.33, 0, 1.85, 0.36, 0.04, 0.36)
-    for aside, is_doubtful in ((0.0, True), (-0.15, False)):  # its centre is 0.09 m beside the lamp, or above it
+    # its centre is 0.09 m or 0.02 m beside the lamp, or above it
+    for aside, is_doubtful in ((0.0, True), (-0.07, True), (-0.15, False)):
         relations = Relations(np.array([moved(clock, x=aside), lamp, FLOOR]), ["clock", "lamp", "floor"])
         assert relations.above[0, 1] and relations.doubtful("above")[0, 1] == is_doubtful
+    behind = Relations(np.array([moved(PICTURE, y=0.07), TABLE, FLOOR]), ["picture", "table", "floor"])
+    assert behind.above[0, 1] and not behind.doubtful("above")[0, 1]  # on the wall, 0.05 m behind the table
 
 
 def test_between_requires_the_line_and_the_same_height() -> None:

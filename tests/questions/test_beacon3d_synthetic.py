@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from su3d_bench.questions.beacon3d import (
     read_replies,
     score_of,
 )
-from su3d_bench.questions.chains import made_files, questions_about
+from su3d_bench.questions.chains import ChainQuestion, _balanced, made_files, questions_about
 from su3d_bench.questions.question_files import read_external_questions
 from su3d_bench.questions.scene_map import SceneMap
 
@@ -115,10 +116,32 @@ def test_answers_are_those_of_the_boxes_and_colours() -> None:
     assert {key: made.get(key) for key in ANSWERS} == ANSWERS
     assert not any("cushion larger" in text or "lamp taller" in text for _, text in made)  # soft; not on the floor
     texts = [one.text for one in questions_about(ROOM.objects[3], "chair next to a box", ROOM)]
+    assert not any(text.startswith("Is the chair that is next to a box next to") for text in texts)
     assert "Is the chair that is next to a box black?" in texts and not any("'" in text for text in texts)
     assert "Is the desk with a cup on it brown?" in {
         one.text for one in questions_about(ROOM.objects[0], "desk with a cup on it", ROOM)
     }
+
+
+def test_each_of_two_answers_is_as_frequent() -> None:
+    def asked(text: str, answer: str) -> ChainQuestion:
+        return ChainQuestion(text, answer, "spatial", text)
+
+    every = {
+        key: [
+            *(asked(f"Is {key} next to {other}?", "Yes" if key < 3 else "No") for other in ("a bed", "a bin", "a box")),
+            *(
+                asked(f"Which is closer to {key}, the {a} or the {b}?", "Bed")
+                for a, b in (("bed", "bin"), ("bin", "bed"))
+            ),
+            *(asked(f"{question} is {key}?", "Bed") for question in ("What color", "Where", "How high")),
+        ]
+        for key in range(9)
+    }
+    answers = [one for made in _balanced(every, None).values() for one in made]
+    n_of = Counter(one.answer for one in answers if one.text.startswith("Is "))
+    is_first = [", the bed or" in one.text for one in answers if " or " in one.text]
+    assert n_of["Yes"] == n_of["No"] > 0 and sum(is_first) == len(is_first) / 2 > 0
 
 
 # ---- the judge

@@ -11,7 +11,7 @@ from scored_room import ID, LABELS, room
 
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.questions.generated import generate_questions
-from su3d_bench.questions.generator import accuracy_by_name, generate
+from su3d_bench.questions.generator import accuracy_by_name, generate, may_be_confused
 from su3d_bench.questions.model import new_question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, known_objects
 
@@ -72,12 +72,17 @@ def test_largest_needs_three_objects_and_a_visible_lead() -> None:
 
 def test_objects_are_not_counted_or_denied_if_another_may_have_the_name() -> None:
     desk = placed(11, "desk", (9, 9, 0), (1.2, 0.6, 0.7))
+    lamps = [placed(k, "lamp", (k, 12, 0), (0.2, 0.2, 0.4)) for k in (12, 13)]  # another count than 0 and 1
     alone, beside = (
-        {one.text for one in generate_questions(scene, n_each=99) if one.answer.value in (0, 1)}
-        for scene in (THINGS, SceneMap((*THINGS.objects, desk)))
+        {one.text for one in generate_questions(SceneMap((*THINGS.objects, *lamps, *more)), n_each=99)}
+        for more in ((), (desk,))
     )
     assert "How many tables are there?" in alone and "How many tables are there?" not in beside
     assert "How many beds are there?" in beside and not any("pillow" in text for text in alone | beside)
+    assert not any("How many cushions" in text for text in alone)  # the sofa may have some
+    assert may_be_confused("cushion", "office chair") and not may_be_confused("chair", "cushion")
+    blinds = SceneMap((*THINGS.objects, placed(11, "blinds", (9, 9, 1), (1.2, 0.1, 0.7))))
+    assert not any("How many blinds" in one.text for one in generate_questions(blinds, n_each=99))
 
 
 def test_closest_object_leads_between_centres_and_between_sides() -> None:
@@ -86,6 +91,17 @@ def test_closest_object_leads_between_centres_and_between_sides() -> None:
         large = placed(3, "cabinet", (x, 0, 0), (3.0, 0.4, 0.7))
         texts = {one.text for one in generate_questions(SceneMap((bin_, small, large)), n_each=99)}
         assert ("Which cabinet is closer to the bin?" in texts) is is_asked
+
+
+def test_object_on_a_candidate_is_not_compared_by_distance() -> None:
+    tables = [placed(k, "table", (3.0 * k, 0, 0), (0.6, 0.6, 0.6)) for k in (1, 2)]
+    for z, is_asked in ((0.0, True), (0.6, False)):
+        cup, bed = (
+            placed(3, "cup", (3.2, 0.2 - 2 * (z == 0), z), (0.1, 0.1, 0.1)),
+            placed(4, "bed", (9, 0, 0), (2, 2, 0.5)),
+        )
+        texts = {one.text for one in generate_questions(SceneMap((*tables, cup, bed)), n_each=99)}
+        assert any(text.startswith("Which table is") and "the cup" in text for text in texts) is is_asked
 
 
 def test_object_between_two_unique_objects_is_asked() -> None:
@@ -135,6 +151,14 @@ def test_positions_of_cut_objects_are_not_asked() -> None:
     ]
     assert any("distance" in text and "sofa" in text for text in whole)
     assert not any("sofa" in text for text in seen if "How many" not in text)
+
+
+def test_objects_with_unclear_names_are_not_in_questions() -> None:
+    truth = room()
+    names = [{"book": "tissue-paper"}.get(name, name) for name in LABELS.names]
+    changed = replace(truth, labels=replace(LABELS, names=tuple(names)))
+    assert [one.id for one in known_objects(changed, 100).objects if not one.is_query_target] == [7]
+    assert all(one.is_query_target for one in known_objects(truth, 100).objects)
 
 
 def test_invisible_objects_are_not_in_questions_or_answers() -> None:

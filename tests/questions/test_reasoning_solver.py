@@ -76,6 +76,21 @@ def test_geometric_questions_are_answered(
 
 
 @pytest.mark.parametrize(
+    ("question", "text"),
+    [
+        ("Is there a fridge?", "no: there is no fridge"),
+        ("Is there a cup on the bed?", "no: there is no cup on the bed"),
+        ("How many chairs are there?", "0: there are no chairs"),
+        ("Which lamp is the largest?", "lamp #4 is the larger: a box of 0.144 m³; lamp #3: a box of 0.016 m³"),
+        ("What is the tallest object?", "shelf #11 is the tallest: 1.8 m tall; lamp #4: 1.6 m tall; "
+         "table #6: 0.7 m tall; picture #15: 0.6 m tall"),
+    ],
+)  # fmt: skip
+def test_answers_are_plain_sentences(solver: Solver, question: str, text: str) -> None:
+    assert solver.answer(question).text == text
+
+
+@pytest.mark.parametrize(
     ("question", "reason"),
     [
         ("I am feeling cold, what should I do?", "the built-in solver cannot read the question"),
