@@ -33,8 +33,12 @@ def see_painted(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(finished_run, "encoder_of", lambda run, device="cpu": WordEncoder())
 
 
+def _protocols(more: Sequence[str]) -> list[str]:
+    return [] if "--protocols" in more else PROTOCOLS  # an option of several values adds to those before
+
+
 def words(*more: str, scenes: str = "*", out: str = "out") -> list[str]:
-    base = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, *PROTOCOLS, "--no-pictures"]
+    base = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, *_protocols(more), "--no-pictures"]
     return [*base, "--jobs", "1", "--out", out, *more]
 
 
@@ -57,10 +61,10 @@ def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
 
 def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,), scenes: str = "ab") -> Path:
     """A finished run of some scenes, created in this process."""
-    named = ["run", *(f"{PAINTED}/{scene}" for scene in scenes), "--methods", *methods, *PROTOCOLS, "--no-pictures"]
+    named = ["run", *(f"{PAINTED}/{scene}" for scene in scenes), "--methods", *methods, "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
         see_painted(patch)
-        assert main([*named, "--jobs", "1", "--out", str(folder), *more]) == 0
+        assert main([*named, *_protocols(more), "--jobs", "1", "--out", str(folder), *more]) == 0
     return folder
 
 
