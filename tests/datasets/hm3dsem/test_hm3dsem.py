@@ -115,6 +115,6 @@ def test_scene_graph_files_are_evaluated_under_both_protocols(
                 features[k] = np.eye(4)[row]
     np.savez(tmp_path / "texts.npz", names=np.array(names), features=features)
     words = ["evaluate", str(tmp_path / "runs"), "--dataset", "hm3dsem", "--text-features", str(tmp_path / "texts.npz")]
-    assert main([*words, "--json"]) == 0
+    assert main([*words, "--all-protocols", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["protocols"]
     assert found["hm3dsem-objects"]["metrics"]["top_5"] == found["hm3dsem-places"]["metrics"]["room recall"] == 1.0

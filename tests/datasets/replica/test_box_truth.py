@@ -87,7 +87,7 @@ def test_boxes_give_perfect_masks(root: Path) -> None:
 
 def test_scene_without_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "--scenes", "replica/room0", "--methods", "oracle", "--no-pictures", "--jobs", "1"]
-    assert main([*words, "--out", "by-default"]) == 0
+    assert main([*words, "--all-protocols", "--out", "every"]) == 0
     answer = capsys.readouterr()
     assert "the protocol replica-boxes scores it by the boxes of its objects" in answer.out + answer.err
     assert main([*words, "--protocols", "replica-boxes", "--out", "out"]) == 0
@@ -96,7 +96,7 @@ def test_scene_without_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.Ca
     assert (result["protocol"], result["kind"], result["n_planned"]) == ("replica-boxes", "boxes", 1)
     assert set(result["result"]["metrics"].values()) == {1.0} and set(result["ceiling"].values()) == {1.0}
     assert set(result["result"]["per_class"]["chair"].values()) == {1.0}
-    assert main(["evaluate", "out", "--dataset", "replica"]) == 2
+    assert main(["evaluate", "out", "--dataset", "replica", "--all-protocols"]) == 2
     assert "the protocol replica-boxes scores it by the boxes of its objects" in capsys.readouterr().err
     table = ["evaluate", "out", "--dataset", "replica", "--protocols", "replica-boxes", "--json", "a.json", "--quiet"]
     assert main([*table, "--per-class"]) == 0
