@@ -165,9 +165,14 @@ def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
 
 
 def of_arrays(
-    module: types.ModuleType, folder: Path, rules: ProtocolRules, classes: list[int], convert: Any = None, **named: Any
+    module: types.ModuleType,
+    folder: Path,
+    rules: ProtocolRules,
+    classes: list[int],
+    ids_of_script: Callable[[Any], Any] = np.asarray,
+    **named: Any,
 ) -> Ask:
-    """Scripts that take masks, scores and classes as arrays; ``convert(class ids)`` returns theirs."""
+    """Scripts that take masks, scores and classes as arrays; ``ids_of_script`` converts our class ids to theirs."""
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
     ids, _ = classes_of(rules)
 
@@ -179,7 +184,7 @@ def of_arrays(
             predicted[str(s)] = {
                 "pred_masks": one.masks.T,
                 "pred_scores": np.ones(len(one.scores)) if are_ones else one.scores,
-                "pred_classes": one.class_ids if convert is None else convert(one.class_ids),
+                "pred_classes": ids_of_script(one.class_ids),
             }
         module.evaluate(predicted, str(truth), **named)
         table = tables[-1][0] if isinstance(tables[-1], tuple) else tables[-1]
@@ -217,10 +222,9 @@ def rows_of(rules: ProtocolRules) -> list[int]:
 def maskclustering(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
     """MaskClustering's script, with --no_class if the protocol has no classes; by both rankings."""
     without_gpu()
-    has_classes = rules.class_agnostic is None
     of_data = "scannetpp" if "scannetpp" in rules.datasets else "scannet"
     words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt"), "--dataset", of_data]
-    words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if has_classes else ["--no_class"])]
+    words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if rules.names_masks else ["--no_class"])]
     module = load(checkout / "evaluation/evaluate.py", [checkout], words)
     # for ScanNet++ it is quadratic in 1,554 classes, seconds per problem; classes in no problem are undefined
     module.CLASS_LABELS, module.VALID_CLASS_IDS = (
@@ -236,8 +240,7 @@ def of_archives(
     module: types.ModuleType, folder: Path, rules: ProtocolRules, ids: dict[int, int], known: list[int]
 ) -> Ask:
     """MaskClustering's script and its copies, over archives."""
-    has_classes = rules.class_agnostic is None
-    rows = [known.index(ids[one]) for one in SCORED] if has_classes else [0]
+    rows = [known.index(ids[one]) for one in SCORED] if rules.names_masks else [0]
     tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
 
     def answer(problem: Problem, *, are_ones: bool) -> Answer:
@@ -272,11 +275,10 @@ def open3dis(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
         numbers = {LEFT_OUT: 0, **{one: labels.index(names[one]) + 2 for one in SCORED}}  # 0 and 1: wall and floor
     numbers[BEYOND] = 5000
     first = 16 if is_scannetpp else 2  # classes before those of instances
-    has_classes = rules.class_agnostic is None
     kind = "scannetpp_benchmark" if is_scannetpp else "scannet200"
-    judge = module.ScanNetEval(class_labels=labels, use_label=has_classes, dataset_name=kind)
+    judge = module.ScanNetEval(class_labels=labels, use_label=rules.names_masks, dataset_name=kind)
     tables = recorded(judge, "evaluate_matches")
-    rows = [numbers[one] - first for one in SCORED] if has_classes else [0]
+    rows = [numbers[one] - first for one in SCORED] if rules.names_masks else [0]
 
     def answer(problem: Problem, *, are_ones: bool) -> Answer:
         semantic, instance, predicted = [], [], []

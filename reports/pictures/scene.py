@@ -187,10 +187,13 @@ Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, camera 
 def draw_scene_picture(look: SceneView, path: Path, width: canvas.Width = "17cm") -> None:
     """Write the picture of ``look`` as PDF, PNG or SVG by the suffix of ``path``."""
     width_in = canvas.WIDTHS_IN[width]
-    reason = canvas.fitted(f"no ground truth: {look.no_truth}", width_in).splitlines()[:REASON_LINES]
-    classes = [] if look.truth is None else _classes(look.truth)[:MAX_CLASSES]
+    reason, classes = [], []
+    if look.truth is None:
+        reason = canvas.fitted(f"no ground truth: {look.no_truth}", width_in).splitlines()[:REASON_LINES]
+    else:
+        classes = _classes(look.truth)[:MAX_CLASSES]
     n_rows = -(-len(classes) // LEGEND_COLUMNS[width])
-    legend_in = canvas.LINE_IN * (len(reason) if look.truth is None else 1 + n_rows) + 2 * GAP_IN
+    legend_in = canvas.LINE_IN * (len(reason) or 1 + n_rows) + 2 * GAP_IN
     frames = [look.shown[place] for place in evenly(len(look.shown), FRAMES_SHOWN[width])]
     frame_in, frame_height = (width_in - SCALE_IN) / FRAMES_SHOWN[width], 0.0
     if frames:
@@ -207,7 +210,7 @@ def draw_scene_picture(look: SceneView, path: Path, width: canvas.Width = "17cm"
                 _draw_walk(axes, camera, look.poses)
     if look.truth is not None:
         _draw_legend(page, classes, n_rows, (legend_top, width_in / LEGEND_COLUMNS[width]))
-    for k, line in enumerate(reason if look.truth is None else ()):
+    for k, line in enumerate(reason):
         page.text(0, legend_top + canvas.LINE_IN * k, line, colour=canvas.GREY)
     if frames:
         _draw_frames(page, frames, look.depth_m[1], (legend_top + legend_in, frame_in, frame_height))
