@@ -97,15 +97,12 @@ def call_diff(arguments: argparse.Namespace) -> None:
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
     su3d-bench protocols diff rooms-instance replica-openmask3d --json
     """
-    from dataclasses import asdict
-
-    from su3d_bench.metrics.protocols.differences import differing
-    from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.metrics.protocols.loading import load_protocol, rule_differences
     from su3d_bench.reports.tables.comparison import rules_tables
 
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
-    found = [asdict(one) for one in differing(first, second)]
-    value = {"schema": 2, "first": first.name, "second": second.name, "differing": found}
+    rows = rule_differences(first, second)
+    value = {"schema": 2, "first": first.name, "second": second.name, "differing": rows}
     answer_tables(arguments, value, rules_tables(value))
 
 

@@ -16,12 +16,15 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.arguments import typed
+from su3d_bench.core.config import flatten
 from su3d_bench.core.errors import ConfigError, counted, suggest
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
 from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules, TransferRules
 
 Text = Annotated[str, Field(min_length=1, max_length=400)]
+# Fields that name a protocol, or state its use or display, and do not affect any value.
+NAMING = {"name", "version", "summary", "datasets", "by_default", "headline", "not_comparable_with"}
 _OF_CODE = ("code", "commit", "files", "licence", "compared")
 
 
@@ -409,3 +412,16 @@ def _first_line(files: Sequence[Path], error: ValidationError, *section: str) ->
     where = line_of(files, path[-1] if first["loc"] else message.split(":")[0])
     message = message[0].lower() + message[1:] + (f", not {first['input']!r}" if first["loc"] else "")
     return f"{where}: {key}: {message}" if key else f"{where}: {message}"
+
+
+def rule_differences(first: ProtocolRules, second: ProtocolRules) -> list[dict[str, Any]]:
+    """The rules, such as ``transfer.cap_m``, with different values; ``ConfigError`` for protocols of two kinds."""
+    if first.kind != second.kind:
+        raise ConfigError(
+            f"{first.name} is of kind '{first.kind}' and {second.name} of kind '{second.kind}': they share no rules to "
+            "compare; 'protocols show' prints each"
+        )
+    sides = [{".".join(path): value for path, value in flatten(one.model_dump(mode="json", exclude=NAMING))}
+             for one in (first, second)]  # fmt: skip
+    rows = [{"rule": rule, "first": sides[0].get(rule), "second": sides[1].get(rule)} for rule in sides[0] | sides[1]]
+    return [row for row in rows if row["first"] != row["second"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -29,6 +30,7 @@ from su3d_bench.metrics.protocols.loading import (
     load_protocol,
     not_comparable_with,
     protocol_names,
+    rule_differences,
     rules_file,
 )
 from su3d_bench.metrics.protocols.model import Kind, MetricName, ProtocolRules
@@ -215,3 +217,18 @@ def test_encoder_is_required_if_features_replace_names(form: Form, labels: str, 
 def test_misspelt_name_gives_a_suggestion() -> None:
     with pytest.raises(ConfigError, match="unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'\\?"):
         load_protocol("rooms-semantics")
+
+
+def test_names_and_versions_are_no_differences(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    lines = ['extends = "rooms-instance"', 'name = "mine"', "version = 7", "min_region_size = 7", "[transfer]"]
+    path.write_text("\n".join([*lines, "cap_m = 0.5"]))
+    rules = load_protocol("rooms-instance")
+    found = {row["rule"]: (row["first"], row["second"]) for row in rule_differences(rules, load_protocol(str(path)))}
+    assert found == {"min_region_size": (rules.min_region_size, 7), "transfer.cap_m": (rules.transfer.cap_m, 0.5)}
+    assert rule_differences(rules, rules) == []
+
+
+def test_protocols_of_two_kinds_give_one_line() -> None:
+    with pytest.raises(ConfigError, match="rooms-semantic is of kind 'semantic' and rooms-instance of kind"):
+        rule_differences(load_protocol("rooms-semantic"), load_protocol("rooms-instance"))
