@@ -215,7 +215,11 @@ def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
     """Return accuracies per dataset, tests between methods, agreement, and annotators compared with ground truth."""
     datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
     tables = [_accuracies(scores, dataset) for dataset in datasets]
-    tables += [_tests(scores["tests"])] if scores["tests"] else []
+    if any(test["n_differ"] for test in scores["tests"]):
+        tables.append(_tests(scores["tests"]))
+    elif scores["tests"]:
+        same = f"no difference between methods in {counted(len(scores['tests']), 'comparison')}"
+        tables[-1] = replace(tables[-1], notes=(*tables[-1].notes, same))
     shared = [question for question in scores["agreements"] if question["agreement"]["n_items"]]
     tables += [_agreements(shared)] if shared else []
     pairs = [(question["ask"], pair) for question in shared for pair in question["agreement"]["pairs"]]

@@ -237,9 +237,12 @@ def claims_table(found: Sequence[Claims]) -> Table:
     for name, (unit, section, form) in MEASURES.items():
         values = [one.means[name] for one in found]
         rows.append([name, unit, section, *(NOT_MEASURED if v is None else f"{v:{form}}" for v in values)])
+    missing: dict[str, list[str]] = {}  # why and in which scenes -> methods
     notes = ["means over all queries, instances, points or scenes; section: of the paper that makes the claim"]
     for label, one in zip(labels, found, strict=True):
         n = [one.counts[name] for name in (OF_SPREAD[0], "length of n", RELATED)]
         notes.append(f"{label}: {n[0]} queries, {n[1]} labels (n': {one.refined_by}), correlation of {n[2]} scenes")
-        notes += [f"{label}: {reason} ({some(scenes, 3)})" for reason, scenes in one.reasons.items()]
+        for reason, scenes in one.reasons.items():
+            missing.setdefault(f"{reason} ({some(scenes, 3)})", []).append(label)
+    notes += [f"{', '.join(methods)}: {reason}" for reason, methods in missing.items()]
     return text_table("claims", rows, caption="Measures of what the OpenSU3D paper claims in words.", notes=notes)

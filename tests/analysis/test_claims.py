@@ -162,7 +162,10 @@ def test_table_names_runs_only_if_there_are_several() -> None:
     assert table.columns == ("unit", "section", "m")
     assert [row.cells[2].text for row in table.rows[:2]] == ["0.200", "-"]
     assert [row.label for row in table.rows] == list(MEASURES)
-    assert claims_table([one, other]).columns[2:] == ("m (runs/a)", "m (runs/b)")
+    one.reasons = other.reasons = {"the map is empty": ["a"]}
+    both = claims_table([one, other])
+    assert both.columns[2:] == ("m (runs/a)", "m (runs/b)")
+    assert both.notes[-1] == "m (runs/a), m (runs/b): the map is empty (a)"
 
 
 @pytest.mark.parametrize("form", ["text", "latex", "csv"])

@@ -117,6 +117,11 @@ def test_paper_labels_and_merging_come_from_the_blinded_questions() -> None:
     assert (test.left, test.right) == ("opensu3d label n", "opensu3d label n'")
     assert (test.n_items, test.n_differ, test.p) == (5, 3, 1.0)  # two better, one worse
     assert test.difference == pytest.approx(1 / 5)
+    assert "differences" in [table.name for table in sheet_tables(asdict(found))]
+    same = replace(found, tests=(replace(test, n_differ=0),))
+    first, *others = sheet_tables(asdict(same))
+    assert first.notes[-1] == "no difference between methods in 1 comparison"
+    assert "differences" not in [table.name for table in others]
     # labels 1 and 2 are one question: 8 labels of 5 instances, two of which have the same label twice
     assert [one.ask for one in found.agreements] == ["label", "merging"]
     assert {one.ask: (one.n, one.n_equal, one.choices[0]) for one in found.confusions} == {
