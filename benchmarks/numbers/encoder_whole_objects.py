@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.datasets.procedural.truth import STRUCTURE, SceneObject
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.datasets.rooms.truth import STRUCTURE, RoomObject
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.runs.scenes import data_root
 
@@ -43,7 +43,7 @@ def whole_objects(rooms: Rooms, scene: str) -> Iterator[tuple[str, UInt8Array]]:
                 yield one.class_name, image.rgb[top:bottom, left:right].copy()
 
 
-def _projected_area(one: RoomObject, camera_to_world: Float64Array, intrinsics: Float64Array) -> float:
+def _projected_area(one: SceneObject, camera_to_world: Float64Array, intrinsics: Float64Array) -> float:
     """Area in pixels of the rectangle around the object's projected box; infinite if the box reaches the camera."""
     corners = np.stack(np.meshgrid(*zip(one.box_min, one.box_max, strict=True)), axis=-1).reshape(-1, 3)
     world_to_camera = np.linalg.inv(camera_to_world)

@@ -19,9 +19,9 @@ from su3d_bench.formats import images
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 
 if TYPE_CHECKING:
+    from su3d_bench.datasets.procedural.scan import SceneScan
+    from su3d_bench.datasets.procedural.truth import SceneObject
     from su3d_bench.datasets.rooms.dataset import Rooms
-    from su3d_bench.datasets.rooms.scan import RoomScan
-    from su3d_bench.datasets.rooms.truth import RoomObject
 
 LAYOUT_VERSION = 1  # increase it when the written bytes of a scene change
 DEPTH_SCALE = 6553.5  # NICE-SLAM's render: 65535 is 10 m
@@ -73,7 +73,7 @@ class ReplicaLayout(Layout):
         write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
 
 
-def _vertex_element(scan: RoomScan) -> PlyElement:
+def _vertex_element(scan: SceneScan) -> PlyElement:
     columns: dict[str, Column] = {}
     for names, array in ((("x", "y", "z"), scan.vertices), (("nx", "ny", "nz"), scan.normals)):
         columns |= {name: array[:, i].astype(np.float32) for i, name in enumerate(names)}
@@ -81,7 +81,7 @@ def _vertex_element(scan: RoomScan) -> PlyElement:
     return PlyElement("vertex", len(scan.vertices), columns)
 
 
-def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
+def _annotated_mesh(scan: SceneScan) -> list[PlyElement]:
     """Quads with a 16-bit ``object_id``, as in the release."""
     if scan.object_id.max(initial=0) > np.iinfo(np.uint16).max or scan.object_id.min(initial=0) < 0:
         raise DataError(f"object ids go up to {scan.object_id.max()}; the layout's 16 bits allow 0 to 65535")
@@ -92,7 +92,7 @@ def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
     return [_vertex_element(scan), PlyElement("face", len(scan.faces), faces)]
 
 
-def _plain_mesh(scan: RoomScan) -> list[PlyElement]:
+def _plain_mesh(scan: SceneScan) -> list[PlyElement]:
     """The same surface as triangles, without labels."""
     triangles = images.triangles_of(scan.faces)
     return [
@@ -101,7 +101,7 @@ def _plain_mesh(scan: RoomScan) -> list[PlyElement]:
     ]
 
 
-def _info(objects: Sequence[RoomObject]) -> dict[str, Any]:
+def _info(objects: Sequence[SceneObject]) -> dict[str, Any]:
     """The content of ``info_semantic.json``."""
     labels = replica_label_set()
     class_of_id = {known.id: known.class_id for known in objects}

@@ -1,4 +1,4 @@
-"""The vocabulary of the rooms, from ``classes.toml``: classes with Replica's ids, colours, materials."""
+"""The vocabulary of the rooms, from ``classes.toml``: classes with Replica's ids, their colours and materials."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.system.files import file_text, parse_toml
+from su3d_bench.datasets.procedural.materials import colours_of
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,11 @@ class RoomClass:
 
 
 _TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("classes.toml")))
-COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
-COLOURS = tuple(COLOUR_RGB)
-LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
-MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 
 
 def _room_class(name: str, row: Mapping[str, Any]) -> RoomClass:
-    colours = tuple(colour for word in row["colours"] for colour in _TABLE["palettes"].get(word, [word]))
-    return RoomClass(row["id"], name, tuple(row["made_of"]), colours, row.get("models", {}), row.get("called", {}))
+    colours, models = colours_of(row["colours"]), row.get("models", {})
+    return RoomClass(row["id"], name, tuple(row["made_of"]), colours, models, row.get("called", {}))
 
 
 CLASSES = tuple(_room_class(name, row) for name, row in _TABLE["classes"].items())

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.system.files import file_text, parse_toml
-from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
+from su3d_bench.datasets.procedural.items import Item, Part, Placed, Spot
 from su3d_bench.datasets.rooms.plan import GAP_M, Plan
-from su3d_bench.datasets.rooms.rendering.mesh import Placed
 
 POOLS: Mapping[str, list[str]] = parse_toml(file_text(Path(__file__).with_name("recipes.toml")))
 

@@ -3,44 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.procedural.items import Box, Item, Light, Part, Placed, Spot, box_of
+from su3d_bench.datasets.procedural.materials import Material, Texture, mix, shade, tone
+from su3d_bench.datasets.procedural.shapes import Shape, rotation
 from su3d_bench.datasets.rooms.objects.catalog import make
-from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, mix, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
-from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
 
 GAP_M = 0.002  # between touching faces, against z-fighting
 WALL_YAW = (0.0, -90.0, 180.0, 90.0)  # of an item with its back to the wall at y = depth, x = width, y = 0, x = 0
 FLAT = frozenset(("rug", "mat"))
 Value = TypeVar("Value")
-
-
-@dataclass(frozen=True)
-class Box:
-    low: Float64Array
-    high: Float64Array
-
-    @property
-    def corners(self) -> Float64Array:
-        """The lowest and the highest corner (2, 3)."""
-        return np.stack([self.low, self.high])
-
-    def overlaps(self, other: Box, gap: float = 0.0) -> bool:
-        """Overlap, with ``gap`` metres of horizontal air around."""
-        pad = np.array([gap, gap, 0.0])
-        return bool(((self.low - pad < other.high) & (other.low < self.high + pad)).all())
-
-
-def box_of(placed: Placed) -> Box:
-    corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in placed.item.parts])
-    world = placed.to_world(corners)
-    return Box(world.min(axis=0), world.max(axis=0))
 
 
 class Plan:

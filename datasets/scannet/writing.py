@@ -32,9 +32,9 @@ TABLE_COLUMNS = (
 )  # fmt: skip
 
 if TYPE_CHECKING:
+    from su3d_bench.datasets.procedural.scan import SceneScan
+    from su3d_bench.datasets.procedural.truth import SceneObject
     from su3d_bench.datasets.rooms.dataset import Rooms
-    from su3d_bench.datasets.rooms.scan import RoomScan
-    from su3d_bench.datasets.rooms.truth import RoomObject
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,12 @@ def label_table_text() -> str:
 MIN_COSINE = 0.9  # faces at an angle above 26 degrees belong to different segments
 
 
-def annotation_id(known: RoomObject) -> int:
+def annotation_id(known: SceneObject) -> int:
     """The id of an object in the annotation, which starts at 0."""
     return known.id - 1
 
 
-def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> list[RoomObject]:
+def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> list[SceneObject]:
     """Write the files of ``scene`` as ``scan`` into ``folder``; return the annotated objects."""
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
@@ -129,14 +129,14 @@ def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> lis
     return seen
 
 
-def object_of_vertex(scan: RoomScan) -> Int64Array:
+def object_of_vertex(scan: SceneScan) -> Int64Array:
     """Object id (V,) of each vertex, from its last face; 0 if no face uses it."""
     owner = np.zeros(len(scan.vertices), np.int64)
     owner[scan.faces] = scan.object_id[:, None]
     return owner
 
 
-def segment_of_vertex(scan: RoomScan) -> Int64Array:
+def segment_of_vertex(scan: SceneScan) -> Int64Array:
     """Segment (V,) of each vertex, named after its first vertex: a connected, nearly flat piece of one object.
 
     A vertex has the direction of its first face, so that a box is split into its sides.
@@ -159,14 +159,14 @@ def segment_of_vertex(scan: RoomScan) -> Int64Array:
     return segments
 
 
-def _face_normals(scan: RoomScan) -> Float64Array:
+def _face_normals(scan: SceneScan) -> Float64Array:
     a, b, c, d = (scan.vertices[scan.faces[:, k]].astype(np.float64) for k in range(4))
     normals = np.cross(c - a, d - b)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
     return normals
 
 
-def _vertices(scan: RoomScan, colours: UInt8Array, more: dict[str, Column]) -> PlyElement:
+def _vertices(scan: SceneScan, colours: UInt8Array, more: dict[str, Column]) -> PlyElement:
     columns: dict[str, Column] = {name: scan.vertices[:, i].astype(np.float32) for i, name in enumerate("xyz")}
     columns |= {name: colours[:, i] for i, name in enumerate(("red", "green", "blue"))}
     columns["alpha"] = np.full(len(scan.vertices), 255, np.uint8)

@@ -250,7 +250,7 @@ def test_ground_truth_map_and_solver_agree_for_every_pair(scene: str, rooms_data
 def test_relations_of_generated_rooms_are_found(scene: str, rooms_data: Path) -> None:
     """On and in, as the room was generated; besides them only objects on a rug."""
     rooms = Rooms(rooms_data)
-    plan = rooms._room(scene).plan
+    plan = rooms.build(scene, None).plan
     built = {(subject, relation, holder) for subject, (holder, relation) in plan.parent.items()}
     built |= {(subject, "on", holder) for subject, holder in plan.rests_also_on}
     truth = rooms.truth(scene)

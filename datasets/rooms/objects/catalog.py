@@ -6,9 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from su3d_bench.datasets.procedural.items import Item
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.objects import decor, fixtures, furniture, household
-from su3d_bench.datasets.rooms.objects.items import Builder, Item, begin
+from su3d_bench.datasets.rooms.objects.items import Builder, begin
 
 _BUILDER_OF_MODEL: Mapping[str, Builder] = {
     name: builder

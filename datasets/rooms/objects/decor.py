@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, light, linear, mix, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import (
+from su3d_bench.datasets.procedural.materials import Material, Texture, light, linear, mix, shade, tone
+from su3d_bench.datasets.procedural.shapes import (
     Shape,
     block,
     both,
@@ -21,6 +20,7 @@ from su3d_bench.datasets.rooms.objects.shapes import (
     soft_block,
     tube,
 )
+from su3d_bench.datasets.rooms.objects.items import Assembly
 
 
 def _shade(build: Assembly, radius: float, height: float, z: float) -> None:

@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, Texture, light, linear, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import (
+from su3d_bench.datasets.procedural.materials import Material, Rgb, Texture, light, linear, shade, tone
+from su3d_bench.datasets.procedural.shapes import (
     Shape,
     block,
     both,
@@ -22,6 +21,7 @@ from su3d_bench.datasets.rooms.objects.shapes import (
     soft_block,
     tube,
 )
+from su3d_bench.datasets.rooms.objects.items import Assembly
 
 
 def door(build: Assembly) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from su3d_bench.datasets.procedural.materials import mix, shade, tone
+from su3d_bench.datasets.procedural.shapes import Shape, block, both, box, corners, cylinder, lathe, soft_block, tube
 from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import mix, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, box, corners, cylinder, lathe, soft_block, tube
 
 
 def _legs(width: float, depth: float, height: float, thick: float, inset: float = 0.02) -> list[Shape]:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from su3d_bench.datasets.procedural.materials import Material, Rgb, Texture, linear, mix, shade, tone
+from su3d_bench.datasets.procedural.shapes import block, both, cylinder, ellipsoid, lathe, soft_block, tube
 from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, Texture, linear, mix, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import block, both, cylinder, ellipsoid, lathe, soft_block, tube
 
 
 def books(build: Assembly) -> None:

@@ -1,22 +1,19 @@
-"""An object of a room before it is placed (parts, spots that hold other objects, size), and how it
-is built.
-"""
+"""How an object of a room is built."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.procedural.items import Item, Part, Spot
+from su3d_bench.datasets.procedural.materials import Material, Rgb, of_kind, tone
+from su3d_bench.datasets.procedural.shapes import Shape, bounds
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, CLASSES
-from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, of_kind, tone
-from su3d_bench.datasets.rooms.objects.shapes import Shape, bounds
 
 USUAL_VOLUME_L: Mapping[str, float] = {model: litres for known in CLASSES for model, litres in known.models.items()}
-FOOT_HEIGHT_M = 0.025
 SMALL_BELOW, LARGE_ABOVE = 0.78, 1.28  # of the typical volume: roughly the outer quartiles of models that vary
 
 
@@ -24,49 +21,6 @@ def size_word(model: str, size: Float64Array) -> str:
     """small, medium or large, for a box with sides ``size`` in metres."""
     share = 1000.0 * float(np.prod(size)) / USUAL_VOLUME_L[model]
     return "small" if share < SMALL_BELOW else "large" if share > LARGE_ABOVE else "medium"
-
-
-@dataclass(frozen=True)
-class Part:
-    shape: Shape
-    material: Material
-
-
-@dataclass(frozen=True)
-class Spot:
-    """A level rectangle in item coordinates that can hold things up to ``clearance`` metres tall."""
-
-    x0: float
-    x1: float
-    y0: float
-    y1: float
-    z: float
-    clearance: float = 10.0
-    role: str = "top"  # top, board, seat, inside
-
-    def moved(self, x: float, y: float, z: float) -> Spot:
-        return Spot(self.x0 + x, self.x1 + x, self.y0 + y, self.y1 + y, self.z + z, self.clearance, self.role)
-
-
-@dataclass(frozen=True)
-class Item:
-    """An object in its own frame: centred over the origin, standing on z = 0, its front towards -y."""
-
-    class_name: str
-    colour: str
-    material: str
-    size_word: str
-    parts: tuple[Part, ...]
-    spots: tuple[Spot, ...]
-    size: Float64Array
-    model: str = ""  # the class's model that was built; empty for parts of the room itself
-
-    @cached_property
-    def foot(self) -> Float64Array:
-        """Corners (2, 2) of the rectangle on which the item stands: its contact area, without overhang."""
-        corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in self.parts])
-        low = corners[corners[:, 2] < FOOT_HEIGHT_M]
-        return np.stack([low[:, :2].min(axis=0), low[:, :2].max(axis=0)])
 
 
 @dataclass

@@ -13,10 +13,10 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.openscan import label_set
+from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
+from su3d_bench.datasets.procedural.scan import SceneScan
+from su3d_bench.datasets.procedural.truth import attribute_of_object
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
-from su3d_bench.datasets.rooms.scan import RoomScan
-from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
@@ -29,9 +29,9 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
     return Rooms(tmp_path_factory.mktemp("data"), SMALL)
 
 
-def _same(first: RoomScan, second: RoomScan) -> bool:
+def _same(first: SceneScan, second: SceneScan) -> bool:
     return all(
-        getattr(first, field.name).tobytes() == getattr(second, field.name).tobytes() for field in fields(RoomScan)
+        getattr(first, field.name).tobytes() == getattr(second, field.name).tobytes() for field in fields(SceneScan)
     )
 
 
@@ -104,7 +104,7 @@ def test_scan_excludes_what_the_trajectory_cannot_see(rooms: Rooms) -> None:
     assert (normals[:, 2] < -0.9).sum() < 0.05 * front
 
 
-def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
+def test_scan_normals_are_unit_and_face_thebuilt(rooms: Rooms) -> None:
     scan = rooms.scan(SCENE)
     assert np.allclose(np.linalg.norm(scan.normals, axis=1), 1.0, atol=1e-3)
     ceiling = scan.normals[np.unique(scan.faces[scan.object_id == 2])]
@@ -130,10 +130,10 @@ def test_cached_mesh_and_trajectory_equal_recomputed_ones(tmp_path: Path) -> Non
     nowhere = Rooms(tmp_path / "no-folder", SMALL)
     for rooms in (first, second, nowhere):
         rooms.frame(SCENE, 0)
-    made, read, again = (one._room(SCENE) for one in (first, second, nowhere))
+    made, read, again = (one.built(SCENE) for one in (first, second, nowhere))
     assert "patches" not in read.__dict__, "the second room was furnished and baked although both files existed"
     for other in (read, again):
-        for field in fields(RoomMesh):
+        for field in fields(SceneMesh):
             one, two = getattr(made.mesh, field.name), getattr(other.mesh, field.name)
             assert one.dtype == two.dtype and one.tobytes() == two.tobytes(), field.name
         assert made.trajectory.tobytes() == other.trajectory.tobytes()
@@ -182,7 +182,7 @@ def test_trajectory_is_smooth_and_keeps_clear(tmp_path: Path) -> None:
 
 def test_room_is_scored_by_an_aspect_and_objects_without_attribute_are_void(rooms: Rooms) -> None:
     truth = rooms.ground_truth(SCENE, "openscan-type")
-    of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type")
+    of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type", Rooms.attributes)
     assert np.array_equal(truth.semantic, of_object[truth.instance])
     assert (truth.instance > 0).all() and not truth.semantic.all() and truth.semantic.any()
     rules = load_protocol("openscan-type")

@@ -7,19 +7,20 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from su3d_bench.datasets.rooms.classes import CLASS_ID, CLASSES, COLOURS, MATERIALS
+from su3d_bench.datasets.procedural.materials import COLOURS, MATERIALS
+from su3d_bench.datasets.procedural.truth import SceneObject, SceneTruth
+from su3d_bench.datasets.rooms.classes import CLASS_ID, CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.rooms.objects.catalog import BUILDERS, make
 from su3d_bench.datasets.rooms.objects.items import USUAL_VOLUME_L, size_word
 from su3d_bench.datasets.rooms.plan import FLAT
 from su3d_bench.datasets.rooms.recipes import KINDS
-from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth
 
 SCENES = ("living3", "bedroom3", "kitchen3", "office3", "bathroom3", "studio3")
 
 
 @pytest.fixture(scope="module")
-def truths(tmp_path_factory: pytest.TempPathFactory) -> list[RoomTruth]:
+def truths(tmp_path_factory: pytest.TempPathFactory) -> list[SceneTruth]:
     rooms = Rooms(tmp_path_factory.mktemp("data"))
     return [rooms.truth(scene) for scene in SCENES]
 
@@ -40,7 +41,7 @@ def test_every_class_except_the_bare_room_has_a_builder() -> None:
         assert set(one.colours) <= set(COLOURS)
 
 
-def test_all_kinds_together_show_most_classes(truths: list[RoomTruth]) -> None:
+def test_all_kinds_together_show_most_classes(truths: list[SceneTruth]) -> None:
     seen = Counter(one.class_name for truth in truths for one in truth.objects)
     assert len(seen) >= 55
     assert {truth.kind for truth in truths} == set(KINDS)
@@ -71,15 +72,15 @@ def test_shapes_are_valid(class_name: str) -> None:
         assert np.allclose(corners.min(axis=0), [-item.size[0] / 2, -item.size[1] / 2, 0.0], atol=1e-9)
 
 
-def _low(one: RoomObject) -> np.ndarray:
+def _low(one: SceneObject) -> np.ndarray:
     return np.asarray(one.box_min)
 
 
-def _high(one: RoomObject) -> np.ndarray:
+def _high(one: SceneObject) -> np.ndarray:
     return np.asarray(one.box_max)
 
 
-def test_relations_hold_in_space(truths: list[RoomTruth]) -> None:
+def test_relations_hold_in_space(truths: list[SceneTruth]) -> None:
     counted: Counter[str] = Counter()
     for truth in truths:
         for link in truth.relations:
@@ -100,7 +101,7 @@ def test_relations_hold_in_space(truths: list[RoomTruth]) -> None:
     assert min(counted[name] for name in ("on", "in", "under", "above", "next to")) > 0
 
 
-def test_standing_furniture_does_not_collide(truths: list[RoomTruth]) -> None:
+def test_standing_furniture_does_not_collide(truths: list[SceneTruth]) -> None:
     for truth in truths:
         standing = [o for o in truth.objects if o.support == "floor" and o.class_name not in FLAT]
         for i, a in enumerate(standing):
@@ -109,7 +110,7 @@ def test_standing_furniture_does_not_collide(truths: list[RoomTruth]) -> None:
                 assert not (overlap > 1e-6).all(), (truth.scene, a.class_name, b.class_name)
 
 
-def test_everything_is_inside_the_room(truths: list[RoomTruth]) -> None:
+def test_everything_is_inside_the_room(truths: list[SceneTruth]) -> None:
     for truth in truths:
         floor, ceiling = truth.by_id(1), truth.by_id(2)
         for one in truth.objects:
@@ -118,7 +119,7 @@ def test_everything_is_inside_the_room(truths: list[RoomTruth]) -> None:
             assert one.box_min[2] >= -1e-9 and one.box_max[2] <= ceiling.box_max[2] + 1e-9
 
 
-def test_material_is_stated_if_a_picture_shows_it(truths: list[RoomTruth]) -> None:
+def test_material_is_stated_if_a_picture_shows_it(truths: list[SceneTruth]) -> None:
     shown = {(known.class_name, known.material) for t in truths for known in t.objects if known.shows_material}
     assert {("table", "wooden"), ("basket", "wicker")} <= shown
     assert {material for _, material in shown} == {"wooden", "wicker"}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.datasets.rooms.classes import MATERIALS
+from su3d_bench.datasets.procedural.materials import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink

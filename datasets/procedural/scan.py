@@ -1,4 +1,4 @@
-"""The ground-truth surface of a room as scanned along the trajectory; and the cached data of a room."""
+"""The ground-truth surface of a scene as scanned along the trajectory; and the cached data of a scene."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
-from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
-from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
+from su3d_bench.datasets.procedural.rendering.mesh import Grid, Patches, SceneMesh, at_rows, caster, cut, merge_equal
+from su3d_bench.datasets.procedural.rendering.render import Renderer, camera_intrinsics
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm per pixel at 1 m
@@ -22,7 +22,7 @@ COARSE_STRIDE = 40  # frames are visited at this stride first, so that the first
 
 
 @dataclass(frozen=True)
-class RoomScan:
+class SceneScan:
     """``vertices`` (V, 3) m, ``normals`` (V, 3) unit, ``colours`` (V, 3); ``faces`` (F, 4) quads, ``object_id`` (F,).
 
     No vertex belongs to two objects.
@@ -40,7 +40,7 @@ class RoomScan:
         return owner
 
 
-def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: float) -> RoomScan:
+def scan_scene(patches: Patches, mesh: SceneMesh, poses: Float64Array, spacing_m: float) -> SceneScan:
     """The faces of about ``spacing_m`` that at least one of the poses sees."""
     grid = cut(patches, spacing_m)
     points = at_rows(patches.corners, grid.rows)
@@ -50,8 +50,8 @@ def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: 
     return _welded(points, at_rows(patches.normals, grid.rows), faces, owner[seen], mesh)
 
 
-def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh, poses: Float64Array) -> BoolArray:
-    from su3d_bench.datasets.rooms.rendering.shade_kernels import aim_at_faces, drop_seen
+def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: SceneMesh, poses: Float64Array) -> BoolArray:
+    from su3d_bench.datasets.procedural.rendering.shade_kernels import aim_at_faces, drop_seen
 
     corners = [points[grid.faces[:, k]] for k in range(4)]
     normals = np.cross(corners[2] - corners[0], corners[3] - corners[1])
@@ -76,8 +76,8 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
 
 
 def _welded(
-    points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: RoomMesh
-) -> RoomScan:
+    points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: SceneMesh
+) -> SceneScan:
     """Merges the corners of an object at the same position, and drops unused vertices."""
     used = np.zeros(len(points), bool)
     used[faces] = True
@@ -92,12 +92,14 @@ def _welded(
     summed = np.column_stack([np.bincount(group, normals[kept, k], len(first)) for k in range(3)])
     lengths = np.linalg.norm(summed, axis=1, keepdims=True)
     smooth = np.where(lengths > 1e-6, summed / np.maximum(lengths, 1e-6), normals[kept][first])
-    return RoomScan(vertices, smooth.astype(np.float32), surface_colours(mesh, vertices), vertex_of_point[faces], owner)
+    return SceneScan(
+        vertices, smooth.astype(np.float32), surface_colours(mesh, vertices), vertex_of_point[faces], owner
+    )
 
 
-def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
+def surface_colours(mesh: SceneMesh, points: Float32Array) -> UInt8Array:
     """The lit colour (N, 3) of the surface nearest to each point, without highlights."""
-    from su3d_bench.datasets.rooms.rendering.shade_kernels import shade
+    from su3d_bench.datasets.procedural.rendering.shade_kernels import shade
 
     o3d = compiled_open3d()
 
@@ -137,11 +139,11 @@ def kept_arrays(
     return made
 
 
-def kept_scan(path: Path, make: Callable[[], RoomScan]) -> RoomScan:
+def kept_scan(path: Path, dataset: str, make: Callable[[], SceneScan]) -> SceneScan:
     """The scan in ``path``; computed if missing, and then stored there, which must be possible."""
     try:
-        return RoomScan(**kept_arrays(path, RoomScan.__dataclass_fields__, lambda: vars(make()), forgiven=()))
+        return SceneScan(**kept_arrays(path, SceneScan.__dataclass_fields__, lambda: vars(make()), forgiven=()))
     except OSError as error:
         raise DataError(
-            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a writable folder"
+            f"{dataset}: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a writable folder"
         ) from error

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
-from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
+from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh, caster
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
@@ -31,7 +31,7 @@ def camera_intrinsics(width: int, height: int) -> Float64Array:
 class Renderer:
     """Renders a room at one image size; ``like`` is another renderer of the same mesh, whose tree is shared."""
 
-    def __init__(self, mesh: RoomMesh, width: int, height: int, like: Renderer | None = None) -> None:
+    def __init__(self, mesh: SceneMesh, width: int, height: int, like: Renderer | None = None) -> None:
         self.width, self.height = width, height
         self._mesh = mesh
         self._scene: Any = caster(mesh.vertices, mesh.triangles) if like is None else like._scene
@@ -41,7 +41,7 @@ class Renderer:
         self._directions = pixels @ focal_inverse.T  # camera z is 1: the distance along a ray is the depth
 
     def render(self, camera_to_world: Float64Array) -> RenderedFrame:
-        from su3d_bench.datasets.rooms.rendering.shade_kernels import shade
+        from su3d_bench.datasets.procedural.rendering.shade_kernels import shade
 
         rays, t_hit, primitive, uv = self._cast(camera_to_world, self._directions)
         n, mesh = len(rays), self._mesh
@@ -63,7 +63,7 @@ class Renderer:
     def _cast(
         self, pose: Float64Array, directions: Float64Array
     ) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
-        from su3d_bench.datasets.rooms.rendering.shade_kernels import aim
+        from su3d_bench.datasets.procedural.rendering.shade_kernels import aim
 
         o3d = compiled_open3d()
 

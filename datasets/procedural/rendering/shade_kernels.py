@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.datasets.rooms.rendering.pattern_kernels import surface_colour
+from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
 
 compiled: Any = njit(cache=True)
 inlined: Any = njit(cache=True, inline="never")

@@ -1,4 +1,4 @@
-"""Ground truth of a room: its objects, their relations, and their attributes as in OpenScan."""
+"""Ground truth of a generated scene: its objects, their relations, and their attributes as in OpenScan."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Int32Array, WholeObject
 from su3d_bench.datasets.openscan import attribute_id
-from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, CLASS_ID
-from su3d_bench.datasets.rooms.objects.items import Item
-from su3d_bench.datasets.rooms.objects.materials import Texture
-from su3d_bench.datasets.rooms.plan import Plan, box_of
+from su3d_bench.datasets.procedural.items import Item, Placed, box_of
+from su3d_bench.datasets.procedural.materials import Texture
 from su3d_bench.numerics.relations import Relations
 
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
@@ -27,12 +26,12 @@ MIN_SHOWN = 0.6  # of the surface
 
 
 @dataclass(frozen=True)
-class RoomObject:
+class SceneObject:
     """One object; ``id`` is its number in instance images, scans and meshes. Boxes are axis-aligned, world metres.
 
     ``size_word`` compares with the typical size of the class; ``support`` is floor, wall, ceiling, object, or room for
     parts of the room itself. ``called``: everyday name, "pile of books"; ``shows_material``: whether a
-    picture shows the material.
+    picture shows the material; ``model``: the model that was built.
     """
 
     id: int
@@ -48,11 +47,22 @@ class RoomObject:
     support: str
     called: str = ""
     shows_material: bool = False
+    model: str = ""
 
     def whole(self) -> WholeObject:
         """The object in the form from which questions are created."""
         box = np.array([self.box_min, self.box_max])
         return WholeObject(self.id, self.called, box, (self.material,) if self.shows_material else (), self.colour)
+
+
+class Described(Protocol):
+    """What the truth needs of a class: its id, and the everyday names of models that differ from its name."""
+
+    @property
+    def id(self) -> int: ...
+
+    @property
+    def called(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True)
@@ -65,19 +75,22 @@ class Relation:
 
 
 @dataclass(frozen=True)
-class RoomTruth:
+class SceneTruth:
     scene: str
     kind: str
-    objects: tuple[RoomObject, ...]
+    objects: tuple[SceneObject, ...]
     relations: tuple[Relation, ...]
 
-    def by_id(self, object_id: int) -> RoomObject:
+    def by_id(self, object_id: int) -> SceneObject:
         return self.objects[object_id - 1]
 
 
-def truth_of(scene: str, kind: str, plan: Plan) -> RoomTruth:
-    objects = tuple(_object(plan, placed_id) for placed_id in range(1, len(plan.placed) + 1))
-    return RoomTruth(scene, kind, objects, _relations(objects))
+def truth_of(
+    scene: str, kind: str, placed: Sequence[Placed], mount: Mapping[int, str], classes: Mapping[str, Described]
+) -> SceneTruth:
+    """The truth of a furnished scene; ``mount``: how each object is held, by id; ``classes`` by name."""
+    objects = tuple(_object(one, mount[one.id], classes[one.item.class_name]) for one in placed)
+    return SceneTruth(scene, kind, objects, _relations(objects))
 
 
 def _triple(values: Float64Array) -> tuple[float, float, float]:
@@ -85,15 +98,13 @@ def _triple(values: Float64Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _object(plan: Plan, placed_id: int) -> RoomObject:
-    placed = plan.placed[placed_id - 1]
+def _object(placed: Placed, mount: str, known: Described) -> SceneObject:
     box, item = box_of(placed), placed.item
-    support = "room" if item.class_name in STRUCTURE | OPENINGS else plan.mount[placed_id]
-    known = CLASS_BY_NAME[item.class_name]
-    return RoomObject(
-        placed_id, CLASS_ID[item.class_name], item.class_name, item.colour, item.material, _triple(item.size),
-        item.size_word, _triple((box.low + box.high) / 2), _triple(box.low), _triple(box.high), support,
-        known.called.get(item.model, item.class_name.replace("-", " ")), _shows_material(item),
+    support = "room" if item.class_name in STRUCTURE | OPENINGS else mount
+    return SceneObject(
+        placed.id, known.id, item.class_name, item.colour, item.material, _triple(item.size), item.size_word,
+        _triple((box.low + box.high) / 2), _triple(box.low), _triple(box.high), support,
+        known.called.get(item.model, item.class_name.replace("-", " ")), _shows_material(item), item.model,
     )  # fmt: skip
 
 
@@ -109,7 +120,7 @@ def _shows_material(item: Item) -> bool:
     return area[True] > 0 and area[True] >= MIN_SHOWN * (area[True] + area[False])
 
 
-def _relations(objects: tuple[RoomObject, ...]) -> tuple[Relation, ...]:
+def _relations(objects: tuple[SceneObject, ...]) -> tuple[Relation, ...]:
     boxes = np.array([(known.box_min, known.box_max) for known in objects])
     links = Relations(boxes, [known.class_name.rpartition("-")[2] for known in objects]).links()
     return tuple(Relation(objects[link.subject].id, link.relation, objects[link.object].id) for link in links)
@@ -118,16 +129,18 @@ def _relations(objects: tuple[RoomObject, ...]) -> tuple[Relation, ...]:
 MATERIAL = "material"
 
 
-def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Array:
-    """The attribute (n + 1,) of every object in an aspect, by object id; 0 for none and for id 0."""
+def attribute_of_object(objects: Sequence[SceneObject], variant: str, table: Path) -> Int32Array:
+    """The attribute (n + 1,) of every object in an aspect, by object id; 0 for none and for id 0.
+
+    ``table``: a TOML file with the classes, or materials, of each attribute by aspect.
+    """
     aspect = variant.partition("-")[2]
-    ids = {word: attribute_id(variant, words) for word, words in _words_of(aspect).items()}
+    ids = {word: attribute_id(variant, words) for word, words in _words_of(table, aspect).items()}
     words = [known.material if aspect == MATERIAL else known.class_name for known in objects]
     return np.array([0, *(ids.get(word) or 0 for word in words)], np.int32)
 
 
 @cache
-def _words_of(aspect: str) -> Mapping[str, str]:
+def _words_of(table: Path, aspect: str) -> Mapping[str, str]:
     """The words of each class, or material, for an aspect."""
-    table = parse_toml(file_text(Path(__file__).with_name("attributes.toml")))[aspect]
-    return {name: words for words, names in table.items() for name in names}
+    return {name: words for words, names in parse_toml(file_text(table))[aspect].items() for name in names}

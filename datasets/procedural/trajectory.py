@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Float64Array
-from su3d_bench.datasets.rooms.plan import Box
-from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
+from su3d_bench.datasets.procedural.items import Box
+from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh, caster
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 CELL_M = 0.1
@@ -19,7 +19,7 @@ YAWS, PITCHES = 24, (-38.0, -24.0, -10.0, 8.0)
 HALF_WIDTH, HALF_HEIGHT = 0.8 * 0.8, 0.6 * 0.8  # tangents of the inner part of a 640x480 image with f = 400
 
 
-def walk(mesh: RoomMesh, boxes: Sequence[Box], room: tuple[float, float, float], n_structure: int, n_frames: int,
+def walk(mesh: SceneMesh, boxes: Sequence[Box], room: tuple[float, float, float], n_structure: int, n_frames: int,
          rng: np.random.Generator) -> Float64Array:  # fmt: skip
     """Camera-to-world poses (n_frames, 4, 4) with OpenCV axes.
 
@@ -176,7 +176,7 @@ def _poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array, roll:
     return poses
 
 
-def _choose_views(mesh: RoomMesh, stations: Float64Array, n_structure: int) -> tuple[Float64Array, Float64Array]:
+def _choose_views(mesh: SceneMesh, stations: Float64Array, n_structure: int) -> tuple[Float64Array, Float64Array]:
     """Yaw and pitch (degrees, yaw unwrapped) at each station, chosen to show every object repeatedly and well."""
     directions, weight = _sphere()
     candidates = np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in PITCHES])
@@ -217,7 +217,7 @@ def _inside_view(candidates: Float64Array, directions: Float64Array) -> Float64A
 
 
 def _visible_shares(
-    mesh: RoomMesh, stations: Float64Array, directions: Float64Array, weight: Float64Array, inside: Float64Array,
+    mesh: SceneMesh, stations: Float64Array, directions: Float64Array, weight: Float64Array, inside: Float64Array,
     n_structure: int,
 ) -> tuple[Float64Array, Float64Array]:  # fmt: skip
     """How well each candidate view of each station shows each object (0..1), and how much of it is too near."""

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float32Array
-from su3d_bench.datasets.rooms.classes import COLOUR_RGB, LOOKS
 
 Rgb = tuple[float, float, float]  # linear light, 0..1
+_TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("looks.toml")))
+MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
+COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
+COLOURS = tuple(COLOUR_RGB)
+LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
+
+
+def colours_of(words: Sequence[str]) -> tuple[str, ...]:
+    """The colours of a list in which the name of a palette means all of its colours."""
+    return tuple(colour for word in words for colour in _TABLE["palettes"].get(word, [word]))
 
 
 # The textures that ``pattern_kernels`` can paint.

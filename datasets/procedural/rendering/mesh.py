@@ -9,36 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
-from su3d_bench.datasets.rooms.objects.items import Item
-from su3d_bench.datasets.rooms.objects.materials import Material
-from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
+from su3d_bench.datasets.procedural.items import Light, Placed
+from su3d_bench.datasets.procedural.materials import Material
+from su3d_bench.datasets.procedural.shapes import Shape, rotation
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 LIGHT_SPACING_M = 0.13  # between the points at which light is computed
 AMBIENT = 0.42
 OCCLUSION_REACH_M = 0.8
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A placed item: rotated by ``yaw`` degrees about z, then moved to ``position``; ``id`` from 1."""
-
-    id: int
-    item: Item
-    yaw: float
-    position: Float64Array
-
-    def to_world(self, points: Float64Array) -> Float64Array:
-        return points @ rotation("z", self.yaw).T + self.position
-
-
-@dataclass(frozen=True)
-class Light:
-    """A soft light: ``position`` m, ``colour`` linear RGB times power, ``radius`` m."""
-
-    position: tuple[float, float, float]
-    colour: tuple[float, float, float]
-    radius: float
 
 
 @dataclass(frozen=True)
@@ -54,7 +32,7 @@ class Patches:
 
 
 @dataclass(frozen=True)
-class RoomMesh:
+class SceneMesh:
     """Input of ray casting and shading; all per vertex except the three arrays of triangles."""
 
     vertices: Float32Array
@@ -155,7 +133,7 @@ def merge_equal(keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.i
     return first, group.reshape(-1)
 
 
-def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> RoomMesh:
+def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> SceneMesh:
     """The render mesh, with light computed by ray casting against itself."""
     grid = cut(patches, LIGHT_SPACING_M)
     points = at_rows(patches.corners, grid.rows)
@@ -170,7 +148,7 @@ def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> Ro
     triangles, quad = triangles[solid], quad[solid]
     light = _bake(grid, patches, points, normals, triangles, lights, exposure)
     sources = np.array([[*source.position, max(source.colour)] for source in lights], np.float32)
-    return RoomMesh(
+    return SceneMesh(
         points.astype(np.float32), normals.astype(np.float32), texture.astype(np.float32), light,
         triangles.astype(np.int32), patches.object_id[quad], patches.material[quad], patches.materials, sources,
     )  # fmt: skip
