@@ -56,8 +56,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
         hint = nearest(scene, DEFAULT_SCENES) or ""
         raise DataError(
-            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or seed and "
-            f"any number up to 999999 such as seed7{hint}"
+            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
+            f"up to 999999 such as seed7{hint}"
         )
     return match[1], int(match[2])
 
@@ -123,7 +123,6 @@ class Homes(GeneratedScenes):
     options: HomeOptions
     sources = ("datasets/homes", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
-    attributes = Path(__file__).with_name("attributes.toml")
     label_set = staticmethod(label_set)
 
     def check_name(self, scene: str) -> None:

@@ -61,23 +61,9 @@ class Material:
 
     def row(self) -> Float32Array:
         """The material as the kernel reads it."""
-        return np.array(
-            [
-                self.texture,
-                *self.a,
-                *self.b,
-                self.scale,
-                self.gloss,
-                self.glow,
-                self.axis,
-                *self.extent,
-                self.seed,
-                self.mirror,
-                self.clear,
-                self.wear,
-            ],  # fmt: skip
-            np.float32,
-        )
+        colours, look = (*self.a, *self.b), (self.scale, self.gloss, self.glow, self.axis)
+        rest = (*self.extent, self.seed, self.mirror, self.clear, self.wear)
+        return np.array([self.texture, *colours, *look, *rest], np.float32)
 
 
 def linear(rgb: tuple[float, float, float]) -> Rgb:
