@@ -53,9 +53,11 @@ class Repeat(Strict):
 class Ajar(Strict):
     """A door or drawer: with ``chance`` opened, turned about ``axis`` through ``hinge`` or moved along ``slide``.
 
-    The opening is a random share of ``degrees`` or of ``slide``.
+    The opening is a random share of ``degrees`` or of ``slide``. Parts whose ``ajar`` is equal open together; ``name``
+    keeps those apart that differ in nothing else.
     """
 
+    name: str = ""
     chance: Share = 0.3
     axis: Axis = "z"
     hinge: Point = (0, 0, 0)
