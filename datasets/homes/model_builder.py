@@ -173,6 +173,8 @@ def _part(row: PartRow, look: Look, rng: np.random.Generator) -> Part:
     shape = shape_of(row)
     if row.taper != 1.0:
         shape = shape.tapered(row.taper)
+    if row.scale != (1, 1, 1):
+        shape = shape.stretched(*row.scale)
     for axis, degrees in row.turn:
         shape = shape.turned(axis, degrees)
     shape = _opened(shape.moved(*row.at), row.ajar, rng)
