@@ -177,6 +177,8 @@ def _part(row: PartRow, look: Look, shares: dict[Ajar, float], rng: np.random.Ge
     shape = shape_of(row)
     if row.taper != 1.0:
         shape = shape.tapered(row.taper)
+    if row.scale != (1, 1, 1):
+        shape = shape.stretched(*row.scale)
     for axis, degrees in row.turn:
         shape = shape.turned(axis, degrees)
     shape = _opened(shape.moved(*row.at), row.ajar, shares, rng)

@@ -75,8 +75,9 @@ class PartRow(Strict):
     thickness] upright; ``cloth`` [width, height], hanging with ``folds`` waves of a ``depth``, its lower edge at
     ``at``; ``leaf`` [length, width, droop] growing from ``at`` along y, rising.
 
-    Then, in this order: ``taper`` scales x and y at the top, ``turn`` [[axis, degrees], ...] about the origin, ``at``
-    moves, ``mirror`` adds copies on the other side ("x", "y" or "xy" for four), ``repeat`` copies.
+    Then, in this order: ``taper`` scales x and y at the top, ``scale`` [x, y, z] all of it (a revolve becomes oval),
+    ``turn`` [[axis, degrees], ...] about the origin, ``at`` moves, ``mirror`` adds copies on the other side ("x", "y"
+    or "xy" for four), ``repeat`` copies.
     ``of``: a slot of the model, "main", or a material with a colour such as "plastic black"; "main*0.7" is darker.
     ``only``: the variants of the model that have it. ``chance``: of being there at all.
     """
@@ -97,6 +98,7 @@ class PartRow(Strict):
     folds: float = Field(default=3.0, ge=0, le=40)
     depth: Length = 0.03
     taper: float = Field(default=1.0, ge=0.05, le=4)
+    scale: tuple[Length, Length, Length] = (1, 1, 1)
     turn: tuple[tuple[Axis, float], ...] = ()
     at: Point = (0, 0, 0)
     mirror: Literal["", "x", "y", "xy"] = ""
