@@ -140,10 +140,13 @@ def _hanging_cloth(width: float, height: float, folds: float, depth: float) -> S
     return sheet(np.stack([(u - 0.5) * width, wave, v * height], axis=-1), 0.004)
 
 
-def _opened(shape: Shape, ajar: Ajar | None, rng: np.random.Generator) -> Shape:
-    if ajar is None or rng.random() >= ajar.chance:
+def _opened(shape: Shape, ajar: Ajar | None, shares: dict[Ajar, float], rng: np.random.Generator) -> Shape:
+    if ajar is None:
         return shape
-    share = float(rng.uniform(0.2, 1.0))
+    if ajar not in shares:
+        shares[ajar] = float(rng.uniform(0.2, 1.0)) if rng.random() < ajar.chance else 0.0
+    if not (share := shares[ajar]):
+        return shape
     x, y, z = ajar.hinge
     turned = shape.moved(-x, -y, -z).turned(ajar.axis, ajar.degrees * share).moved(x, y, z)
     return turned.moved(*(share * step for step in ajar.slide))
@@ -169,13 +172,13 @@ def _repeated(shapes: Sequence[Shape], repeat: Repeat | None, rng: np.random.Gen
     return copies
 
 
-def _part(row: PartRow, look: Look, rng: np.random.Generator) -> Part:
+def _part(row: PartRow, look: Look, shares: dict[Ajar, float], rng: np.random.Generator) -> Part:
     shape = shape_of(row)
     if row.taper != 1.0:
         shape = shape.tapered(row.taper)
     for axis, degrees in row.turn:
         shape = shape.turned(axis, degrees)
-    shape = _opened(shape.moved(*row.at), row.ajar, rng)
+    shape = _opened(shape.moved(*row.at), row.ajar, shares, rng)
     whole = join(_repeated(_mirrored(shape, row.mirror), row.repeat, rng))
     return Part(whole, material_of(look.paint(row.of), whole, row.grain, rng))
 
@@ -185,11 +188,11 @@ def build_item(row: ModelRow, rng: np.random.Generator, muted: bool = False, col
     variant = str(rng.choice(row.variants)) if row.variants else ""
     look = Look(row, rng, muted, colour)
     scale = (1 + rng.uniform(-row.vary, row.vary)) * (1 + rng.uniform(-row.stretch, row.stretch, 3))
-    parts = []
+    parts, shares = [], dict[Ajar, float]()
     for part in row.parts:
         is_there = (not part.only or variant in part.only) and (part.chance >= 1 or rng.random() < part.chance)
         if is_there:
-            parts.append(_part(part, look, rng))
+            parts.append(_part(part, look, shares, rng))
     low, high = bounds([part.shape for part in parts])
     shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
     moved = tuple(_scaled(part, shift, scale) for part in parts)

@@ -53,7 +53,8 @@ class Repeat(Strict):
 class Ajar(Strict):
     """A door or drawer: with ``chance`` opened, turned about ``axis`` through ``hinge`` or moved along ``slide``.
 
-    The opening is a random share of ``degrees`` or of ``slide``.
+    The opening is a random share of ``degrees`` or of ``slide``; parts of a model with equal rows, such as a door and
+    its handle, open together.
     """
 
     chance: Share = 0.3
