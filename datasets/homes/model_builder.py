@@ -31,6 +31,7 @@ from su3d_bench.datasets.procedural.shapes import (
     join,
     lathe,
     leaf,
+    loft,
     prism,
     puff,
     sheet,
@@ -129,6 +130,8 @@ def shape_of(row: PartRow) -> Shape:
         return puff(*row.cushion).moved(z=row.cushion[1] / 2)
     if row.cloth:
         return _hanging_cloth(*row.cloth, row.folds, row.depth)
+    if row.loft:
+        return loft(row.loft, row.power, row.sides or 20)
     assert row.leaf
     return leaf(*row.leaf)
 
