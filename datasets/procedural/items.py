@@ -37,6 +37,15 @@ class Spot:
 
 
 @dataclass(frozen=True)
+class Light:
+    """A soft light: ``position`` m, ``colour`` linear RGB times power, ``radius`` m."""
+
+    position: tuple[float, float, float]
+    colour: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
 class Item:
     """An object in its own frame: centred over the origin, standing on z = 0, its front towards -y."""
 
@@ -48,6 +57,7 @@ class Item:
     spots: tuple[Spot, ...]
     size: Float64Array
     model: str = ""  # the class's model that was built; empty for parts of the room itself
+    lights: tuple[Light, ...] = ()  # that it emits, in its own frame
 
     @cached_property
     def foot(self) -> Float64Array:
@@ -68,15 +78,6 @@ class Placed:
 
     def to_world(self, points: Float64Array) -> Float64Array:
         return points @ rotation("z", self.yaw).T + self.position
-
-
-@dataclass(frozen=True)
-class Light:
-    """A soft light: ``position`` m, ``colour`` linear RGB times power, ``radius`` m."""
-
-    position: tuple[float, float, float]
-    colour: tuple[float, float, float]
-    radius: float
 
 
 @dataclass(frozen=True)

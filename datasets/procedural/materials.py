@@ -19,6 +19,7 @@ MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
 COLOURS = tuple(COLOUR_RGB)
 LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
+HOMES_LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"] | _TABLE["homes_looks"]
 
 
 def colours_of(words: Sequence[str]) -> tuple[str, ...]:
@@ -30,7 +31,8 @@ def colours_of(words: Sequence[str]) -> tuple[str, ...]:
 Texture = IntEnum(
     "Texture",
     "PLAIN WOOD WEAVE TILES SPECKLE STRIPES CHECKS DOTS BRUSHED PICTURE KEYS SCREEN PLANKS WICKER LEAF CARPET SKY "
-    "CLOCK_FACE RUG MARBLE CARDBOARD LABEL ZIGZAG GORES WALL",
+    "CLOCK_FACE RUG MARBLE CARDBOARD LABEL ZIGZAG GORES WALL VIEW PAINTING STAINS FABRIC2 BRICK PARQUET TILES2 LABEL2 "
+    "BOOKSPINE",
     start=0,
 )
 
@@ -40,7 +42,8 @@ class Material:
     """The look of a part: ``texture`` paints with colours ``a`` and ``b`` at ``scale`` metres along ``axis``.
 
     ``extent`` (u0, u1, v0, v1) bounds textures that fill a face (pictures, screens, rugs); ``gloss`` 0..1 is the
-    strength of the highlight, ``glow`` the light it emits.
+    strength of the highlight, ``glow`` the light it emits. ``mirror`` and ``clear``: shares of light that are mirrored
+    and that pass; ``wear``: strength of variation at several scales.
     """
 
     texture: Texture
@@ -52,11 +55,27 @@ class Material:
     axis: int = 0
     extent: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 1.0)
     seed: int = 0
+    mirror: float = 0.0
+    clear: float = 0.0
+    wear: float = 0.0
 
     def row(self) -> Float32Array:
         """The material as the kernel reads it."""
         return np.array(
-            [self.texture, *self.a, *self.b, self.scale, self.gloss, self.glow, self.axis, *self.extent, self.seed],
+            [
+                self.texture,
+                *self.a,
+                *self.b,
+                self.scale,
+                self.gloss,
+                self.glow,
+                self.axis,
+                *self.extent,
+                self.seed,
+                self.mirror,
+                self.clear,
+                self.wear,
+            ],  # fmt: skip
             np.float32,
         )
 

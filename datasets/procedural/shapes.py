@@ -209,6 +209,81 @@ def puff(width: float, height: float, thickness: float, n: int = 13) -> Shape:
     return join(shapes)
 
 
+def leaf(length: float, width: float, droop: float) -> Shape:
+    """A pointed leaf that grows from the origin along y, rising and then drooping."""
+    t = np.linspace(0, 1, 6)
+    half = width / 2 * np.sin(np.pi * np.clip(t * 0.93 + 0.05, 0, 1)) ** 0.8
+    v = np.linspace(-1, 1, 3)
+    y = np.repeat((length * t * (1 - 0.25 * droop * t))[:, None], 3, axis=1)
+    z = length * (0.55 * t - droop * t**2)[:, None] + 0.12 * width * np.abs(v)[None, :] * np.sin(np.pi * t)[:, None]
+    return sheet(np.stack([v[None, :] * half[:, None], y, z], axis=-1), 0.004)
+
+
+def prism(outline: Sequence[tuple[float, float]], length: float, along: str = "y") -> Shape:
+    """A polygon (x, z) seen from the front, ``length`` deep and centred; along "x": (y, z); "z": (x, y), from z = 0.
+
+    Bends of the outline below the crease angle are smooth. Raises ``ValueError`` if the outline crosses itself.
+    """
+    points = np.array(outline, np.float64)
+    if _area(points) < 0:
+        points = points[::-1]
+    edge = np.roll(points, -1, axis=0) - points
+    edge /= np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
+    out = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+    before = np.roll(out, 1, axis=0)
+    is_smooth = (out * before).sum(axis=1) > CREASE
+    mean = out + before
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    start = np.where(is_smooth[:, None], mean, out)
+    end = np.where(np.roll(is_smooth, -1)[:, None], np.roll(mean, -1, axis=0), out)
+    following = np.roll(points, -1, axis=0)
+    sides = [
+        np.stack([_raised(points, 0), _raised(following, 0), _raised(following, length), _raised(points, length)], 1)
+    ]
+    normals = [np.stack([_raised(start, 0), _raised(end, 0), _raised(end, 0), _raised(start, 0)], 1)]
+    triangles = points[_ears(points)]
+    for level, up in ((0.0, -1.0), (length, 1.0)):
+        cap = np.stack([_raised(triangles[:, k], level) for k in (0, 1, 2, 2)], axis=1)
+        sides.append(cap)
+        normals.append(np.broadcast_to(np.array([0.0, 0.0, up]), cap.shape))
+    shape = Shape(np.concatenate(sides), np.concatenate(normals))
+    if along == "z":
+        return shape
+    upright = shape.moved(z=-length / 2).turned("x", 90.0)
+    return upright if along == "y" else upright.turned("z", 90.0)
+
+
+def _raised(points: Float64Array, z: float) -> Float64Array:
+    return np.column_stack([points, np.full(len(points), z)])
+
+
+def _area(points: Float64Array) -> float:
+    following = np.roll(points, -1, axis=0)
+    return float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum() / 2)
+
+
+def _ears(points: Float64Array) -> list[list[int]]:
+    """Triangles of a counter-clockwise simple polygon, by cutting off its ears."""
+    left, triangles = list(range(len(points))), []
+    while len(left) > 3:
+        for k in range(len(left)):
+            ear = [left[k - 1], left[k], left[(k + 1) % len(left)]]
+            a, b, c = points[ear]
+            others = points[[i for i in left if i not in ear]]
+            sides = [_cross(b - a, others - a), _cross(c - b, others - b), _cross(a - c, others - c)]
+            if _cross(b - a, c - a) > -1e-15 and not (np.min(sides, axis=0) > 1e-12).any():
+                triangles.append(ear)
+                left.remove(ear[1])
+                break
+        else:
+            raise ValueError("the outline crosses itself")
+    return [*triangles, left]
+
+
+def _cross(u: Float64Array, v: Float64Array) -> Float64Array:
+    return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+
 def bounds(shapes: Sequence[Shape]) -> tuple[Float64Array, Float64Array]:
     corners = np.concatenate([s.quads.reshape(-1, 3) for s in shapes])
     return corners.min(axis=0), corners.max(axis=0)
