@@ -24,14 +24,19 @@ TRIES = 12  # random positions tried on a spot or along a wall
 
 
 @dataclass(frozen=True)
-class Window:
-    """A window's glazing: ``centre`` (3,), half edges ``u`` (horizontal) and ``v`` (up), ``normal`` into the room."""
+class Sun:
+    """``direction`` unit vector towards the sun; ``colour`` linear RGB times power."""
 
-    id: int
-    centre: Float64Array
-    u: Float64Array
-    v: Float64Array
-    normal: Float64Array
+    direction: tuple[float, float, float]
+    colour: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Window:
+    centre: tuple[float, float, float]
+    u: tuple[float, float, float]
+    v: tuple[float, float, float]
+    sky: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,7 @@ class Span:
 
 @dataclass
 class HomePlan:
-    """A home; placing methods return ``None`` if there is no space. ``sun`` is the direction in which sunlight travels."""
+    """A home; placing methods return ``None`` if there is no space."""
 
     rng: np.random.Generator
     layout: Layout
@@ -57,7 +62,7 @@ class HomePlan:
     mount: dict[int, str] = field(default_factory=dict)
     lights: list[Light] = field(default_factory=list)
     windows: list[Window] = field(default_factory=list)
-    sun: Float64Array | None = None
+    sun: Sun | None = None
     n_structure: int = 0
     keep_free: list[Solids] = field(default_factory=list)  # where nothing may stand on the floor
     doors: list[Float64Array] = field(default_factory=list)  # points on the floor in front of the doors
@@ -66,7 +71,7 @@ class HomePlan:
 
     def __post_init__(self) -> None:
         self._grid = FloorGrid(self.layout, 0.05, PERSON_M)
-        self._notches = [_upright(rect) for room in self.layout.rooms for rect in room.tiles()[1]]
+        self._notches = [upright(rect) for room in self.layout.rooms for rect in room.tiles()[1]]
 
     @property
     def kind(self) -> str:
@@ -216,13 +221,16 @@ class HomePlan:
                     return placed
         return None
 
-    def hang(self, item: Item, span: Span, along: float, z: float, off: float = 0.0) -> Placed | None:
+    def hang(self, item: Item, span: Span, along: float, z: float, off: float = 0.0, gap: float = 0.02) -> Placed | None:
         """Fixed to a wall with its lower edge at height ``z``."""
         half = item.size[0] / 2
         if not span.a + half < along < span.b - half:
             return None
         at = span.wall.point(along, item.size[1] / 2 + GAP_M + off)
-        return self.put(item, at, span.wall.yaw, z, "wall", gap=0.02)
+        return self.put(item, at, span.wall.yaw, z, "wall", gap=gap)
+
+    def hang_new(self, item: Item | None, span: Span, along: float, z: float, off: float = 0.0) -> Placed | None:
+        return None if item is None else self.hang(item, span, along, z, off, 0.0)
 
     def hang_somewhere(self, item: Item, zone: Zone, z: float) -> Placed | None:
         half = item.size[0] / 2 + 0.02
@@ -295,7 +303,7 @@ class HomePlan:
         return x, y
 
 
-def _upright(rect: Sequence[float], z0: float = 0.0, z1: float = 10.0) -> Solids:
+def upright(rect: Sequence[float], z0: float = 0.0, z1: float = 10.0) -> Solids:
     x0, x1, y0, y1 = rect
     half = np.array([[x1 - x0, y1 - y0]]) / 2
     return Solids(np.array([[x0 + x1, y0 + y1]]) / 2, half, np.zeros(1), np.array([[z0, z1]]))
