@@ -9,6 +9,7 @@ from su3d_bench.datasets.homes.layout import Layout
 from su3d_bench.datasets.homes.solids import Solids
 
 BODY_M = (0.04, 1.9)  # heights in which things are in the way: above rugs, below the head of a tall person
+THIN_M = 0.02  # of a wall on the grid, where it counts as an obstacle
 MARGIN_M = 0.2  # of the grid around the home
 
 
@@ -16,8 +17,6 @@ class FloorGrid:
     """Cells of ``cell_m``; ``origin`` is the corner of cell (0, 0). A disc of ``radius_m`` may be centred where free."""
 
     def __init__(self, layout: Layout, cell_m: float, radius_m: float) -> None:
-        from scipy.ndimage import distance_transform_edt
-
         x0, x1, y0, y1 = layout.rect
         self.cell_m, self.radius_m = cell_m, radius_m
         self.origin = np.array([x0, y0]) - MARGIN_M
@@ -26,17 +25,25 @@ class FloorGrid:
             np.meshgrid(*((np.arange(n) + 0.5) * cell_m + o for n, o in zip(shape, self.origin, strict=True)), indexing="ij"),
             axis=-1,
         )  # fmt: skip
-        floor = np.zeros(shape, bool)
+        self.taken = np.ones(shape, np.int16)
         self.low_ceiling = np.zeros(shape, bool)
         for room in layout.rooms:
             inside = room.contains(self.centres)
-            floor |= inside
+            self.taken[inside] = 0
             self.low_ceiling |= inside & (room.ceiling(self.centres) < BODY_M[1])
         if layout.doorway is not None:
             a, b, c, d = layout.doorway
             x, y = self.centres[..., 0], self.centres[..., 1]
-            floor |= (x > a - cell_m) & (x < b + cell_m) & (y > c) & (y < d)
-        self.taken = (distance_transform_edt(floor) * cell_m - cell_m / 2 < radius_m).astype(np.int16)
+            self.taken[(x > a - cell_m) & (x < b + cell_m) & (y > c - cell_m) & (y < d + cell_m)] = 0
+        for room in layout.rooms:
+            for wall in room.walls:
+                hole = layout.hole(wall) or (wall.length, wall.length)
+                for start, end in ((0.0, hole[0]), (hole[1], wall.length)):
+                    self._mark_wall(wall.point(start, 0.0), wall.point(end, -THIN_M))
+
+    def _mark_wall(self, a: Float64Array, b: Float64Array) -> None:
+        half = np.abs(b - a)[None] / 2
+        self.mark(Solids((a + b)[None] / 2, half, np.zeros(1), np.array([[0.0, BODY_M[1]]])))
 
     def mark(self, solids: Solids, by: int = 1) -> None:
         """Count ``by`` in the cells that are nearer to the solids than the radius."""

@@ -18,8 +18,10 @@ GAP_M = 0.002  # between touching faces, against z-fighting
 TOUCH_M = 0.001  # deeper overlaps are collisions: below the gap
 BACK_M = 0.018  # of furniture from its wall: the thickness of a skirting board
 FLAT_M = 0.03  # lower things on the floor are rugs and mats, on which others may stand
+LOW_M = 0.65  # furniture below this height hides what is under it from a standing person
 PERSON_M = 0.25  # radius of the disc that can reach all free floor: half the width of a person's shoulders
 POCKET_M2 = 0.05  # free regions up to this area are gaps between furniture, not floor: a quarter of the disc
+NEAR_WALL = 0.8  # share of things on the floor that are near a wall: people keep the middle free
 TRIES = 12  # random positions tried on a spot or along a wall
 
 
@@ -71,6 +73,8 @@ class HomePlan:
 
     def __post_init__(self) -> None:
         self._grid = FloorGrid(self.layout, 0.05, PERSON_M)
+        self._low, self._high = np.empty((0, 3)), np.empty((0, 3))  # of the boxes, in the order of their ids
+        self._ids: list[int] = []
         self._notches = [upright(rect) for room in self.layout.rooms for rect in room.tiles()[1]]
 
     @property
@@ -100,6 +104,9 @@ class HomePlan:
         if mount != "room":
             self.boxes[placed.id] = box_of(placed)
             self.solids[placed.id] = Solids.of(self.pieces(item), yaw, position)
+            self._ids.append(placed.id)
+            self._low = np.concatenate([self._low, self.boxes[placed.id].low[None]])
+            self._high = np.concatenate([self._high, self.boxes[placed.id].high[None]])
         return placed
 
     def back_to(self, n: int) -> None:
@@ -109,6 +116,8 @@ class HomePlan:
             self._grid.mark(self.solids.pop(gone), -1)
             del self.boxes[gone], self.mount[gone]
             self.parent.pop(gone, None)
+            self._ids.pop()
+            self._low, self._high = self._low[:-1], self._high[:-1]
 
     def pieces(self, item: Item) -> Float64Array:
         if id(item) not in self._pieces:
@@ -129,6 +138,8 @@ class HomePlan:
         if not self._in_room(xy, solids) or self._hits(solids, holder, relation, position, gap):
             return None
         if mount == "floor" and item.size[2] > FLAT_M:
+            if self._is_hidden(position):
+                return None
             if any(overlap(solids, free, TOUCH_M).any() for free in self.keep_free):
                 return None
         if mount != "object":
@@ -157,15 +168,22 @@ class HomePlan:
                     lift = max(lift, float(self.boxes[other].high[2]))
         return lift
 
+    def _is_hidden(self, position: Float64Array) -> bool:
+        """Whether a place on the floor is under a bed, a sofa or something as low."""
+        over = (self._low[:, :2] < position[:2]).all(axis=1) & (self._high[:, :2] > position[:2]).all(axis=1)
+        return bool((over & (self._high[:, 2] > FLAT_M + position[2]) & (self._high[:, 2] < LOW_M)).any())
+
     def _in_room(self, xy: Float64Array, solids: Solids) -> bool:
-        room = next((room for room in self.layout.rooms if room.contains(xy)), None)
-        if room is None:
+        for room in self.layout.rooms:
+            x0, x1, y0, y1 = room.rect
+            if x0 < xy[0] < x1 and y0 < xy[1] < y1:
+                break
+        else:
             return False
-        x0, x1, y0, y1 = room.rect
         corners = solids.corners
         if (corners < (x0, y0)).any() or (corners > (x1, y1)).any() or (solids.z[:, 0] < 0).any():
             return False
-        if (room.ceiling(corners) < solids.z[:, 1:]).any():
+        if solids.z.max() > room.height or (room.slope and (room.ceiling(corners) < solids.z[:, 1:]).any()):
             return False
         return not any(overlap(solids, notch, TOUCH_M).any() for notch in self._notches)
 
@@ -175,15 +193,16 @@ class HomePlan:
         low = np.append((solids.centre - solids.reach).min(axis=0) - gap, solids.z.min())
         high = np.append((solids.centre + solids.reach).max(axis=0) + gap, solids.z.max())
         chain = self.holders(holder)
-        for other, box in self.boxes.items():
-            if (low < box.high).all() and (box.low < high).all():
-                if other not in chain:
-                    if overlap(solids, self.solids[other], TOUCH_M, gap).any():
-                        return True
-                elif relation != "in":
-                    held_by = self.solids[other]
-                    if overlap(solids, held_by.chosen(~_around(held_by, position)), TOUCH_M).any():
-                        return True
+        near = ((low < self._high) & (self._low < high)).all(axis=1)
+        for k in np.flatnonzero(near):
+            other = self._ids[k]
+            if other not in chain:
+                if overlap(solids, self.solids[other], TOUCH_M, gap).any():
+                    return True
+            elif relation != "in":
+                held_by = self.solids[other]
+                if overlap(solids, held_by.chosen(~_around(held_by, position)), TOUCH_M).any():
+                    return True
         return False
 
     def holders(self, placed: Placed | None) -> list[int]:
@@ -242,15 +261,21 @@ class HomePlan:
                 return placed
         return None
 
-    def somewhere(self, item: Item, zone: Zone, is_middle: bool = False, yaw: float | None = None, gap: float = 0.0) -> Placed | None:
-        """On the floor of a zone, in its middle or anywhere."""
-        x0, x1, y0, y1 = zone.rect
+    def somewhere(
+        self, item: Item, zone: Zone, is_middle: bool = False, yaw: float | None = None, gap: float = 0.0
+    ) -> Placed | None:
+        """On the floor of a zone: in its middle, or anywhere but mostly not far from a wall."""
         inset = 0.3 if is_middle else 0.04
-        low, high = np.array([x0, y0]) * (1 - inset) + np.array([x1, y1]) * inset, 0.0
-        high = np.array([x1, y1]) * (1 - inset) + np.array([x0, y0]) * inset
+        corners = np.array(zone.rect).reshape(2, 2)
+        low, high = corners[:, 0] * (1 - inset) + corners[:, 1] * inset, corners[:, 1] * (1 - inset) + corners[:, 0] * inset
+        spans = self.spans(zone)
         for _ in range(TRIES):
-            turn = self.uniform(-180, 180) if yaw is None else yaw
-            placed = self.put(item, self.rng.uniform(low, high), turn, gap=gap)
+            at, turn = self.rng.uniform(low, high), self.uniform(-180, 180)
+            if not is_middle and self.rng.random() < NEAR_WALL:
+                span = spans[int(self.rng.integers(len(spans)))]
+                off = float(item.size[:2].max()) / 2 + BACK_M + self.uniform(0.0, 0.3)
+                at, turn = span.wall.point(self.uniform(span.a, span.b), off), span.wall.yaw + self.uniform(-25, 25)
+            placed = self.put(item, at, turn if yaw is None else yaw, gap=gap)
             if placed:
                 return placed
         return None

@@ -15,7 +15,7 @@ N_LEVELS = 6  # into which they are merged
 
 def pieces_of(item: Item) -> Float64Array:
     """Bounds (K, 2, 3) in item coordinates of the connected pieces of an item's parts."""
-    boxes = np.concatenate([_connected(part.shape.quads) for part in item.parts])
+    boxes = _connected(item)
     if len(boxes) <= MAX_PIECES:
         return boxes
     low, high = boxes[:, 0, 2].min(), boxes[:, 1, 2].max()
@@ -24,23 +24,22 @@ def pieces_of(item: Item) -> Float64Array:
     return np.stack([np.stack([b[:, 0].min(axis=0), b[:, 1].max(axis=0)]) for b in merged])
 
 
-def _connected(quads: Float64Array) -> Float64Array:
+def _connected(item: Item) -> Float64Array:
+    """Quads of one part that share a corner are one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n = len(quads)
-    if n > 6:  # more than one block
-        grid = np.round(quads.reshape(-1, 3) * 1e5).astype(np.int64)
-        _, corner = np.unique(grid @ np.array([1, 1 << 21, 1 << 42]), return_inverse=True)
-        edges = coo_matrix((np.ones(4 * n, bool), (np.repeat(np.arange(n), 4), n + corner)), (n + corner.max() + 1,) * 2)
-        label = connected_components(edges, directed=False)[1][:n]
-    else:
-        label = np.zeros(n, int)
+    quads = np.concatenate([part.shape.quads for part in item.parts])
+    part = np.repeat(np.arange(len(item.parts)), [len(one.shape.quads) for one in item.parts])
+    n, grid = len(quads), np.round(quads.reshape(-1, 3) * 1e4).astype(np.int64)
+    key = grid @ np.array([1, 1 << 18, 1 << 36]) * len(item.parts) + np.repeat(part, 4)
+    _, corner = np.unique(key, return_inverse=True)
+    edges = coo_matrix((np.ones(4 * n, bool), (np.repeat(np.arange(n), 4), n + corner)), (n + corner.max() + 1,) * 2)
+    label = connected_components(edges, directed=False)[1][:n]
     order = np.argsort(label, kind="stable")
     starts = np.flatnonzero(np.diff(label[order], prepend=-1))
-    sorted_quads = quads[order]
-    low = np.minimum.reduceat(sorted_quads.min(axis=1), starts)
-    high = np.maximum.reduceat(sorted_quads.max(axis=1), starts)
+    low = np.minimum.reduceat(quads.min(axis=1)[order], starts)
+    high = np.maximum.reduceat(quads.max(axis=1)[order], starts)
     return np.stack([low, high], axis=1)
 
 
