@@ -30,7 +30,8 @@ def colours_of(words: Sequence[str]) -> tuple[str, ...]:
 Texture = IntEnum(
     "Texture",
     "PLAIN WOOD WEAVE TILES SPECKLE STRIPES CHECKS DOTS BRUSHED PICTURE KEYS SCREEN PLANKS WICKER LEAF CARPET SKY "
-    "CLOCK_FACE RUG MARBLE CARDBOARD LABEL ZIGZAG GORES WALL",
+    "CLOCK_FACE RUG MARBLE CARDBOARD LABEL ZIGZAG GORES WALL "
+    "VIEW PAINTING STAINS FABRIC2 BRICK PARQUET TILES2 POSTER LABEL2 BOOKSPINE",
     start=0,
 )
 
@@ -40,7 +41,8 @@ class Material:
     """The look of a part: ``texture`` paints with colours ``a`` and ``b`` at ``scale`` metres along ``axis``.
 
     ``extent`` (u0, u1, v0, v1) bounds textures that fill a face (pictures, screens, rugs); ``gloss`` 0..1 is the
-    strength of the highlight, ``glow`` the light it emits.
+    strength of the highlight, ``glow`` the light it emits. ``mirror`` and ``clear`` are the shares of light reflected and
+    let through, ``wear`` the strength of variation at 0.6 m, 0.12 m and 0.025 m: ``SampledRenderer`` shows these.
     """
 
     texture: Texture
@@ -52,13 +54,17 @@ class Material:
     axis: int = 0
     extent: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 1.0)
     seed: int = 0
+    mirror: float = 0.0
+    clear: float = 0.0
+    wear: float = 0.0
 
     def row(self) -> Float32Array:
         """The material as the kernel reads it."""
         return np.array(
-            [self.texture, *self.a, *self.b, self.scale, self.gloss, self.glow, self.axis, *self.extent, self.seed],
+            [self.texture, *self.a, *self.b, self.scale, self.gloss, self.glow, self.axis, *self.extent, self.seed,
+             self.mirror, self.clear, self.wear],
             np.float32,
-        )
+        )  # fmt: skip
 
 
 def linear(rgb: tuple[float, float, float]) -> Rgb:
