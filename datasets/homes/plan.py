@@ -12,6 +12,7 @@ from su3d_bench.datasets.homes.floor import FloorGrid
 from su3d_bench.datasets.homes.layout import Layout, Wall, Zone
 from su3d_bench.datasets.homes.solids import Solids, overlap, pieces_of
 from su3d_bench.datasets.procedural.items import Box, Item, Light, Placed, Spot, box_of
+from su3d_bench.datasets.procedural.rendering.light import Sun, Window
 from su3d_bench.datasets.procedural.shapes import rotation
 
 GAP_M = 0.002  # between touching faces, against z-fighting
@@ -23,22 +24,6 @@ PERSON_M = 0.25  # radius of the disc that can reach all free floor: half the wi
 POCKET_M2 = 0.05  # free regions up to this area are gaps between furniture, not floor: a quarter of the disc
 NEAR_WALL = 0.8  # share of things on the floor that are near a wall: people keep the middle free
 TRIES = 12  # random positions tried on a spot or along a wall
-
-
-@dataclass(frozen=True)
-class Sun:
-    """``direction`` unit vector towards the sun; ``colour`` linear RGB times power."""
-
-    direction: tuple[float, float, float]
-    colour: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Window:
-    centre: tuple[float, float, float]
-    u: tuple[float, float, float]
-    v: tuple[float, float, float]
-    sky: tuple[float, float, float]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
 COLOURS = tuple(COLOUR_RGB)
 LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
+HOMES_LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"] | _TABLE["homes_looks"]
 
 
 def colours_of(words: Sequence[str]) -> tuple[str, ...]:
