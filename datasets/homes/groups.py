@@ -13,6 +13,7 @@ from su3d_bench.datasets.homes.plan import BACK_M, GAP_M, TRIES, HomePlan, Span
 from su3d_bench.datasets.procedural.items import Item, Part, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
+FARTHEST_M = 5.0  # from a sofa to the television on the opposite wall
 Range = tuple[float, float]
 
 
@@ -176,12 +177,13 @@ def _behind(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed
 
 def _opposite(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed) -> Placed | None:
     """Back to the wall that the anchor looks at."""
-    for span in plan.spans(zone):
-        if abs((span.wall.yaw - anchor.yaw) % 360 - 180) < 1:
-            along = span.wall.position(anchor.position[:2])[0] + plan.uniform(-0.3, 0.3)
-            low, high = span.a + item.size[0] / 2 + BACK_M, span.b - item.size[0] / 2 - BACK_M
-            if low < high:
-                at = span.wall.point(float(np.clip(along, low, high)), item.size[1] / 2 + BACK_M)
+    whole = replace(zone, rect=plan.layout.rooms[zone.room].rect)
+    for span in plan.spans(whole):
+        along, off = span.wall.position(anchor.position[:2])
+        low, high = span.a + item.size[0] / 2 + BACK_M, span.b - item.size[0] / 2 - BACK_M
+        if abs((span.wall.yaw - anchor.yaw) % 360 - 180) < 1 and low < high and off < FARTHEST_M:
+            for shift in (0.0, -0.4, 0.4, -0.8, 0.8):
+                at = span.wall.point(float(np.clip(along + shift, low, high)), item.size[1] / 2 + BACK_M)
                 placed = plan.put(item, at, span.wall.yaw)
                 if placed:
                     return placed
