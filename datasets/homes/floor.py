@@ -14,17 +14,14 @@ MARGIN_M = 0.2  # of the grid around the home
 
 
 class FloorGrid:
-    """Cells of ``cell_m``; ``origin`` is the corner of cell (0, 0). A disc of ``radius_m`` may be centred where free."""
+    """Cells of ``cell_m``; ``origin``: the corner of cell (0, 0). A disc of ``radius_m`` may be centred where free."""
 
     def __init__(self, layout: Layout, cell_m: float, radius_m: float) -> None:
         x0, x1, y0, y1 = layout.rect
         self.cell_m, self.radius_m = cell_m, radius_m
         self.origin = np.array([x0, y0]) - MARGIN_M
         shape = np.ceil((np.array([x1, y1]) + MARGIN_M - self.origin) / cell_m).astype(int)
-        self.centres = np.stack(
-            np.meshgrid(*((np.arange(n) + 0.5) * cell_m + o for n, o in zip(shape, self.origin, strict=True)), indexing="ij"),
-            axis=-1,
-        )  # fmt: skip
+        self.centres = (np.moveaxis(np.indices(tuple(shape.tolist())), 0, -1) + 0.5) * cell_m + self.origin
         self.taken = np.ones(shape, np.int16)
         self.low_ceiling = np.zeros(shape, bool)
         for room in layout.rooms:

@@ -52,7 +52,9 @@ REPEATS: Mapping[str, tuple[Repeats, ...]] = {
 }
 
 
-def furnish(rng: np.random.Generator, catalogue: Catalogue, training: bool = False, layout: str | None = None) -> HomePlan:
+def furnish(
+    rng: np.random.Generator, catalogue: Catalogue, training: bool = False, layout: str | None = None
+) -> HomePlan:
     """A furnished home, of the named layout or any."""
     plan = HomePlan(rng, draw_layout(rng, layout), muted=bool(rng.random() < 0.5), is_evening=bool(rng.random() < 0.3))
     target = int(rng.integers(N_OBJECTS[0], N_OBJECTS[1] + 1))
@@ -129,7 +131,7 @@ class _Furnisher:
         """Adds what suits the places that are left, rarely what is there already, up to ``target`` objects."""
         plan = self.plan
         modes, weights = list(MODES), np.array(list(MODES.values()))
-        self.n_of = {name: 0 for name in self.catalogue.classes}
+        self.n_of = dict.fromkeys(self.catalogue.classes, 0)
         for placed in plan.placed:
             self.n_of[placed.item.class_name] += 1
         failures = 0
@@ -214,7 +216,8 @@ class _Furnisher:
         x = (last.item.size[0] + item.size[0]) / 2 + (0.02 if how == "pair" else 0.003)
         if spot is None:
             if how == "scatter":
-                return plan.by(item, last, *self.rng.uniform(-0.6, 0.6, 2), plan.uniform(-180, 180))
+                x, y = self.rng.uniform(-0.6, 0.6, 2)
+                return plan.by(item, last, float(x), float(y), plan.uniform(-180, 180))
             return plan.by(item, last, x, 0.0, jitter)
         holder = plan.placed[plan.parent[last.id][0] - 1]
         local = rotation("z", -holder.yaw) @ (last.position - holder.position)
@@ -223,10 +226,10 @@ class _Furnisher:
         turn = last.yaw - holder.yaw
         for side in (1, -1):
             step = np.array([np.cos(np.deg2rad(turn)), np.sin(np.deg2rad(turn)), 0.0]) * (side * (x + 0.004))
-            at = local + step
-            if spot.x0 <= at[0] - item.size[0] / 2 and at[0] + item.size[0] / 2 <= spot.x1 and spot.y0 <= at[1] <= spot.y1:
-                world = holder.to_world(at)
-                placed = plan.put(item, world[:2], last.yaw, float(last.position[2]), "object", holder, plan.parent[last.id][1])
+            at, half = local + step, item.size[:2] / 2
+            if spot.x0 <= at[0] - half[0] and at[0] + half[0] <= spot.x1 and spot.y0 <= at[1] <= spot.y1:
+                world, relation = holder.to_world(at), plan.parent[last.id][1]
+                placed = plan.put(item, world[:2], last.yaw, float(last.position[2]), "object", holder, relation)
                 if placed:
                     return placed
         return None
@@ -244,4 +247,3 @@ class _Furnisher:
                 x0, x1, y0, y1 = room.tiles()[0][0]
                 z = float(room.ceiling(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))) - 0.2
                 plan.lights.append(Light(((x0 + x1) / 2, (y0 + y1) / 2, z), (0.75, 0.72, 0.66), 0.3))
-

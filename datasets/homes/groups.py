@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.datasets.homes.layout import Zone
 from su3d_bench.datasets.homes.model_format import Strict
-from su3d_bench.datasets.homes.plan import BACK_M, GAP_M, TRIES, HomePlan, Span
+from su3d_bench.datasets.homes.plan import BACK_M, GAP_M, TRIES, HomePlan
 from su3d_bench.datasets.procedural.items import Item, Part, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
@@ -20,10 +20,11 @@ Range = tuple[float, float]
 class Thing(Strict):
     """An object of a recipe and what belongs to it.
 
-    ``put``: classes, one is drawn, or "=" for the very item of the anchor; or ``any``: other things, the first that fits. ``at``: a word of ``AT``; ``n``: how
-    many, ``same``: identical ones. ``gap``: m to the anchor; ``shift``: m to its right; ``turn``: degrees at random;
-    ``air``: m kept free around; ``z``: m of the lower edge; ``tall``: m, the height that the object may have.
-    ``needs``: things without which it is removed again; ``then``: further things.
+    ``put``: classes, one is drawn, or "=" for the very item of the anchor; or ``any``: other things, the first that
+    fits. ``at``: a word of ``FREE`` or ``RELATIVE``; ``n``: how many, ``same``: identical ones. ``gap``: m to the
+    anchor; ``shift``: m to its right; ``turn``: degrees at random; ``air``: m kept free around; ``z``: m of the lower
+    edge; ``tall``: m, the height that the object may have. ``needs``: things without which it is removed again;
+    ``then``: further things.
     """
 
     put: tuple[str, ...] = ()
@@ -207,7 +208,8 @@ def _around(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed
     """At a free side of a table, facing it, pushed partly under it or pulled out."""
     w, d = anchor.item.size[:2] / 2
     n = max(1, int(2 * w / (item.size[0] + 0.08)))
-    seats = [(s, 2 * w * ((k + 0.5) / n - 0.5)) for s in (0, 2) for k in range(n)] + [(s, 0.0) for s in (1, 3) if d > 0.33]
+    seats = [(s, 2 * w * ((k + 0.5) / n - 0.5)) for s in (0, 2) for k in range(n)]
+    seats += [(s, 0.0) for s in (1, 3) if d > 0.33]
     pushed = plan.uniform(-0.28, 0.12)
     for k in sorted(range(len(seats)), key=lambda k: (seats[k][0] % 2, plan.rng.random())):
         side, x = seats[k]
@@ -287,5 +289,6 @@ FREE: Mapping[str, Free] = {
 }  # fmt: skip
 RELATIVE: Mapping[str, Relative] = {
     "front": _before(1), "facing": _before(-1), "beside": _beside, "centre": _centre, "behind": _behind,
-    "opposite": _opposite, "above": _above, "around": _around, "on": _on, "stack": _stack, "slab": _slab, "before": _before_it, "near": _near,
+    "opposite": _opposite, "above": _above, "around": _around, "on": _on, "stack": _stack, "slab": _slab,
+    "before": _before_it, "near": _near,
 }  # fmt: skip

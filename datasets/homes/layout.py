@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Wall:
 
 @dataclass(frozen=True)
 class Slope:
-    """A ceiling that starts at ``knee`` m over the wall x * nx + y * ny = offset and reaches full height after ``run``."""
+    """A ceiling ``knee`` m high over the line x * nx + y * ny = offset, that reaches full height after ``run`` m."""
 
     nx: float
     ny: float
@@ -92,10 +93,10 @@ class Room:
         if self.slope is not None:
             end = self.slope.offset + self.slope.run
             (xs if self.slope.nx else ys).add(end * (self.slope.nx + self.slope.ny))
-        grids = [sorted(values) for values in (xs, ys)]
-        all_of = [(a, b, c, d) for a, b in _pairs(grids[0]) for c, d in _pairs(grids[1])]
+        all_of = [(a, b, c, d) for a, b in pairwise(sorted(xs)) for c, d in pairwise(sorted(ys))]
         centres = np.array([((a + b) / 2, (c + d) / 2) for a, b, c, d in all_of])
-        covered, notch = [], []
+        covered: list[Rect] = []
+        notch: list[Rect] = []
         for tile, is_inside in zip(all_of, self.contains(centres), strict=True):
             (covered if is_inside else notch).append(tile)
         return covered, notch
@@ -139,10 +140,6 @@ class Layout:
         (a, b) = sorted(along for along, _ in corners)
         is_behind = offs[0] > -PARTITION_M - 1e-6 and offs[1] < 1e-6 and a > 0 and b < wall.length
         return (a, b) if is_behind else None
-
-
-def _pairs(values: Sequence[float]) -> list[tuple[float, float]]:
-    return list(zip(values[:-1], values[1:], strict=True))
 
 
 def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Float64Array:
@@ -240,6 +237,7 @@ def draw_layout(rng: np.random.Generator, name: str | None = None) -> Layout:
 
 def _swapped(layout: Layout) -> Layout:
     """The mirror image in which x and y change places."""
+
     def rect(r: Rect) -> Rect:
         return r[2], r[3], r[0], r[1]
 

@@ -75,7 +75,7 @@ class HomePlan:
         return float(self.rng.uniform(low, high))
 
     def free(self, cell_m: float = 0.1, clearance_m: float = 0.3) -> tuple[BoolArray, Float64Array]:
-        """Cells (X, Y) of the largest region where a camera may be, and the position (2,) of the corner of cell (0, 0)."""
+        """Cells (X, Y) of the largest region where a camera may be, and the corner (2,) of cell (0, 0)."""
         grid = FloorGrid(self.layout, cell_m, clearance_m)
         for solids in self.solids.values():
             grid.mark(solids)
@@ -148,9 +148,9 @@ class HomePlan:
     def _rug_below(self, solids: Solids) -> float:
         lift = 0.0
         for other, mount in self.mount.items():
-            if mount == "floor" and self.placed[other - 1].item.size[2] <= FLAT_M:
-                if overlap(solids, self.solids[other], TOUCH_M - GAP_M).any():
-                    lift = max(lift, float(self.boxes[other].high[2]))
+            is_flat = mount == "floor" and self.placed[other - 1].item.size[2] <= FLAT_M
+            if is_flat and overlap(solids, self.solids[other], TOUCH_M - GAP_M).any():
+                lift = max(lift, float(self.boxes[other].high[2]))
         return lift
 
     def _is_hidden(self, position: Float64Array) -> bool:
@@ -172,9 +172,7 @@ class HomePlan:
             return False
         return not any(overlap(solids, notch, TOUCH_M).any() for notch in self._notches)
 
-    def _hits(
-        self, solids: Solids, holder: Placed | None, relation: str, position: Float64Array, gap: float
-    ) -> bool:
+    def _hits(self, solids: Solids, holder: Placed | None, relation: str, position: Float64Array, gap: float) -> bool:
         low = np.append((solids.centre - solids.reach).min(axis=0) - gap, solids.z.min())
         high = np.append((solids.centre + solids.reach).max(axis=0) + gap, solids.z.max())
         chain = self.holders(holder)
@@ -225,7 +223,9 @@ class HomePlan:
                     return placed
         return None
 
-    def hang(self, item: Item, span: Span, along: float, z: float, off: float = 0.0, gap: float = 0.02) -> Placed | None:
+    def hang(
+        self, item: Item, span: Span, along: float, z: float, off: float = 0.0, gap: float = 0.02
+    ) -> Placed | None:
         """Fixed to a wall with its lower edge at height ``z``."""
         half = item.size[0] / 2
         if not span.a + half < along < span.b - half:
@@ -251,8 +251,8 @@ class HomePlan:
     ) -> Placed | None:
         """On the floor of a zone: in its middle, or anywhere but mostly not far from a wall."""
         inset = 0.3 if is_middle else 0.04
-        corners = np.array(zone.rect).reshape(2, 2)
-        low, high = corners[:, 0] * (1 - inset) + corners[:, 1] * inset, corners[:, 1] * (1 - inset) + corners[:, 0] * inset
+        first, last = np.array(zone.rect).reshape(2, 2).T
+        low, high = first + inset * (last - first), last - inset * (last - first)
         spans = self.spans(zone)
         for _ in range(TRIES):
             at, turn = self.rng.uniform(low, high), self.uniform(-180, 180)

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.homes.layout import DOOR_HEIGHT_M, PARTITION_M, Rect, Room, Wall
-from su3d_bench.datasets.homes.plan import GAP_M, HomePlan, Span, Sun, Window, upright
+from su3d_bench.datasets.homes.plan import GAP_M, HomePlan, Span, upright
 from su3d_bench.datasets.homes.solids import Solids
 from su3d_bench.datasets.procedural.items import Item, Part
 from su3d_bench.datasets.procedural.materials import Material, Rgb, Texture, mix, shade, tone
+from su3d_bench.datasets.procedural.rendering.light import Sun, Window
 from su3d_bench.datasets.procedural.shapes import Shape, block, box, join
 
 New = Callable[..., Item | None]
 SKIRTING = (0.012, 0.08)  # thickness and height, m
 CASING_M = 0.06  # width of the boards around a doorway
 WALL_COLOURS = ("white", "white", "beige", "grey", "yellow", "green", "blue", "pink")
-SKY, NIGHT_SKY = (0.88, 0.97, 1.1), (0.02, 0.025, 0.04)
+SKY, NIGHT_SKY = (0.75, 0.83, 0.94), (0.02, 0.025, 0.04)
 SUNLIGHT = 4.0  # times the sky's: 100 klx of direct sun to 25 klx of blue sky, at noon
 
 
@@ -34,13 +36,17 @@ def add_shell(plan: HomePlan, covers: list[str]) -> None:
         accent = int(rng.integers(0, len(room.walls))) if style != 2 and rng.random() < 0.4 else -1
         for k, wall in enumerate(room.walls):
             base = shade(rgb, 0.8) if k == accent else rgb
-            paint = Material(Texture.WALL, base, shade(base, 0.82), plan.uniform(0.12, 0.3), 0.3 if style == 2 else 0.02,
-                             0.0, 0 if k == accent else style, seed=int(rng.integers(1, 999)))  # fmt: skip
+            paint = Material(
+                Texture.WALL, base, shade(base, 0.82), plan.uniform(0.12, 0.3), 0.3 if style == 2 else 0.02,
+                axis=0 if k == accent else style, seed=int(rng.integers(1, 999)),
+            )  # fmt: skip
             _add_wall(plan, room, wall, paint, colour)
     plan.n_structure = len(plan.placed)
 
 
-def _add(plan: HomePlan, name: str, colour: str, made_of: str, parts: tuple[Part, ...], position: Float64Array, yaw: float) -> None:
+def _add(
+    plan: HomePlan, name: str, colour: str, made_of: str, parts: tuple[Part, ...], position: Float64Array, yaw: float
+) -> None:
     corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in parts])
     size = corners.max(axis=0) - corners.min(axis=0)
     plan.add(Item(name, colour, made_of, "medium", parts, (), size), position, yaw, "room")
@@ -78,7 +84,8 @@ def _add_floor(plan: HomePlan, room: Room, cover: str) -> None:
 def _add_ceiling(plan: HomePlan, room: Room) -> None:
     """The level part and, as an object of its own, the sloped part."""
     white = Material(Texture.PLAIN, tone("white"), shade(tone("white"), 0.95))
-    level, sloped = [], []
+    level: list[list[tuple[float, float, float]]] = []
+    sloped: list[list[tuple[float, float, float]]] = []
     for rect in room.tiles()[0]:
         points = np.array(_level(rect))
         heights = room.ceiling(points)
@@ -166,16 +173,15 @@ def _add_inner_door(plan: HomePlan) -> None:
     handles = [block(0.12, 0.03, 0.02, width / 2 - 0.1, side * 0.045, 0.98) for side in (-1, 1)]
     parts = (Part(join([block(width, 0.04, height), *panels]), paint), Part(join(handles), steel))
     leaf = Item("door", colour, "wooden", "medium", parts, (), np.array([width, 0.12, height]), "")
-    for opened in (plan.uniform(75, 110), 90.0, 80.0):
-        for hinge, sign in ((hole[0], 1.0), (hole[1], -1.0)) if plan.rng.random() < 0.5 else ((hole[1], -1.0), (hole[0], 1.0)):
-            angle = np.deg2rad(opened)
-            along = hinge + sign * np.cos(angle) * width / 2
-            at = wall.point(along, np.sin(angle) * width / 2 + 0.05)
-            if plan.put(leaf, at, wall.yaw - sign * opened, GAP_M, "wall"):
-                break
-        else:
-            continue
-        break
+    hinges = [(hole[0], 1.0), (hole[1], -1.0)]
+    if plan.rng.random() < 0.5:
+        hinges.reverse()
+    for opened, (hinge, sign) in product((plan.uniform(75, 110), 90.0, 80.0), hinges):
+        angle = np.deg2rad(opened)
+        along = hinge + sign * np.cos(angle) * width / 2
+        at = wall.point(along, np.sin(angle) * width / 2 + 0.05)
+        if plan.put(leaf, at, wall.yaw - sign * opened, GAP_M, "wall"):
+            break
     for room in plan.layout.rooms:
         side = next((w, h) for w in room.walls if (h := plan.layout.hole(w)) is not None)
         middle = (side[1][0] + side[1][1]) / 2
@@ -200,11 +206,10 @@ def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     if placed is None:
         return False
     width, height = item.size[0] / 2 - 0.05, item.size[2] / 2 - 0.05
-    centre = np.append(wall.point(along, 0.0), sill + item.size[2] / 2)
-    power = plan.uniform(0.8, 1.2)
-    sky = tuple(power * value for value in (NIGHT_SKY if plan.is_evening else SKY))
+    x, y = wall.point(along, 0.0).tolist()
+    sky = shade(NIGHT_SKY if plan.is_evening else SKY, plan.uniform(0.8, 1.2))
     u = (float(wall.along[0] * width), float(wall.along[1] * width), 0.0)
-    plan.windows.append(Window(tuple(centre.tolist()), u, (0.0, 0.0, float(height)), sky))
+    plan.windows.append(Window((x, y, sill + float(item.size[2]) / 2), u, (0.0, 0.0, float(height)), sky))
     plan.keep_free.append(_before(wall, along, item.size[0] / 2, 0.45, sill + 0.05, 2.3))
     plan.hang_new(new("radiator"), span, along, 0.12)
     cover = plan.rng.random()
