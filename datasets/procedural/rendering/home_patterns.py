@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.datasets.procedural.rendering.noise_kernels import cloudy, hash01, noise, noise2
+from su3d_bench.datasets.procedural.rendering.noise_kernels import cloudy, hash01, noise2, noise3, rough
 
 inlined: Any = njit(cache=True, inline="never")
 
@@ -48,7 +48,7 @@ def _bricks(u, v, length, seed):  # type: ignore[no-untyped-def]
     ragged = 0.02 * noise2(u / length * 14, v / length * 14, seed)
     if b - row < 0.13 + 3 * ragged or a - piece < 0.035 + ragged:
         return -1.0
-    return 0.7 + 0.5 * hash01(piece, row, seed) + 0.35 * (cloudy(u / length * 9, v / length * 9, seed) - 0.5)
+    return 0.7 + 0.5 * hash01(piece, row, seed) + 0.35 * (rough(u / length * 9, v / length * 9, seed) - 0.5)
 
 
 @inlined
@@ -195,25 +195,26 @@ def _herringbone(u, v, wide, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _plaster(u, v, x, a, b, part, seed):  # type: ignore[no-untyped-def]
+def _plaster(u, v, a, b, part, seed):  # type: ignore[no-untyped-def]
     """Painted plaster; ``part`` 0 is a wall, 1 one with a skirting board, 2 a ceiling."""
     if part == 1 and v < 0.075:
         line = 0.55 if v > 0.069 or v < 0.006 else 1.0
         return _times((0.66, 0.65, 0.61), line * (0.9 + 0.12 * cloudy(u * 7, v * 30, seed)))
-    tone = 0.95 + 0.06 * cloudy(u * 0.9, v * 0.9, seed) + 0.05 * (noise2(u * 260, v * 260, seed) - 0.5)
-    tint = _blend(a, b, 0.5 * (cloudy(u * 1.6, v * 1.6, seed + 1) - 0.35))
+    broad = cloudy(u * 1.2, v * 1.2, seed)
+    tone = 0.95 + 0.06 * broad + 0.05 * (noise2(u * 260, v * 260, seed) - 0.5) - 0.5 * max(0.0, broad - 0.64)
+    tint = _blend(a, b, 0.5 * (0.6 - broad))
     if part < 2:
         i, j = math.floor(u / 0.5), math.floor(v / 0.5)
-        p, q = u - (i + 0.2 + 0.6 * hash01(i, j, seed)) * 0.5, v - (j + 0.2 + 0.6 * hash01(i, j, seed + 1)) * 0.5
         rare = hash01(i, j, seed + 2)
-        if rare < 0.16 and v > 1.1:  # nail holes
-            tone *= 0.35 if p * p + q * q < 1.2e-5 else (0.93 if abs(p) < 0.004 and -0.03 < q < 0 else 1.0)
-        elif rare < 0.5 and v < 1.1:  # scuffs
+        if rare < 0.5:
+            p, q = u - (i + 0.2 + 0.6 * hash01(i, j, seed)) * 0.5, v - (j + 0.2 + 0.6 * hash01(i, j, seed + 1)) * 0.5
             lean = p * (hash01(i, j, seed + 3) - 0.5) + q
-            if abs(p) < 0.09 and abs(lean) < 0.006:
-                tone *= 1 - 0.3 * (1 - abs(p) / 0.09) * cloudy(u * 40, v * 160, seed)
-        tone *= 1 - 0.22 * math.exp(-v / 0.16) * cloudy(u * 3, v * 9, seed + 4)
-        tone *= 1 - 0.1 * max(0.0, cloudy(u * 1.3, v * 1.3, seed + 6) - 0.62) / 0.2
+            if rare < 0.16 and v > 1.1:  # a nail hole
+                tone *= 0.35 if p * p + q * q < 1.2e-5 else (0.93 if abs(p) < 0.004 and -0.03 < q < 0 else 1.0)
+            elif v < 1.1 and abs(p) < 0.09 and abs(lean) < 0.006:  # a scuff
+                tone *= 1 - 0.3 * (1 - abs(p) / 0.09) * rough(u * 40, v * 160, seed)
+        if v < 0.6:
+            tone *= 1 - 0.22 * math.exp(-v / 0.16) * rough(u * 3, v * 9, seed + 4)
     return _times(tint, tone)
 
 
@@ -229,24 +230,24 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
     if kind == 26 or kind == 32:
         return _painting(fu, fv, 11 if kind == 32 else seed % 11, a, b, seed)
     if kind == 27:
-        return _plaster(u, v, x, a, b, int(row[10]), seed)
+        return _plaster(u, v, a, b, int(row[10]), seed)
     if kind == 28:  # woven yarn of two tones, with folds
         i, j = math.floor(u / scale), math.floor(v / scale)
         p, q = u / scale - i - 0.5, v / scale - j - 0.5
         over = (i + j) % 2 == 0
         yarn = hash01(i, 1, seed) if over else hash01(j, 2, seed)
         relief = 1.08 - (1.1 * p * p + 0.5 * q * q if over else 1.1 * q * q + 0.5 * p * p)
-        folds = 0.8 + 0.26 * noise(x * 5.0, y * 5.0, z * 5.0 + seed) + 0.14 * noise(x * 17.0, y * 17.0, z * 17.0)
+        folds = 0.8 + 0.26 * noise3(x * 5.0, y * 5.0, z * 5.0, seed) + 0.14 * noise3(x * 17.0, y * 17.0, z * 17.0, seed)
         return _times(_blend(a, b, 0.75 * yarn), relief * folds)
     if kind == 29:
         tone = _bricks(u, v, scale, seed)
-        dirt = 0.8 + 0.4 * cloudy(u * 25, v * 25, seed)
+        dirt = 0.8 + 0.4 * rough(u * 25, v * 25, seed)
         return _times(b, dirt) if tone < 0 else _times(a, tone * (0.85 + 0.15 * dirt))
     if kind == 30:
         i, j, along, across = _herringbone(u, v, scale, seed)
         tone = 0.72 + 0.5 * hash01(i, j, seed)
         shift = 50 * hash01(i, j, seed + 1)
-        grain = cloudy(along * 7 + shift, across * 130 + shift, seed) - 0.5
+        grain = rough(along * 7 + shift, across * 130 + shift, seed) - 0.5
         rings = math.sin(6.3 * (across / 0.011 + 3 * noise2(along * 4 + shift, across * 20, seed)))
         gap = min(min(across, scale - across), min(along, 5 * scale - along))
         dark = 0.35 if gap < 0.0008 else (0.85 if gap < 0.0022 else 1.0)
@@ -256,16 +257,16 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
         p, q = u - i * scale, v - j * scale
         edge = min(min(p, scale - p), min(q, scale - q))
         if edge < 0.002:
-            return _times(b, 0.55 + 0.75 * cloudy(u * 9, v * 9, seed))
-        tone = 0.9 + 0.16 * hash01(i, j, seed) + 0.12 * (cloudy(u * 14 + 7 * i, v * 14 + 3 * j, seed) - 0.5)
+            return _times(b, 0.55 + 0.75 * rough(u * 9, v * 9, seed))
+        tone = 0.9 + 0.16 * hash01(i, j, seed) + 0.12 * (rough(u * 14 + 7 * i, v * 14 + 3 * j, seed) - 0.5)
         warm = 0.05 * (hash01(i, j, seed + 1) - 0.5)
-        tone *= 1.06 if edge < 0.004 else 1.0 - 0.12 * max(0.0, 1 - edge / 0.02) * cloudy(u * 20, v * 20, seed + 2)
+        tone *= 1.06 if edge < 0.004 else 1.0 - 0.12 * max(0.0, 1 - edge / 0.02) * rough(u * 20, v * 20, seed + 2)
         return a[0] * tone * (1 + warm), a[1] * tone, a[2] * tone * (1 - warm)
     if kind == 33:
         return _package(fu, fv, a, b, seed)
     if row[12] - row[11] > row[14] - row[13]:  # a spine that lies
         fu, fv = fv, fu
-    cloth = 0.86 + 0.2 * noise2(u * 500, v * 500, seed) + 0.1 * (cloudy(u * 20, v * 20, seed) - 0.5)
+    cloth = 0.86 + 0.2 * noise2(u * 500, v * 500, seed) + 0.1 * (rough(u * 20, v * 20, seed) - 0.5)
     band = 0.06 + 0.1 * hash01(1, 2, seed)
     if abs(fv - band) < 0.012 or abs(fv - 1 + band) < 0.012 or (fv > 0.84 and seed % 4 == 0):
         return _times(b, cloth)

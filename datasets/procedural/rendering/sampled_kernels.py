@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.datasets.procedural.rendering.noise_kernels import noise
+from su3d_bench.datasets.procedural.materials import Texture
+from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
 from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
 from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, _highlight
 
@@ -19,7 +20,8 @@ compiled: Any = njit(cache=True, nogil=True)
 inlined: Any = njit(cache=True, inline="never")
 
 SAMPLES = np.array([[-0.375, -0.125], [0.375, 0.125], [0.125, -0.375], [-0.125, 0.375]])  # rotated grid, in pixels
-ALIKE = 0.012  # two of the four samples suffice if they differ less, in linear light
+ALIKE = 0.03  # two of the four samples suffice if they differ less, in linear light
+PLAIN, STAINS = int(Texture.PLAIN), int(Texture.STAINS)  # smooth at the scale of a pixel: one sample
 SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 
 
@@ -59,9 +61,9 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
                light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
     """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
 
-    ``across`` and ``down`` are the steps of a ray's direction from one sample of the texture to the next pixel; zero for
-    a single sample. ``is_last`` makes glass and mirrors opaque.
+    ``across`` and ``down`` are the steps of a ray's direction to the next pixels; zero for one sample of the texture. ``is_last`` makes glass and mirrors opaque.
     """
+    pixel = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
     for i in range(start, stop):
         tint[i] = 0.0
         colour[i] = 0.0
@@ -82,17 +84,19 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
         e2x, e2y, e2z = _difference(texture, i2, i0)
         px, py, pz = abs(e1y * e2z - e1z * e2y), abs(e1z * e2x - e1x * e2z), abs(e1x * e2y - e1y * e2x)
         plane = 2 if pz >= px and pz >= py else (0 if px >= py else 1)
-        # the steps of the texture coordinates across a pixel
-        gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
-        gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)
-        foot = math.sqrt(max(gux * gux + guy * guy + guz * guz, gvx * gvx + gvy * gvy + gvz * gvz))
+        kind, n = int(row[0]), 1
+        foot = far * length * pixel * length / max(abs(facing), 0.1 * length)
+        gux, guy, guz, gvx, gvy, gvz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        if pixel > 0 and kind != PLAIN and not (kind == STAINS and z > 0.1 + foot):
+            n = 4
+            gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
+            gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)
         r, g, b = 0.0, 0.0, 0.0
-        n = 1 if foot == 0 or (row[0] == 0 and foot < 0.02) else 4
         for k in range(n):
             su, sv = (SAMPLES[k, 0], SAMPLES[k, 1]) if n > 1 else (0.0, 0.0)
             sx, sy, sz = x + su * gux + sv * gvx, y + su * guy + sv * gvy, z + su * guz + sv * gvz
             pu, pv = (sx, sy) if plane == 2 else ((sy, sz) if plane == 0 else (sx, sz))
-            kr, kg, kb = surface_colour(int(row[0]), sx, sy, sz, pu, pv, row, row[7], int(row[10]), row[15])
+            kr, kg, kb = surface_colour(kind, sx, sy, sz, pu, pv, row, row[7], int(row[10]), row[15])
             if k == 1 and abs(kr - r) + abs(kg - g) + abs(kb - b) < ALIKE:
                 n = 2
             r, g, b = r + kr, g + kg, b + kb
@@ -100,9 +104,9 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
                 break
         r, g, b = r / n, g / n, b / n
         if row[18] > 0:
-            large = noise(x * 1.7 + row[15], y * 1.7, z * 1.7)
-            middle = noise(x * 8.3, y * 8.3 + row[15], z * 8.3)
-            small = noise(x * 40.0, y * 40.0, z * 40.0 + row[15]) if foot < 0.02 else 0.5
+            large = noise3(x * 1.7, y * 1.7, z * 1.7, row[15])
+            middle = noise3(x * 8.3, y * 8.3, z * 8.3, row[15])
+            small = noise3(x * 40.0, y * 40.0, z * 40.0, row[15]) if foot < 0.02 else 0.5
             worn = 1 + row[18] * ((0.78 + 0.44 * large) * (0.84 + 0.32 * middle) * (0.88 + 0.24 * small) - 1)
             hue = 0.07 * row[18] * (middle + large - 1)
             r, g, b = r * worn * (1 + hue), g * worn, b * worn * (1 - hue)
@@ -142,8 +146,6 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
 def _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, turn, texture):  # type: ignore[no-untyped-def]
     """Change of the texture coordinates on a triangle's plane if a ray's direction changes by ``turn``."""
     lean = turn[0] * nx + turn[1] * ny + turn[2] * nz
-    if lean == 0 and turn[0] == 0 and turn[1] == 0 and turn[2] == 0:
-        return 0.0, 0.0, 0.0
     lean /= facing if abs(facing) > 1e-3 else 1e-3
     wx, wy, wz = far * (turn[0] - lean * dx), far * (turn[1] - lean * dy), far * (turn[2] - lean * dz)
     ax, ay, az = _difference(vertices, i1, i0)
