@@ -128,20 +128,18 @@ def lateral_noise(
     """
     import cv2
 
-    theta = np.minimum(angle, np.float32(STEEPEST))
-    sigma = np.float32(0.8) + np.float32(0.035) * theta / (np.float32(np.pi / 2) - theta)
-    sigma *= np.float32(strength * focal_px / FOCAL_PX)
-    height, width = depth_m.shape
-    columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
-    at_u = np.clip(columns + np.rint(sigma * grain(depth_m.shape, grain_px, rng)), 0, width - 1)
-    at_v = np.clip(rows + np.rint(sigma * grain(depth_m.shape, grain_px, rng)), 0, height - 1)
-    inverse = inverse_depth(depth_m)
-    image = cv2.merge([inverse, _slope(inverse, 1), _slope(inverse, 0)])
-    beside, slope_u, slope_v = cv2.split(cv2.remap(image, at_u, at_v, cv2.INTER_NEAREST))
-    sampled = beside + slope_u * (columns - at_u) + slope_v * (rows - at_v)
-    usable = (depth_m > 0) & (beside > 0) & (sampled > 0.01) & ((at_u != columns) | (at_v != rows))
-    np.divide(np.float32(1), sampled, out=sampled, where=usable)
-    return np.where(usable, sampled, depth_m)
+    near = cv2.dilate(edges(depth_m).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0  # elsewhere nothing changes
+    rows, columns = np.nonzero(near)
+    theta = np.minimum(angle[near], STEEPEST)
+    sigma = (0.8 + 0.035 * theta / (np.pi / 2 - theta)) * (strength * focal_px / FOCAL_PX)
+    at_u = columns + np.rint(sigma * grain(depth_m.shape, grain_px, rng)[near]).astype(np.int64)
+    at_v = rows + np.rint(sigma * grain(depth_m.shape, grain_px, rng)[near]).astype(np.int64)
+    at = np.clip(at_v, 0, depth_m.shape[0] - 1), np.clip(at_u, 0, depth_m.shape[1] - 1)
+    inverse, result = inverse_depth(depth_m), depth_m.copy()
+    sampled = inverse[at] + _slope(inverse, 1)[at] * (columns - at[1]) + _slope(inverse, 0)[at] * (rows - at[0])
+    usable = (depth_m[near] > 0) & (inverse[at] > 0) & (sampled > 0.01) & ((at[1] != columns) | (at[0] != rows))
+    result[near] = np.where(usable, 1 / np.maximum(sampled, 0.01), depth_m[near])
+    return result
 
 
 def quantise(depth_m: Image, step_px: float = STEP_PX, px_per_m: float = PX_PER_M) -> Image:
@@ -174,11 +172,12 @@ def cast_shadow(depth_m: Image, focal_px: float, baseline_m: float = BASELINE_M)
     """
     height, width = depth_m.shape
     disparity = np.clip(inverse_depth(depth_m) * np.float32(focal_px * baseline_m), -width, width)
-    index = np.arange(width) - disparity + (np.arange(height)[:, None] * (3 * width + 2) + width)
+    row = np.arange(height, dtype=np.int32)[:, None] * (3 * width + 2) + width
+    column = np.arange(width, dtype=np.float32) - disparity
     nearest = np.zeros(height * (3 * width + 2), np.float32)  # a depth buffer of the projector
-    np.maximum.at(nearest, index.astype(np.int32).ravel(), np.abs(disparity).ravel())
+    np.maximum.at(nearest, (row + np.floor(column).astype(np.int32)).ravel(), np.abs(disparity).ravel())
     nearest[1:] = np.maximum(nearest[1:], nearest[:-1])  # a surface reaches the column after its own
-    return _without(depth_m, nearest[np.rint(index).astype(np.int32)] > np.abs(disparity) + 1)
+    return _without(depth_m, nearest[row + np.rint(column).astype(np.int32)] > np.abs(disparity) + 1)
 
 
 def lose_weak(
