@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
-from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array as Image
+from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.procedural.rendering.render import RenderedFrame
 from su3d_bench.sensors import colour, depth, poses
 
@@ -55,85 +57,72 @@ class Materials:
     ``beyond_m`` is the depth of what is seen through glass or in a mirror, 0 where nothing is.
     """
 
-    albedo: Float32Array
-    gloss: Float32Array
-    clear: Float32Array
-    mirror: Float32Array
-    beyond_m: Float32Array | None = None
+    albedo: Image
+    gloss: Image
+    clear: Image
+    mirror: Image
+    beyond_m: Image | None = None
 
 
 @dataclass(frozen=True)
 class CameraContext:
     """Intrinsics (3, 3), camera-to-world poses (4, 4) of the image and at both ends of the exposure.
 
-    ``luminances`` are the mean luminances of the frames that ``metered`` lists, noise-free, rendered at any size.
+    ``luminances``, at least one: mean luminances of the frames that ``metered`` lists, noise-free, at any image size.
     """
 
     intrinsics: Float64Array
     camera_to_world: Float64Array
     at_open: Float64Array
     at_close: Float64Array
-    luminances: tuple[float, ...] = ()
+    luminances: tuple[float, ...]
     materials: Materials | None = None
 
 
 def metered(index: int, settings: SensorSettings) -> list[int]:
     """Frames whose luminance determines the exposure of frame ``index``, in order; the last is the frame itself."""
-    first = index - settings.metering_stride * settings.metering_frames
-    return [max(k, 0) for k in range(first, index + 1, settings.metering_stride)]
+    return [max(index - settings.metering_stride * k, 0) for k in range(settings.metering_frames, -1, -1)]
 
 
 def record(
-    clean: RenderedFrame, context: CameraContext, settings: SensorSettings, rng: np.random.Generator
-) -> tuple[UInt8Array, Float32Array]:
+    clean: RenderedFrame, context: CameraContext, settings: SensorSettings, rng: Generator
+) -> tuple[UInt8Array, Image]:
     """Colour (H, W, 3) and depth (H, W) m as the camera records them; a function of the arguments alone."""
-    colour_rng, depth_rng = rng.spawn(2)
-    return (
-        record_colour(clean.rgb, clean.depth_m, context, settings, colour_rng),
-        record_depth(clean.depth_m, context, settings, depth_rng),
-    )
+    for_colour, for_depth = rng.spawn(2)
+    rgb = record_colour(clean, context, settings, for_colour)
+    return rgb, record_depth(clean.depth_m, context, settings, for_depth)
 
 
-def record_colour(
-    rgb: UInt8Array, depth_m: Float32Array, context: CameraContext, settings: SensorSettings, rng: np.random.Generator
-) -> UInt8Array:
-    light = colour.motion_blur(colour.to_linear(rgb), depth_m, context.intrinsics, context.camera_to_world,
-                               context.at_open, context.at_close, settings.blur_samples)  # fmt: skip
-    gain = 1.0
-    if context.luminances:
-        speed = 1 - (1 - settings.metering_speed) ** settings.metering_stride
-        gain = colour.exposure_gain(
-            context.luminances, settings.target_luminance, speed, settings.min_ev, settings.max_ev
-        )
-    light = colour.expose(light, gain)
-    light = colour.photon_noise(light, settings.shot, settings.read, rng, max(gain, 1.0))
-    return colour.jpeg(colour.to_srgb(light), settings.jpeg_quality)
+def record_colour(clean: RenderedFrame, context: CameraContext, camera: SensorSettings, rng: Generator) -> UInt8Array:
+    light = colour.motion_blur(colour.to_linear(clean.rgb), clean.depth_m, context.intrinsics, context.camera_to_world,
+                               context.at_open, context.at_close, camera.blur_samples)  # fmt: skip
+    speed, luminances = 1 - (1 - camera.metering_speed) ** camera.metering_stride, context.luminances
+    gain = colour.exposure_gain(luminances, camera.target_luminance, speed, camera.min_ev, camera.max_ev)
+    light = colour.photon_noise(colour.expose(light, gain), camera.shot, camera.read, rng, max(gain, 1.0))
+    return colour.jpeg(colour.to_srgb(light), camera.jpeg_quality)
 
 
-def record_depth(
-    depth_m: Float32Array, context: CameraContext, settings: SensorSettings, rng: np.random.Generator
-) -> Float32Array:
+def record_depth(depth_m: Image, context: CameraContext, camera: SensorSettings, rng: Generator) -> Image:
     """Depth with errors in the order in which they arise: light, geometry, matching, disparity, output."""
     glass, light, outline, mixture, side, front = rng.spawn(6)
     focal_px, materials = float(context.intrinsics[0, 0]), context.materials
     angle, at_edge = depth.incidence(depth_m, context.intrinsics), depth.edges(depth_m)
-    albedo = depth.TYPICAL_ALBEDO if materials is None else materials.albedo
-    seen = depth.lose_weak(depth_m, angle, albedo, settings.min_signal, light, settings.signal_spread)
+    albedo = 0.5 if materials is None else materials.albedo  # that of a painted wall
+    seen = depth.lose_weak(depth_m, angle, albedo, camera.min_signal, light, camera.signal_spread)
     if materials is not None:
-        seen = depth.lose_glare(seen, angle, materials.gloss, settings.min_gloss, np.deg2rad(settings.lobe_deg))
+        seen = depth.lose_glare(seen, angle, materials.gloss, camera.min_gloss, np.deg2rad(camera.lobe_deg))
         share = np.maximum(materials.clear, materials.mirror)
         seen = depth.see_through(seen, share, glass, materials.beyond_m)
-    if settings.baseline_m:  # depth is in the colour image: infrared camera and projector are on either side of it
-        for side_m in (settings.baseline_m - settings.camera_offset_m, -settings.camera_offset_m):
+    if camera.baseline_m:  # depth is in the colour image: infrared camera and projector are on either side of it
+        for side_m in (camera.baseline_m - camera.camera_offset_m, -camera.camera_offset_m):
             seen = np.where(depth.cast_shadow(depth_m, focal_px, side_m) > 0, seen, np.float32(0))
-    seen = depth.lose_edges(seen, at_edge, settings.edge_width_px, settings.edge_share, outline)
-    seen = depth.add_flying_pixels(seen, at_edge, settings.flying_share, mixture)
-    seen = depth.lateral_noise(seen, angle, side, settings.depth_strength, settings.grain_px, focal_px / depth.FOCAL_PX)
-    step_m = depth.disparity_step(seen, settings.step_px)
-    seen = depth.axial_noise(seen, angle, front, settings.depth_strength, settings.grain_px, step_m)
-    return depth.limit_range(depth.quantise(seen, settings.step_px), settings.near_m, settings.far_m)
+    seen = depth.lose_edges(seen, at_edge, camera.edge_width_px, camera.edge_share, outline)
+    seen = depth.add_flying_pixels(seen, at_edge, camera.flying_share, mixture)
+    seen = depth.lateral_noise(seen, angle, side, camera.depth_strength, camera.grain_px, focal_px)
+    seen = depth.axial_noise(seen, angle, front, camera.depth_strength, camera.grain_px, camera.step_px)
+    return depth.limit_range(depth.quantise(seen, camera.step_px), camera.near_m, camera.far_m)
 
 
-def drifted(camera_to_world: Float64Array, settings: SensorSettings, rng: np.random.Generator) -> Float64Array:
+def drifted(camera_to_world: Float64Array, settings: SensorSettings, rng: Generator) -> Float64Array:
     """The trajectory (N, 4, 4) as a SLAM system estimates it."""
     return poses.drift(camera_to_world, settings.drift_m, settings.drift_deg, rng, settings.drift_smooth_frames)

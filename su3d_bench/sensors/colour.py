@@ -6,18 +6,20 @@ Colour images are (H, W, 3): ``rgb`` sRGB bytes, ``linear`` float32 light in 0..
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, reduce
 
 import numpy as np
+from numpy.random import Generator
 
-from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array as Light
+from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.sensors.depth import inverse_depth, normal_noise
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
 
 
 @cache
-def _tables() -> tuple[Float32Array, UInt8Array]:
+def _tables() -> tuple[Light, UInt8Array]:
     """Light of each byte, and byte of light in 1/65535: the transfer function of IEC 61966-2-1."""
     code, light = np.arange(256) / 255, np.arange(65536) / 65535
     to_light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
@@ -25,11 +27,11 @@ def _tables() -> tuple[Float32Array, UInt8Array]:
     return to_light.astype(np.float32), np.rint(255 * to_code).astype(np.uint8)
 
 
-def to_linear(rgb: UInt8Array) -> Float32Array:
+def to_linear(rgb: UInt8Array) -> Light:
     return _tables()[0][rgb]
 
 
-def to_srgb(linear: Float32Array) -> UInt8Array:
+def to_srgb(linear: Light) -> UInt8Array:
     """Bytes of light, clipped to 0..1; exactly the bytes that ``to_linear`` came from."""
     return _tables()[1][(np.clip(linear, 0, 1) * np.float32(65535) + np.float32(0.5)).astype(np.uint16)]
 
@@ -40,9 +42,9 @@ def mean_luminance(rgb: UInt8Array) -> float:
 
 
 def motion_blur(
-    linear: Float32Array, depth_m: Float32Array, intrinsics: Float64Array, camera_to_world: Float64Array,
+    linear: Light, depth_m: Light, intrinsics: Float64Array, camera_to_world: Float64Array,
     at_open: Float64Array, at_close: Float64Array, n_samples: int = 8,
-) -> Float32Array:  # fmt: skip
+) -> Light:  # fmt: skip
     """The mean of the image over an exposure, sampled along each pixel's projected motion.
 
     Poses (4, 4) are camera-to-world, of the image and at both ends of the exposure. Each pixel moves by its own depth;
@@ -54,31 +56,23 @@ def motion_blur(
         return linear
     u, v = np.meshgrid(np.arange(depth_m.shape[1], dtype=np.float32), np.arange(depth_m.shape[0], dtype=np.float32))
     inverse = inverse_depth(depth_m)
-    open_u, open_v = _seen_from(at_open, camera_to_world, intrinsics, u, v, inverse)
-    close_u, close_v = _seen_from(at_close, camera_to_world, intrinsics, u, v, inverse)
-    flow_u, flow_v = close_u - open_u, close_v - open_v
+
+    def seen_from(pose: Float64Array) -> tuple[Light, Light]:
+        """Where another camera sees the point of each pixel: K (R K^-1 (u, v, 1) + t / depth)."""
+        motion = np.linalg.inv(pose) @ camera_to_world
+        turn = (intrinsics @ motion[:3, :3] @ np.linalg.inv(intrinsics)).astype(np.float32)
+        shift = (intrinsics @ motion[:3, 3]).astype(np.float32)
+        x, y, z = (turn[k, 0] * u + turn[k, 1] * v + turn[k, 2] + shift[k] * inverse for k in range(3))
+        z = np.maximum(z, np.float32(1e-3))
+        return x / z, y / z
+
+    flow_u, flow_v = (end - start for start, end in zip(seen_from(at_open), seen_from(at_close), strict=True))
     n = min(n_samples, 1 + int(np.ceil(max(np.abs(flow_u).max(), np.abs(flow_v).max()))))
-    total, shifted, to_u, to_v = np.zeros_like(linear), np.empty_like(linear), np.empty_like(u), np.empty_like(v)
-    for share in (np.arange(n) + 0.5) / n - 0.5:
-        np.add(u, np.multiply(flow_u, np.float32(-share), out=to_u), out=to_u)
-        np.add(v, np.multiply(flow_v, np.float32(-share), out=to_v), out=to_v)
-        cv2.remap(linear, to_u, to_v, cv2.INTER_LINEAR, dst=shifted, borderMode=cv2.BORDER_REPLICATE)
-        total += shifted
-    total *= np.float32(1 / n)
-    return total
-
-
-def _seen_from(
-    pose: Float64Array, camera_to_world: Float64Array, intrinsics: Float64Array, u: Float32Array, v: Float32Array,
-    inverse: Float32Array,
-) -> tuple[Float32Array, Float32Array]:  # fmt: skip
-    """Where another camera sees the point of each pixel: K (R K^-1 (u, v, 1) + t / depth)."""
-    motion = np.linalg.inv(pose) @ camera_to_world
-    turn = (intrinsics @ motion[:3, :3] @ np.linalg.inv(intrinsics)).astype(np.float32)
-    shift = (intrinsics @ motion[:3, 3]).astype(np.float32)
-    x, y, z = (turn[k, 0] * u + turn[k, 1] * v + turn[k, 2] + shift[k] * inverse for k in range(3))
-    z = np.maximum(z, np.float32(1e-3))
-    return x / z, y / z
+    total, shifted = np.zeros_like(linear), np.empty_like(linear)
+    for share in ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32):
+        to_u, to_v = u - share * flow_u, v - share * flow_v
+        total += cv2.remap(linear, to_u, to_v, cv2.INTER_LINEAR, dst=shifted, borderMode=cv2.BORDER_REPLICATE)
+    return total * np.float32(1 / n)
 
 
 def exposure_gain(luminances: Sequence[float], target: float, speed: float, min_ev: float, max_ev: float) -> float:
@@ -90,30 +84,20 @@ def exposure_gain(luminances: Sequence[float], target: float, speed: float, min_
     1.0
     """
     wanted = np.clip(np.log2(target / np.maximum(luminances, 1e-6)), min_ev, max_ev)
-    ev = float(wanted[0])
-    for value in wanted[1:]:
-        ev += speed * (float(value) - ev)
-    return float(2.0**ev)
+    return float(2.0 ** reduce(lambda ev, next_ev: ev + speed * (next_ev - ev), wanted))
 
 
-def expose(linear: Float32Array, gain: float) -> Float32Array:
+def expose(linear: Light, gain: float) -> Light:
     """Light times ``gain``; where the image is saturated it stays so, as the light there is at least 1."""
-    if gain == 1:
-        return linear
     brighter = linear * np.float32(gain)
     if gain < 1:
         brighter += np.float32(1 - gain) * np.square(np.square(np.square(linear)))  # 0.004 at half of the scale
-    np.minimum(brighter, 1, out=brighter)
-    return brighter
+    return np.asarray(np.minimum(brighter, 1, out=brighter))
 
 
-def photon_noise(
-    linear: Float32Array, shot: float, read: float, rng: np.random.Generator, gain: float = 1.0
-) -> Float32Array:
+def photon_noise(linear: Light, shot: float, read: float, rng: Generator, gain: float = 1.0) -> Light:
     """Light with variance shot * gain * light + read * gain^2 (photon transfer: Janesick 2007; Brooks et al. 2019,
     equation 1). ``shot`` and ``read`` are variances at gain 1 for a full scale of 1."""
-    if shot == 0 and read == 0:
-        return linear
     noise = np.float32(shot * gain) * linear
     noise += np.float32(read * gain**2)
     np.sqrt(noise, out=noise)
