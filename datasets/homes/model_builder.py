@@ -31,6 +31,7 @@ from su3d_bench.datasets.procedural.shapes import (
     join,
     lathe,
     leaf,
+    loft,
     prism,
     puff,
     sheet,
@@ -129,6 +130,8 @@ def shape_of(row: PartRow) -> Shape:
         return puff(*row.cushion).moved(z=row.cushion[1] / 2)
     if row.cloth:
         return _hanging_cloth(*row.cloth, row.folds, row.depth)
+    if row.loft:
+        return loft(row.loft, row.power, row.sides or 20)
     assert row.leaf
     return leaf(*row.leaf)
 
@@ -177,6 +180,8 @@ def _part(row: PartRow, look: Look, shares: dict[Ajar, float], rng: np.random.Ge
     shape = shape_of(row)
     if row.taper != 1.0:
         shape = shape.tapered(row.taper)
+    if row.scale != (1, 1, 1):
+        shape = shape.stretched(*row.scale)
     for axis, degrees in row.turn:
         shape = shape.turned(axis, degrees)
     shape = _opened(shape.moved(*row.at), row.ajar, shares, rng)
