@@ -79,7 +79,8 @@ def table(sources: Sequence[Source]) -> Iterator[str]:
 
 def motion(addresses: Sequence[str], stride: int) -> Iterator[str]:
     """Objects per view and motion per update of generated scenes."""
-    yield f"\n| per update, stride {stride} | objects | objects per view | translation | rotation |\n|---|---|---|---|---|"
+    yield f"\n| per update, stride {stride} | objects | objects per view | translation | rotation |"
+    yield "|---|---|---|---|---|"
     for address in addresses:
         name, _, scene = address.partition("/")
         row = view_statistics(registry.load("dataset", name)(data_root()), scene, stride)

@@ -132,13 +132,19 @@ def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
             return grey * edge, 0.97 * grey * edge, 0.9 * grey * edge
         return _times(_blend(scene, _blend(a, b, v), 0.3), 0.65 + 0.35 * stroke)
     if style == 6:  # fruit and jars on a table, lit from the left
-        ground = _times((0.2, 0.12, 0.07), 0.8 + 0.4 * stroke) if v < 0.36 else _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
+        ground = (
+            _times((0.2, 0.12, 0.07), 0.8 + 0.4 * stroke) if v < 0.36 else _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
+        )
         for k in range(5):
             wide = 0.06 + 0.06 * hash01(k, 1, seed)
             tall = wide * (1.0 if k < 3 else 2.2)
             p, q = (u - 0.2 - 0.14 * k) / wide, (v - 0.26 - 0.05 * hash01(k, 2, seed) - tall) / tall
             if p * p + q * q < 1:
-                body = _blend(a, b, 0.5 * k) if k % 2 == 0 else _blend((0.5, 0.22, 0.05), (0.35, 0.33, 0.1), hash01(k, 3, seed))
+                body = (
+                    _blend(a, b, 0.5 * k)
+                    if k % 2 == 0
+                    else _blend((0.5, 0.22, 0.05), (0.35, 0.33, 0.1), hash01(k, 3, seed))
+                )
                 ground = _times(body, (0.25 + 0.75 * max(0.0, 0.6 - 0.55 * p + 0.3 * q)) * (0.8 + 0.3 * stroke))
         return ground
     if style == 7:
@@ -157,7 +163,9 @@ def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
             along = (u - 0.5) * side * 0.8 + (v - root) * 0.6
             across = (v - root) * 0.8 - (u - 0.5) * side * 0.6
             if 0 < along < 0.24 and abs(across) < 0.16 * along * (0.24 - along) / 0.06:
-                return _times(_blend(_blend((0.08, 0.14, 0.06), a, 0.5), paper, 0.3 * stroke), 0.8 if abs(across) < 0.004 else 1.0)
+                return _times(
+                    _blend(_blend((0.08, 0.14, 0.06), a, 0.5), paper, 0.3 * stroke), 0.8 if abs(across) < 0.004 else 1.0
+                )
         return _blend(a, paper, 0.2) if abs(u - 0.5) < 0.005 and 0.16 < v < 0.8 else _times(paper, 0.96 + 0.04 * stroke)
     picture = _view(u, (v - 0.36) / 0.6, int(seed) % 6, seed, False)
     if v > 0.36:
@@ -271,4 +279,7 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
     if abs(fv - band) < 0.012 or abs(fv - 1 + band) < 0.012 or (fv > 0.84 and seed % 4 == 0):
         return _times(b, cloth)
     ink = _text((0.8 - fv) / 0.55, (fu - 0.2) / 0.6, 1 + seed % 2, seed)
-    return _times(_blend(a, b if abs(a[1] - b[1]) > 0.15 else ((0.7, 0.68, 0.6) if a[1] < 0.3 else (0.04, 0.04, 0.05)), ink), cloth)
+    return _times(
+        _blend(a, b if abs(a[1] - b[1]) > 0.15 else ((0.7, 0.68, 0.6) if a[1] < 0.3 else (0.04, 0.04, 0.05)), ink),
+        cloth,
+    )
