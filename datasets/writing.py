@@ -24,7 +24,7 @@ from su3d_bench.core.types import Frame
 from su3d_bench.datasets.recordings.file_dataset import MARKER, read_marker
 
 if TYPE_CHECKING:
-    from su3d_bench.datasets.rooms.dataset import Rooms
+    from su3d_bench.datasets.procedural.dataset import GeneratedScenes
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Layout(ABC):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget: ...
 
     @abstractmethod
-    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: GeneratedScenes, scene: str, out: Path) -> None:
         """Write the files shared by all scenes; a ``StoreError`` if they exist with other content."""
 
     @abstractmethod
@@ -91,14 +91,14 @@ class Layout(ABC):
         """The content of each of ``frame_names``."""
 
     @abstractmethod
-    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
         """Write all files except those of the frames into ``target.partial``."""
 
-    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have one file per frame
+    def join(self, dataset: GeneratedScenes, target: SceneTarget) -> None:  # noqa: B027 - most have one file per frame
         """Create in ``target.partial`` the file for all frames; called after everything else is written."""
 
 
-def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
+def plan_scenes(layout: Layout, dataset: GeneratedScenes, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
     """The incomplete scenes below ``out``, which is prepared for them; one caller at a time.
 
     Raises ``StoreError`` if ``out`` is not writable or contains one of the scenes, or a shared file, from
@@ -141,7 +141,7 @@ def write_shared_text(path: Path, text: str, complaint: str) -> None:
 
 def write_frames(
     layout: Layout,
-    dataset: Rooms,
+    dataset: GeneratedScenes,
     target: SceneTarget,
     indices: range,
     report: Callable[[int], None] = lambda n_done: None,
@@ -160,7 +160,7 @@ def write_frames(
         report(n_done)
 
 
-def finish_scene(layout: Layout, dataset: Rooms, target: SceneTarget) -> None:
+def finish_scene(layout: Layout, dataset: GeneratedScenes, target: SceneTarget) -> None:
     """Move everything to its destination, the scene's folder last, so that only complete scenes appear."""
     try:
         layout.join(dataset, target)

@@ -1,6 +1,6 @@
-"""Train the embedded encoder on rendered rooms not used by benchmarks, export it and evaluate it.
+"""Train the embedded encoder on homes for training, without held-out models and classes; export and measure it.
 
-    python tools/train_encoder.py --out DIR --rooms 360 --minutes 30 --seed 0
+    python tools/train_encoder.py --out DIR --homes 150 --minutes 40 --seed 0
 
 Needs the models extra (torch, onnx). The number of steps depends on time, so two trainings differ in their weights.
 """
@@ -23,11 +23,12 @@ from export_onnx import export_onnx
 from numpy.typing import NDArray
 from training_captions import Caption, CropTruth, fill, fixed_captions
 from training_crops import (
-    FIRST_HELD_OUT_NUMBER,
-    FIRST_TRAINING_NUMBER,
+    FIRST_MEASURED_NUMBER,
+    MEASURED,
+    TRAINING,
     CropSet,
+    home_names,
     make_crops,
-    room_names,
 )
 
 from su3d_bench.core.errors import Su3dError
@@ -36,6 +37,7 @@ from su3d_bench.core.safe_output import doors
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
+from su3d_bench.datasets.homes.catalogue import catalogue
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
 from su3d_bench.perception.embedded.lexicon import DIM, N_IDS, N_WORDS, ROOM_NAMES, SURFACES, class_words, token_ids
 
@@ -45,12 +47,13 @@ MIN_POSITIVES = 3
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured value: ``value`` over ``n`` trials, with ``chance`` level."""
+    """One measured value: ``value`` over ``n`` trials, with ``chance`` level; 95 % interval over homes, if measured."""
 
     name: str
     value: float
     chance: float
     n: int
+    interval: tuple[float, float] | None = None
 
 
 def measure(encoder: Encoder, crops: CropSet, features: Float32Array, class_names: Sequence[str]) -> tuple[Figure, ...]:
@@ -65,7 +68,7 @@ def measure(encoder: Encoder, crops: CropSet, features: Float32Array, class_name
         ("ratio 4", has_class & (crops.ratios == 4.0)),
     )
     held_out = _HeldOut(encoder, crops, features, class_names)
-    figures: list[Figure] = []
+    figures: list[Figure] = held_out.split_figures(exact)
     for prompt in PROMPTS:
         figures += held_out.class_figures(exact, prompt, groups[0][0])
     for label, chosen in groups[1:]:
@@ -105,6 +108,27 @@ class _HeldOut:
             Figure(mean, float(np.mean(by_class or [0.0])), 1.0 / len(names), len(rows)),
         ]
 
+    def split_figures(self, chosen: BoolArray) -> list[Figure]:
+        """Classification of what training has shown and of what it has not, with intervals over homes."""
+        rows, names = np.flatnonzero(chosen), self.class_names
+        rank = _ranks(
+            self.similarity(rows, [fill(PROMPTS[0], name) for name in names]), self.places(rows, names, "class_name")
+        )
+        known = catalogue()
+        held_out = {model.name for name in names for model in known.classes[name].models if model.is_held_out}
+        is_novel = np.array([known.classes[self.crops.truths[row].class_name].is_novel for row in rows], bool)
+        is_unseen = np.array([self.crops.truths[row].model in held_out for row in rows], bool)
+        splits = (
+            ("models seen in training", ~is_unseen),
+            ("unseen models of base classes", is_unseen & ~is_novel),
+            ("novel classes", is_novel),
+        )
+        return [
+            Figure(f"top-{k}: {label}, class of {len(names)}", _mean(rank[split] < k), k / len(names), int(split.sum()),
+                   _interval_over(self.crops.homes[rows[split]], rank[split] < k))
+            for label, split in splits for k in (1, 5)
+        ]  # fmt: skip
+
     def colour_figures(self, chosen: BoolArray) -> list[Figure]:
         rows, names = np.flatnonzero(chosen), self.class_names
         colours = sorted({truth.colour for truth in self.crops.truths} - {""})
@@ -130,6 +154,7 @@ class _HeldOut:
 
     def retrieval_figures(self, exact: BoolArray, shown: BoolArray) -> list[Figure]:
         names = {truth.class_name for truth in self.crops.truths} - {""}
+        everything = fixed_captions(frozenset(names))
         classes = [Caption(word, classes=(name,)) for name in sorted(names) for word in class_words(name)]
         colours = sorted({(truth.colour, truth.class_name) for truth in self.crops.truths if truth.class_name})
         properties = [
@@ -138,7 +163,7 @@ class _HeldOut:
         relative = _relative_captions([self.crops.truths[row] for row in np.flatnonzero(shown)])
         return [
             self.average_precision("instance words", classes, exact),
-            self.average_precision("affordances and group words", fixed_captions(), exact),
+            self.average_precision("affordances and group words", everything, exact),
             self.average_precision("colour and class", properties, exact),
             self.average_precision("relations", relative, shown),
             self.relation_choice(shown),
@@ -206,6 +231,17 @@ def _ranks(similarity: Float32Array, truth: Int64Array) -> Int64Array:
     return np.asarray((similarity > own[:, None]).sum(axis=1), np.int64)
 
 
+def _interval_over(homes: Int64Array, is_right: BoolArray) -> tuple[float, float] | None:
+    """The 95 % interval of a share by drawing homes with replacement 2000 times."""
+    n, right = np.bincount(homes), np.bincount(homes, is_right)
+    n, right = n[n > 0], right[n > 0]
+    if len(n) < 2:
+        return None
+    drawn = np.random.default_rng(0).integers(0, len(n), (2000, len(n)))
+    low, high = np.percentile(right[drawn].sum(axis=1) / n[drawn].sum(axis=1), (2.5, 97.5))
+    return float(low), float(high)
+
+
 def _mean(values: NDArray[Any]) -> float:
     return float(np.mean(values, dtype=np.float64)) if len(values) else 0.0
 
@@ -225,9 +261,9 @@ class Order:
 
     out: Path
     cache: Path
-    rooms: int
-    held_out_rooms: int
-    frames_per_room: int
+    homes: int
+    measured_homes: int
+    frames_per_home: int
     minutes: float
     seed: int
     jobs: int
@@ -241,11 +277,11 @@ def run(order: Order) -> tuple[Figure, ...]:
         require(package, "training")
     from training_loop import TrainingPlan, train
 
-    names = room_names(order.rooms, FIRST_TRAINING_NUMBER)
-    crops = make_crops(names, order.frames_per_room, order.seed, order.cache, order.jobs)
-    held_names = room_names(order.held_out_rooms, FIRST_HELD_OUT_NUMBER)
-    held_out = make_crops(held_names, order.frames_per_room, order.seed, order.cache, order.jobs)
-    logger.info("%d crops to train on, %d held out", len(crops), len(held_out))
+    names = home_names(TRAINING, order.homes)
+    crops = make_crops(names, order.frames_per_home, order.seed, order.cache, order.jobs)
+    other_names = home_names(MEASURED, order.measured_homes, FIRST_MEASURED_NUMBER)
+    others = make_crops(other_names, order.frames_per_home, order.seed, order.cache, order.jobs)
+    logger.info("%d crops to train on, %d to measure on", len(crops), len(others))
     plan = TrainingPlan(
         order.minutes,
         order.seed,
@@ -256,11 +292,13 @@ def run(order: Order) -> tuple[Figure, ...]:
     towers = train(crops, plan, keep=lambda snapshot: export(snapshot, order.out))
     export(towers, order.out)
     encoder = EmbeddedEncoder(order.out)
-    class_names = sorted({truth.class_name for truth in crops.truths} - {""})
-    features = encoder.encode_shrunk(held_out.pixels, held_out.log_sizes)
-    figures = measure(encoder, held_out, features, class_names)
-    difference = largest_difference(towers, order.out, held_out.first(256), [*class_names, "plant on a shelf"])
-    _write_card(order, plan, towers, (len(crops), len(held_out)), class_names, figures, difference)
+    trained = sorted({truth.class_name for truth in crops.truths} - {""})
+    class_names = sorted({*trained, *(truth.class_name for truth in others.truths)} - {""})
+    features = encoder.encode_shrunk(others.pixels, others.log_sizes)
+    figures = measure(encoder, others, features, class_names)
+    difference = largest_difference(towers, order.out, others.first(256), [*class_names, "plant on a shelf"])
+    models = sorted({truth.model for truth in crops.truths} - {""})
+    _write_card(order, plan, towers, (len(crops), len(others)), (trained, models), figures, difference)
     return figures
 
 
@@ -295,7 +333,7 @@ def _write_card(
     plan: TrainingPlan,
     towers: Towers,
     n_crops: tuple[int, int],
-    class_names: Sequence[str],
+    trained_on: tuple[Sequence[str], Sequence[str]],
     figures: Sequence[Figure],
     difference: float,
 ) -> None:
@@ -308,9 +346,8 @@ def _write_card(
             name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()
         },
         "training": {
-            "rooms": order.rooms,
-            "first_room_number": FIRST_TRAINING_NUMBER,
-            "frames_per_room": order.frames_per_room,
+            "homes": order.homes,
+            "frames_per_home": order.frames_per_home,
             "crops": n_crops[0],
             "seed": order.seed,
             "batch_size": plan.batch_size,
@@ -320,17 +357,20 @@ def _write_card(
             "crops_seen": towers.n_crops_seen,
             "minutes": round(towers.minutes, 1),
             "threads": plan.threads,
-            "classes": list(class_names),
+            "classes": list(trained_on[0]),
+            "models": list(trained_on[1]),
         },
-        "held_out": {
-            "rooms": order.held_out_rooms,
-            "first_room_number": FIRST_HELD_OUT_NUMBER,
+        "measured": {
+            "homes": order.measured_homes,
+            "first_home": f"{MEASURED}{FIRST_MEASURED_NUMBER}",
             "crops": n_crops[1],
             "figures": [asdict(figure) for figure in figures],
         },
         "largest_difference_from_torch": difference,
     }
     (order.out / CARD_JSON).write_text(json.dumps(card, indent=1) + "\n")
+    header = "# The classes that the encoder was trained on.\n"
+    (order.out / "training_classes.txt").write_text(header + "".join(f"{name}\n" for name in trained_on[0]))
     template = file_text(Path(__file__).parent / "model_card.md.j2")
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     text = environment.from_string(template).render(card, program=PROGRAM, card_json=CARD_JSON)
@@ -342,10 +382,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog=f"python {PROGRAM}", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the two ONNX files and the model card")
     parser.add_argument("--cache", type=Path, help="folder for rendered crops; default: OUT/crops")
-    parser.add_argument("--rooms", type=int, default=360)
-    parser.add_argument("--held-out-rooms", type=int, default=24)
-    parser.add_argument("--frames-per-room", type=int, default=6)
-    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--homes", type=int, default=150)
+    parser.add_argument("--measured-homes", type=int, default=24)
+    parser.add_argument("--frames-per-home", type=int, default=8)
+    parser.add_argument("--minutes", type=float, default=40.0)
     parser.add_argument("--max-steps", type=int, help="maximum number of steps")
     parser.add_argument("--snapshot-minutes", type=float, help="export a snapshot every N minutes")
     parser.add_argument("--seed", type=int, default=0)

@@ -44,7 +44,10 @@ class Neighbour:
 
 @dataclass(frozen=True)
 class CropTruth:
-    """Content of a crop: ``class_name`` is "" for a whole image, ``room`` is "" if little of the room is visible."""
+    """Content of a crop: ``class_name`` is "" for a whole image, ``room`` is "" if little of the room is visible.
+
+    ``model`` is the model of the object.
+    """
 
     class_name: str
     colour: str
@@ -52,6 +55,7 @@ class CropTruth:
     size_word: str
     neighbours: tuple[Neighbour, ...] = ()
     room: str = ""
+    model: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,10 +97,10 @@ def class_caption(class_name: str, random: Generator) -> Caption:
     return Caption(fill(draw(CLASS_TEMPLATES, random), name), classes=(class_name,))
 
 
-def fixed_captions() -> tuple[Caption, ...]:
-    """The captions of affordances and of words for several classes, identical in every scene."""
-    uses = [Caption(phrase, classes=classes) for phrase, classes in AFFORDANCES.items()]
-    return (*uses, *(Caption(word, classes=classes) for word, classes in GROUPS.items()))
+def fixed_captions(known: frozenset[str]) -> tuple[Caption, ...]:
+    """The captions of affordances and of words for several classes, without those of none of the ``known`` classes."""
+    words = [*AFFORDANCES.items(), *GROUPS.items()]
+    return tuple(Caption(text, classes=classes) for text, classes in words if not known.isdisjoint(classes))
 
 
 def room_caption(room: str, random: Generator) -> Caption:

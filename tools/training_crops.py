@@ -1,4 +1,4 @@
-"""Training crops cut from rendered rooms: windows as placed by a segmenter, with their content."""
+"""Training crops cut from rendered homes: windows as placed by a segmenter, with their content."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from training_captions import CropTruth, Neighbour
 
 from su3d_bench.core import registry
 from su3d_bench.core.system.files import file_text, regular
-from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.cache import crop_window, mask_boxes
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 
-KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
-FIRST_TRAINING_NUMBER = 10000
-FIRST_HELD_OUT_NUMBER = 20000
-# Poses of the trajectory through a room from which the images are drawn.
-WALK_FRAMES = 200
+TRAINING, MEASURED = "training", "seed"  # series of homes: without held-out models, and with all
+FIRST_MEASURED_NUMBER = 990_000
+# Where the camera stands: heights and distances of a person and of a robot, m; it looks at some object.
+HEIGHTS, DISTANCES = (0.5, 1.75), (0.7, 3.2)
+TRIES = 12  # candidate views of an image; the one that shows most objects is rendered
 MIN_VIEW_PIXELS = 80
 # A neighbour counts as shown if it fills this part of the window, or if this part of its visible pixels is inside.
 SHOWN_OF_WINDOW, SHOWN_OF_NEIGHBOUR = 0.02, 0.5
@@ -43,7 +43,8 @@ SEGMENTER_LEVELS: tuple[Literal["objects", "parts"], ...] = ("objects", "parts")
 class CropSet:
     """N crops: ``pixels`` (N, 64, 64, 3) uint8, ``log_sizes`` (N, 2) float32, their content, and how they were cut.
 
-    ``ratios`` (N,) float32 are crop ratios, 0 for a whole image; ``is_exact`` (N,): whether the box was the object's.
+    ``ratios`` (N,) float32 are crop ratios, 0 for a whole image; ``is_exact`` (N,): whether the box was the object's;
+    ``homes`` (N,): the number of the home.
     """
 
     pixels: UInt8Array
@@ -51,30 +52,32 @@ class CropSet:
     truths: tuple[CropTruth, ...]
     ratios: Float32Array
     is_exact: np.ndarray[Any, np.dtype[np.bool_]]
+    homes: Int64Array
 
     def __len__(self) -> int:
         return len(self.truths)
 
     def first(self, n: int) -> CropSet:
         """The first ``n`` crops."""
-        return CropSet(self.pixels[:n], self.log_sizes[:n], self.truths[:n], self.ratios[:n], self.is_exact[:n])
+        each = (self.pixels, self.log_sizes, self.truths, self.ratios, self.is_exact, self.homes)
+        return CropSet(*(values[:n] for values in each))
 
 
-def room_names(n_rooms: int, first_number: int) -> list[str]:
-    """``n_rooms`` scene names, cycling through the kinds, numbered from ``first_number``; never a benchmark scene."""
-    return [f"{KINDS[index % len(KINDS)]}{first_number + index // len(KINDS)}" for index in range(n_rooms)]
+def home_names(series: str, n_homes: int, first_number: int = 0) -> list[str]:
+    """The names of ``n_homes`` homes of a series; never one of a benchmark."""
+    return [f"{series}{first_number + index}" for index in range(n_homes)]
 
 
-def make_crops(scenes: Sequence[str], frames_per_room: int, seed: int, folder: Path, jobs: int) -> CropSet:
+def make_crops(scenes: Sequence[str], frames_per_home: int, seed: int, folder: Path, jobs: int) -> CropSet:
     """The crops of ``scenes``, read from ``folder`` if an earlier call wrote them, otherwise rendered into it."""
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = [(scene, frames_per_room, seed, folder) for scene in scenes if not _facts_path(folder, scene).is_file()]
+    tasks = [(scene, frames_per_home, seed, folder) for scene in scenes if not _facts_path(folder, scene).is_file()]
     if jobs == 1 or len(tasks) < 2:
         for task in tasks:
-            _render_room(task)
+            _render_home(task)
     else:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            list(pool.map(_render_room, tasks))
+            list(pool.map(_render_home, tasks))
     return read_crops(scenes, folder)
 
 
@@ -89,16 +92,17 @@ def read_crops(scenes: Sequence[str], folder: Path) -> CropSet:
         start += len(of_scene)
     return CropSet(
         pixels,
-        np.array([row[6] for row in rows], np.float32).reshape(-1, 2),
+        np.array([row[7] for row in rows], np.float32).reshape(-1, 2),
         tuple(_crop_truth(row) for row in rows),
-        np.array([row[7] for row in rows], np.float32),
-        np.array([row[8] for row in rows], np.bool_),
+        np.array([row[8] for row in rows], np.float32),
+        np.array([row[9] for row in rows], np.bool_),
+        np.repeat(np.arange(len(facts)), [len(of_scene) for of_scene in facts]),
     )
 
 
 def _crop_truth(row: list[Any]) -> CropTruth:
-    name, colour, material, size_word, neighbours, room = row[:6]
-    return CropTruth(name, colour, material, size_word, tuple(Neighbour(*item) for item in neighbours), room)
+    name, colour, material, size_word, neighbours, room, model = row[:7]
+    return CropTruth(name, colour, material, size_word, tuple(Neighbour(*item) for item in neighbours), room, model)
 
 
 def _facts_path(folder: Path, scene: str) -> Path:
@@ -109,27 +113,56 @@ def _pixels_path(folder: Path, scene: str) -> Path:
     return folder / f"{scene}.npy"
 
 
-def _render_room(task: tuple[str, int, int, Path]) -> None:
+def _render_home(task: tuple[str, int, int, Path]) -> None:
     scene, n_frames, seed, folder = task
-    rooms_class = registry.load("dataset", "rooms")
-    rooms = rooms_class(folder, rooms_class.Options(n_frames=WALK_FRAMES))
+    homes = registry.load("dataset", "homes")(folder / "no cache")
     rng = np.random.default_rng([seed, *scene.encode()])
-    truth = rooms.truth(scene)
-    trajectory = rooms.trajectory(scene)
-    step = len(trajectory) // n_frames
+    built, truth = homes.built(scene), homes.truth(scene)
     segmenters = [RgbdSegmenter(SegmenterConfig(), level) for level in SEGMENTER_LEVELS]
     pixels, facts = [], []
     for count in range(n_frames):
-        index = count * step + int(rng.integers(step))
-        view = rooms.render(scene, trajectory[index])
-        frame = Frame(index, 0.0, view.rgb, view.depth_m, trajectory[index], rooms.intrinsics)
+        pose = _best_view(built, truth, rng)
+        view = built.renderer.render(pose)
+        frame = Frame(count, 0.0, view.rgb, view.depth_m, pose, homes.intrinsics)
         regions = segmenters[count % len(segmenters)].segment(frame)
         for crop, row in _view_crops(view.rgb, _View(view.instance, truth), regions, rng):
             pixels.append(crop)
             facts.append(row)
     np.save(_pixels_path(folder, scene), np.stack(pixels))
-    # The facts come last: their presence marks the room as complete.
+    # The facts come last: their presence marks the home as complete.
     _facts_path(folder, scene).write_text(json.dumps(facts))
+
+
+def _best_view(built: Any, truth: Any, rng: np.random.Generator) -> Float64Array:
+    """Of a few random poses that look at an object from a free place, the one that shows most objects."""
+    free, origin = built.plan.free(0.1)
+    cells = (np.argwhere(free) + 0.5) * 0.1 + origin
+    best, most = np.eye(4), -1.0
+    small = built.coarser(80)
+    every = np.arange(small.width * small.height)
+    for _ in range(TRIES):
+        target = np.array(truth.objects[int(rng.integers(len(truth.objects)))].centre)
+        distance = np.linalg.norm(cells - target[:2], axis=1)
+        near = np.flatnonzero((distance > DISTANCES[0]) & (distance < DISTANCES[1]))
+        if not len(near):
+            continue
+        eye = np.array([*cells[int(rng.choice(near))], float(rng.uniform(*HEIGHTS))])
+        pose = _looking(eye, target + rng.normal(0.0, 0.25, 3))
+        depth, ids = small.depth_and_instance(pose, every)
+        n_shown = len(np.unique(ids)) - 40.0 * float((depth < 0.4).mean())
+        if n_shown > most:
+            best, most = pose, n_shown
+    return best
+
+
+def _looking(eye: Float64Array, target: Float64Array) -> Float64Array:
+    forward = (target - eye) / max(float(np.linalg.norm(target - eye)), 1e-6)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= max(float(np.linalg.norm(right)), 1e-6)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = eye
+    return pose
 
 
 def _view_crops(
@@ -227,6 +260,7 @@ class _View:
             item.size_word,
             tuple(neighbours),
             self._truth.kind if shows_room else "",
+            item.model,
         )
 
     def whole(self) -> CropTruth:

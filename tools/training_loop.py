@@ -154,7 +154,7 @@ class Batches:
         self._table = TruthTable(crops.truths)
         self._rng = np.random.default_rng(seed)
         self._batch_size = batch_size
-        self._fixed = fixed_captions()
+        self._fixed = fixed_captions(frozenset(self._table.class_names))
         classes = self._table.class_of
         counts = np.bincount(classes + 1, minlength=len(self._table.class_names) + 1).astype(np.float64)
         # Square-root sampling: between the rooms' frequencies and uniform classes. Whole images count three times.

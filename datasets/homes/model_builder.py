@@ -31,6 +31,7 @@ from su3d_bench.datasets.procedural.shapes import (
     join,
     lathe,
     leaf,
+    loft,
     prism,
     puff,
     sheet,
@@ -129,6 +130,8 @@ def shape_of(row: PartRow) -> Shape:
         return puff(*row.cushion).moved(z=row.cushion[1] / 2)
     if row.cloth:
         return _hanging_cloth(*row.cloth, row.folds, row.depth)
+    if row.loft:
+        return loft(row.loft, row.power, row.sides or 20)
     assert row.leaf
     return leaf(*row.leaf)
 
@@ -141,6 +144,7 @@ def _hanging_cloth(width: float, height: float, folds: float, depth: float) -> S
 
 
 def _opened(shape: Shape, ajar: Ajar | None, shares: dict[Ajar, float], rng: np.random.Generator) -> Shape:
+    """The shape opened by the share of its ``ajar``, which is drawn for the first part that has it."""
     if ajar is None:
         return shape
     if ajar not in shares:
@@ -176,6 +180,8 @@ def _part(row: PartRow, look: Look, shares: dict[Ajar, float], rng: np.random.Ge
     shape = shape_of(row)
     if row.taper != 1.0:
         shape = shape.tapered(row.taper)
+    if row.scale != (1, 1, 1):
+        shape = shape.stretched(*row.scale)
     for axis, degrees in row.turn:
         shape = shape.turned(axis, degrees)
     shape = _opened(shape.moved(*row.at), row.ajar, shares, rng)
@@ -188,7 +194,8 @@ def build_item(row: ModelRow, rng: np.random.Generator, muted: bool = False, col
     variant = str(rng.choice(row.variants)) if row.variants else ""
     look = Look(row, rng, muted, colour)
     scale = (1 + rng.uniform(-row.vary, row.vary)) * (1 + rng.uniform(-row.stretch, row.stretch, 3))
-    parts, shares = [], dict[Ajar, float]()
+    parts: list[Part] = []
+    shares: dict[Ajar, float] = {}
     for part in row.parts:
         is_there = (not part.only or variant in part.only) and (part.chance >= 1 or rng.random() < part.chance)
         if is_there:

@@ -24,7 +24,7 @@ Range = tuple[Number, Number]
 Axis = Literal["x", "y", "z"]
 FABRICS = ("fabric", "plain fabric", "large fabric")
 KINDS = (*FABRICS, *HOMES_LOOKS)
-SHAPES = ("block", "revolve", "extrude", "tube", "ellipsoid", "cushion", "cloth", "leaf")
+SHAPES = ("block", "revolve", "extrude", "tube", "ellipsoid", "cushion", "cloth", "leaf", "loft")
 
 
 class Strict(BaseModel):
@@ -53,10 +53,11 @@ class Repeat(Strict):
 class Ajar(Strict):
     """A door or drawer: with ``chance`` opened, turned about ``axis`` through ``hinge`` or moved along ``slide``.
 
-    The opening is a random share of ``degrees`` or of ``slide``; parts of a model with equal rows, such as a door and
-    its handle, open together.
+    The opening is a random share of ``degrees`` or of ``slide``. Parts whose ``ajar`` is equal open together; ``name``
+    keeps those apart that differ in nothing else.
     """
 
+    name: str = ""
     chance: Share = 0.3
     axis: Axis = "z"
     hinge: Point = (0, 0, 0)
@@ -72,10 +73,12 @@ class PartRow(Strict):
     ``length`` deep and centred on ``at`` (``along`` "x": [y, z]; "z": [x, y], standing on ``at``); ``tube``
     [[x, y, z], ...] of a ``radius``; ``ellipsoid`` [rx, ry, rz], standing on ``at``; ``cushion`` [width, height,
     thickness] upright; ``cloth`` [width, height], hanging with ``folds`` waves of a ``depth``, its lower edge at
-    ``at``; ``leaf`` [length, width, droop] growing from ``at`` along y, rising.
+    ``at``; ``leaf`` [length, width, droop] growing from ``at`` along y, rising; ``loft`` [[z, x, y, rx, ry], ...], a
+    skin over oval sections, the more rectangular the larger ``power``.
 
-    Then, in this order: ``taper`` scales x and y at the top, ``turn`` [[axis, degrees], ...] about the origin, ``at``
-    moves, ``mirror`` adds copies on the other side ("x", "y" or "xy" for four), ``repeat`` copies.
+    Then, in this order: ``taper`` scales x and y at the top, ``scale`` [x, y, z] all of it (a revolve becomes oval),
+    ``turn`` [[axis, degrees], ...] about the origin, ``at`` moves, ``mirror`` adds copies on the other side ("x", "y"
+    or "xy" for four), ``repeat`` copies.
     ``of``: a slot of the model, "main", or a material with a colour such as "plastic black"; "main*0.7" is darker.
     ``only``: the variants of the model that have it. ``chance``: of being there at all.
     """
@@ -88,6 +91,8 @@ class PartRow(Strict):
     cushion: tuple[Length, Length, Length] | None = None
     cloth: tuple[Length, Length] | None = None
     leaf: tuple[Length, Length, float] | None = None
+    loft: tuple[tuple[Number, Number, Number, Share, Share], ...] | None = None
+    power: float = Field(default=2.0, ge=1, le=12)
     round: float = Field(default=0.0, ge=0, le=0.5)
     sides: int | None = Field(default=None, ge=3, le=48)
     length: Length = 0.02
@@ -96,6 +101,7 @@ class PartRow(Strict):
     folds: float = Field(default=3.0, ge=0, le=40)
     depth: Length = 0.03
     taper: float = Field(default=1.0, ge=0.05, le=4)
+    scale: tuple[Length, Length, Length] = (1, 1, 1)
     turn: tuple[tuple[Axis, float], ...] = ()
     at: Point = (0, 0, 0)
     mirror: Literal["", "x", "y", "xy"] = ""
@@ -111,7 +117,7 @@ class PartRow(Strict):
         named = [shape for shape in SHAPES if getattr(self, shape) is not None]
         if len(named) != 1:
             raise ValueError(f"a part has exactly one of {', '.join(SHAPES)}; found {', '.join(named) or 'none'}")
-        points = {"revolve": self.revolve, "extrude": self.extrude, "tube": self.tube}.get(named[0])
+        points = {"revolve": self.revolve, "extrude": self.extrude, "tube": self.tube, "loft": self.loft}.get(named[0])
         if points is not None and not (3 if named[0] == "extrude" else 2) <= len(points) <= 64:
             raise ValueError(f"{named[0]} has too few or too many points")
         return self

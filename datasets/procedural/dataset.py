@@ -138,7 +138,6 @@ class GeneratedScenes(ABC):
     version: ClassVar[int]  # increase it whenever a scene of the same name changes
     sources: ClassVar[tuple[str, ...]]  # what affects a scene: part of the key of cached data
     default_scenes: ClassVar[tuple[str, ...]]
-    attributes: ClassVar[Path]  # the table of OpenScan's attributes by class
 
     def __init__(self, root: Path, options: Any = None) -> None:
         self.root = root
@@ -255,7 +254,7 @@ class GeneratedScenes(ABC):
         if variant in self.extra_ground_truths:
             scan = self.scan(scene)
             owner = scan.object_of_vertex()
-            attributes = attribute_of_object(self.objects(scene), variant, self.attributes)[owner]
+            attributes = attribute_of_object(self.objects(scene), variant)[owner]
             source = f"{made}: attributes of the objects seen on the trajectory"
             return GroundTruth(scan.vertices, attributes, owner, openscan.label_set(variant), variant, source)
         if variant not in self.variants:

@@ -194,6 +194,25 @@ def sheet(points: Float64Array, thickness: float = 0.006) -> Shape:
     return join([_from_grid(points + offset, normals), _from_grid(points - offset, -normals)])
 
 
+def loft(sections: Sequence[Sequence[float]], power: float = 2.0, sides: int = 24) -> Shape:
+    """A skin over level sections (z, centre x, centre y, radius x, radius y) with flat ends.
+
+    A section is an ellipse at ``power`` 2, nearly a rectangle from 5 on.
+    """
+    rows = np.array(sections, np.float64)
+    angle = 2 * np.pi * np.arange(-1, sides + 2) / sides
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None, :]
+    plane = rows[None, :, 1:3] + rows[None, :, 3:] * np.sign(unit) * np.abs(unit) ** (2 / power)
+    height = np.broadcast_to(rows[None, :, 0], (len(angle), len(rows)))[..., None]
+    grid = np.concatenate([plane, height], axis=2)
+    shapes = [_from_grid(grid[1:-1], _grid_normals(grid)[1:-1])]
+    for end, up in ((0, -1.0), (len(rows) - 1, 1.0)):
+        rim = grid[1:-1, end]
+        centre = np.broadcast_to(rows[end, [1, 2, 0]], rim.shape)
+        shapes.append(_from_grid(np.stack([centre, rim], axis=1), np.full((len(rim), 2, 3), (0.0, 0.0, up))))
+    return join(shapes)
+
+
 def puff(width: float, height: float, thickness: float, n: int = 13) -> Shape:
     """A filled cushion in the x-z plane, centred at the origin, thickest in the middle, with pinched corners."""
     t = np.linspace(-1, 1, n)

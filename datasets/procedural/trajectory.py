@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +30,16 @@ def walk(mesh: SceneMesh, boxes: Sequence[Box], room: tuple[float, float, float]
     n_views = min(n_frames, max(10, n_frames // FRAMES_PER_VIEW))
     at = np.linspace(0.0, 1.0, n_views, endpoint=False)
     height = rng.uniform(1.32, 1.72, n_views)
-    stations = np.column_stack([_along(path, at), height])
+    stations = np.column_stack([along_loop(path, at), height])
     yaw, pitch = _choose_views(mesh, stations, n_structure)
     time = np.arange(n_frames) / max(n_frames, 1)
-    smooth_height = _smooth(at, height, time)
+    smooth_height = smooth_through(at, height, time)
     wobble = _wobble(rng, n_frames)
-    position = np.column_stack([_along(path, time), smooth_height]) + wobble[:, :3] * 0.008
-    return _poses(
+    position = np.column_stack([along_loop(path, time), smooth_height]) + wobble[:, :3] * 0.008
+    return camera_poses(
         position,
-        _smooth(at, yaw, time) + 0.5 * wobble[:, 3],
-        _smooth(at, pitch, time) + 0.5 * wobble[:, 4],
+        smooth_through(at, yaw, time) + 0.5 * wobble[:, 3],
+        smooth_through(at, pitch, time) + 0.5 * wobble[:, 4],
         1.2 * wobble[:, 5],
     )
 
@@ -54,11 +55,11 @@ def _free_cells(boxes: Sequence[Box], room: tuple[float, float, float]) -> BoolA
                 near = (x > box.low[0] - CLEAR_M) & (x < box.high[0] + CLEAR_M)
                 free &= ~(near & (y > box.low[1] - CLEAR_M) & (y < box.high[1] + CLEAR_M))
         if free.sum() > 40:
-            return _largest_part(free)
-    return _largest_part(free)
+            return largest_part(free)
+    return largest_part(free)
 
 
-def _largest_part(free: BoolArray) -> BoolArray:
+def largest_part(free: BoolArray) -> BoolArray:
     from scipy.ndimage import label
 
     parts, n = label(free)
@@ -81,17 +82,17 @@ def _loop(free: BoolArray, boxes: Sequence[Box], rng: np.random.Generator) -> Fl
     order = [chosen[int(k)] for k in np.argsort(turn, kind="stable")]
     if rng.random() < 0.5:
         order.reverse()
-    steps = _shortest_paths(free, cells, _cost(points, boxes), order)
+    steps = _shortest_paths(free, cells, low_furniture_cost(points, boxes), order)
     raw = points[steps]
     for sigma in (0.45, 0.3, 0.2, 0.1):
-        smoothed = _blur_loop(_even(raw), sigma)
+        smoothed = _blur_loop(even_loop(raw), sigma)
         index = np.clip((smoothed / CELL_M).astype(int), 0, np.array(free.shape) - 1)
         if free[index[:, 0], index[:, 1]].all():
             return smoothed
-    return _even(raw)
+    return even_loop(raw)
 
 
-def _cost(points: Float64Array, boxes: Sequence[Box]) -> Float64Array:
+def low_furniture_cost(points: Float64Array, boxes: Sequence[Box]) -> Float64Array:
     cost = np.ones(len(points))
     for box in boxes:
         if box.high[2] > 0.2 and box.low[2] < 1.0:
@@ -102,8 +103,19 @@ def _cost(points: Float64Array, boxes: Sequence[Box]) -> Float64Array:
 
 def _shortest_paths(free: BoolArray, cells: NDArray[np.intp], cost: Float64Array, order: Sequence[int]) -> list[int]:
     """Cell indices along the cheapest path through all ``order`` stops and back to the first."""
-    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
+
+    graph = grid_graph(free, cells, cost)
+    way: list[int] = []
+    for start, end in zip(order, [*order[1:], order[0]], strict=True):
+        before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)[1]
+        way.extend(backtrack(before, start, end))
+    return way
+
+
+def grid_graph(free: BoolArray, cells: NDArray[np.intp], cost: Float64Array) -> Any:
+    """Sparse graph of the 8-connected free ``cells`` (N, 2); an edge weighs its length in cells times its cost."""
+    from scipy.sparse import coo_matrix
 
     index = np.full(free.shape, -1)
     index[tuple(cells.T)] = np.arange(len(cells))
@@ -115,18 +127,19 @@ def _shortest_paths(free: BoolArray, cells: NDArray[np.intp], cost: Float64Array
         rows.append(here)
         columns.append(other[here])
         weights.append(np.hypot(dx, dy) * (cost[here] + cost[other[here]]) / 2)
-    graph = coo_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), (len(cells),) * 2)
-    way: list[int] = []
-    for start, end in zip(order, [*order[1:], order[0]], strict=True):
-        before = dijkstra(graph.tocsr(), directed=False, indices=start, return_predecessors=True)[1]
-        leg = [end]
-        while leg[-1] != start:
-            leg.append(int(before[leg[-1]]))
-        way.extend(reversed(leg[1:]))
-    return way
+    edges = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
+    return coo_matrix(edges, (len(cells),) * 2).tocsr()
 
 
-def _even(loop: Float64Array) -> Float64Array:
+def backtrack(before: NDArray[np.int32], start: int, end: int) -> list[int]:
+    """The path of ``before`` (predecessors towards ``start``) from ``start`` to ``end``, which it leaves out."""
+    leg = [end]
+    while leg[-1] != start:
+        leg.append(int(before[leg[-1]]))
+    return leg[:0:-1]
+
+
+def even_loop(loop: Float64Array) -> Float64Array:
     """The closed polyline at steps of 2 cm."""
     closed = np.concatenate([loop, loop[:1]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
@@ -140,13 +153,13 @@ def _blur_loop(loop: Float64Array, sigma_m: float) -> Float64Array:
     return np.asarray(gaussian_filter1d(loop, sigma_m / 0.02, axis=0, mode="wrap"))
 
 
-def _along(loop: Float64Array, share: Float64Array) -> Float64Array:
+def along_loop(loop: Float64Array, share: Float64Array) -> Float64Array:
     closed = np.concatenate([loop, loop[:1]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     return np.column_stack([np.interp(share * length[-1], length, closed[:, k]) for k in range(2)])
 
 
-def _smooth(at: Float64Array, values: Float64Array, time: Float64Array) -> Float64Array:
+def smooth_through(at: Float64Array, values: Float64Array, time: Float64Array) -> Float64Array:
     """A monotone cubic through (at, values); constant after the last one."""
     from scipy.interpolate import PchipInterpolator
 
@@ -164,7 +177,7 @@ def _wobble(rng: np.random.Generator, n_frames: int) -> Float64Array:
     return total
 
 
-def _poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array, roll: Float64Array) -> Float64Array:
+def camera_poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array, roll: Float64Array) -> Float64Array:
     y, p, r = np.deg2rad(yaw), np.deg2rad(pitch), np.deg2rad(roll)
     forward = np.stack([np.cos(p) * np.cos(y), np.cos(p) * np.sin(y), np.sin(p)], axis=1)
     right = np.stack([np.sin(y), -np.cos(y), np.zeros_like(y)], axis=1)
@@ -178,9 +191,9 @@ def _poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array, roll:
 
 def _choose_views(mesh: SceneMesh, stations: Float64Array, n_structure: int) -> tuple[Float64Array, Float64Array]:
     """Yaw and pitch (degrees, yaw unwrapped) at each station, chosen to show every object repeatedly and well."""
-    directions, weight = _sphere()
+    directions, weight = sphere_directions()
     candidates = np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in PITCHES])
-    inside = _inside_view(candidates, directions)
+    inside = inside_view(candidates, directions)
     shares, near = _visible_shares(mesh, stations, directions, weight, inside, n_structure)
     n_views = len(stations)
     picked = np.full(n_views, -1)
@@ -198,7 +211,7 @@ def _choose_views(mesh: SceneMesh, stations: Float64Array, n_structure: int) -> 
     return yaw, candidates[picked, 1]
 
 
-def _sphere() -> tuple[Float64Array, Float64Array]:
+def sphere_directions() -> tuple[Float64Array, Float64Array]:
     """Unit directions (N, 3) all around and the solid angle of each."""
     turn = (np.arange(96) + 0.5) * 2 * np.pi / 96
     rise = np.deg2rad(np.linspace(-80, 50, 44))
@@ -207,8 +220,8 @@ def _sphere() -> tuple[Float64Array, Float64Array]:
     return np.stack([np.cos(r) * np.cos(t), np.cos(r) * np.sin(t), np.sin(r)], axis=1), weight
 
 
-def _inside_view(candidates: Float64Array, directions: Float64Array) -> Float64Array:
-    poses = _poses(np.zeros((len(candidates), 3)), candidates[:, 0], candidates[:, 1], np.zeros(len(candidates)))
+def inside_view(candidates: Float64Array, directions: Float64Array) -> Float64Array:
+    poses = camera_poses(np.zeros((len(candidates), 3)), candidates[:, 0], candidates[:, 1], np.zeros(len(candidates)))
     local = np.einsum("nd,cdk->cnk", directions, poses[:, :3, :3])
     ahead = local[..., 2] > 0.05
     z = np.where(ahead, local[..., 2], 1.0)

@@ -129,18 +129,16 @@ def _relations(objects: tuple[SceneObject, ...]) -> tuple[Relation, ...]:
 MATERIAL = "material"
 
 
-def attribute_of_object(objects: Sequence[SceneObject], variant: str, table: Path) -> Int32Array:
-    """The attribute (n + 1,) of every object in an aspect, by object id; 0 for none and for id 0.
-
-    ``table``: a TOML file with the classes, or materials, of each attribute by aspect.
-    """
+def attribute_of_object(objects: Sequence[SceneObject], variant: str) -> Int32Array:
+    """The attribute (n + 1,) of every object in an aspect, by object id; 0 for none and for id 0."""
     aspect = variant.partition("-")[2]
-    ids = {word: attribute_id(variant, words) for word, words in _words_of(table, aspect).items()}
+    ids = {word: attribute_id(variant, words) for word, words in _words_of(aspect).items()}
     words = [known.material if aspect == MATERIAL else known.class_name for known in objects]
     return np.array([0, *(ids.get(word) or 0 for word in words)], np.int32)
 
 
 @cache
-def _words_of(table: Path, aspect: str) -> Mapping[str, str]:
+def _words_of(aspect: str) -> Mapping[str, str]:
     """The words of each class, or material, for an aspect."""
-    return {name: words for words, names in parse_toml(file_text(table))[aspect].items() for name in names}
+    table = parse_toml(file_text(Path(__file__).with_name("attributes.toml")))[aspect]
+    return {name: words for words, names in table.items() for name in names}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import json_text, make_folder, write_json, write_text
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
@@ -19,13 +21,14 @@ from su3d_bench.formats import images
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 
 if TYPE_CHECKING:
+    from su3d_bench.datasets.procedural.dataset import GeneratedScenes
     from su3d_bench.datasets.procedural.scan import SceneScan
     from su3d_bench.datasets.procedural.truth import SceneObject
-    from su3d_bench.datasets.rooms.dataset import Rooms
 
 LAYOUT_VERSION = 1  # increase it when the written bytes of a scene change
 DEPTH_SCALE = 6553.5  # NICE-SLAM's render: 65535 is 10 m
 RENDER_FOLDER, ORIGINAL_FOLDER = "Replica", "replica_v1"
+NO_CLASS = -1  # as in the release
 STAGED_ORIGINAL, STAGED_MESH = ".original", ".mesh.ply"
 
 
@@ -45,7 +48,7 @@ class ReplicaLayout(Layout):
         truth = (mesh, original / MESH_NAME, original / INFO_NAME)
         return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
 
-    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: GeneratedScenes, scene: str, out: Path) -> None:
         make_folder(out / ORIGINAL_FOLDER)
         height, width = dataset.frames(scene, 1)[0].depth_m.shape
         k = dataset.intrinsics
@@ -60,7 +63,7 @@ class ReplicaLayout(Layout):
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
         return images.jpeg_bytes(frame.rgb), images.png_bytes(images.depth_in_units(frame.depth_m, DEPTH_SCALE))
 
-    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
         """Trajectory, annotated mesh, table of objects and plain mesh."""
         scan = dataset.scan(target.scene)
         staged = target.partial / STAGED_ORIGINAL
@@ -104,7 +107,9 @@ def _plain_mesh(scan: SceneScan) -> list[PlyElement]:
 def _info(objects: Sequence[SceneObject]) -> dict[str, Any]:
     """The content of ``info_semantic.json``."""
     labels = replica_label_set()
-    class_of_id = {known.id: known.class_id for known in objects}
+    ids = dict(zip(labels.names, labels.ids, strict=True))
+    names = {known.id: _class_name(known.class_name) for known in objects}
+    class_of_id = {object_id: ids.get(name, NO_CLASS) for object_id, name in names.items()}
     return {
         "classes": [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)],
         "gravity_center": [0.0, 0.0, 0.0],
@@ -112,8 +117,8 @@ def _info(objects: Sequence[SceneObject]) -> dict[str, Any]:
         "id_to_label": [class_of_id.get(object_id, -1) for object_id in range(max(class_of_id, default=-1) + 1)],
         "objects": [
             {
-                "class_id": known.class_id,
-                "class_name": known.class_name,
+                "class_id": class_of_id[known.id],
+                "class_name": names[known.id],
                 "id": known.id,
                 "oriented_bbox": _oriented_box(
                     np.array(known.box_min, np.float64), np.array(known.box_max, np.float64)
@@ -122,6 +127,16 @@ def _info(objects: Sequence[SceneObject]) -> dict[str, Any]:
             for known in objects
         ],
     }
+
+
+@cache
+def _class_names() -> Mapping[str, str]:
+    return dict(parse_toml(file_text(Path(__file__).with_name("made_classes.toml")))["classes"])
+
+
+def _class_name(name: str) -> str:
+    """Replica's class for a class of generated scenes; the name itself if it is one, or if there is none."""
+    return _class_names().get(name, name)
 
 
 def _oriented_box(low: Float64Array, high: Float64Array) -> dict[str, Any]:

@@ -98,7 +98,6 @@ class Rooms(GeneratedScenes):
     options: RoomOptions
     sources = ("datasets/rooms", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
-    attributes = Path(__file__).with_name("attributes.toml")
     label_set = staticmethod(label_set)
 
     def check_name(self, scene: str) -> None:

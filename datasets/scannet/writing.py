@@ -32,9 +32,9 @@ TABLE_COLUMNS = (
 )  # fmt: skip
 
 if TYPE_CHECKING:
+    from su3d_bench.datasets.procedural.dataset import GeneratedScenes
     from su3d_bench.datasets.procedural.scan import SceneScan
     from su3d_bench.datasets.procedural.truth import SceneObject
-    from su3d_bench.datasets.rooms.dataset import Rooms
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def _facts() -> Mapping[str, Any]:
 
 @cache
 def categories() -> Mapping[str, Category]:
-    """The ScanNet category of each room class."""
+    """The ScanNet category of each class of generated scenes."""
     return {name: Category(*row) for name, row in _facts()["classes"].items()}
 
 
@@ -68,7 +68,7 @@ def scan_name(room: str) -> str:
     """The scan name of a room: kitchen7 is scene9207_00; raises ``DataError`` for a room beyond 99."""
     match = ROOM_NAME.fullmatch(room)
     if match is None or match[1] not in _facts()["kinds"]:
-        raise DataError(f"rooms/{room}: has no scan name; choose a room from 0 to 99 of its kind")
+        raise DataError(f"{room}: has no scan name; choose a scene from 0 to 99 of its kind")
     return f"scene9{_facts()['kinds'][match[1]][0]}{int(match[2]):02d}_00"
 
 
@@ -97,7 +97,7 @@ def annotation_id(known: SceneObject) -> int:
     return known.id - 1
 
 
-def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> list[SceneObject]:
+def write_scan_truth(dataset: GeneratedScenes, scene: str, scan: str, folder: Path) -> list[SceneObject]:
     """Write the files of ``scene`` as ``scan`` into ``folder``; return the annotated objects."""
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
@@ -173,7 +173,7 @@ def _vertices(scan: SceneScan, colours: UInt8Array, more: dict[str, Column]) -> 
     return PlyElement("vertex", len(scan.vertices), columns | more)
 
 
-def _facts_of(dataset: Rooms, scene: str) -> str:
+def _facts_of(dataset: GeneratedScenes, scene: str) -> str:
     """The content of ``<scan>.txt``, keys in the order of the release."""
     frames = dataset.frames(scene, 1)
     height, width = frames[0].depth_m.shape
@@ -200,7 +200,7 @@ PIECES = ".frames"
 
 
 class ScannetLayout(Layout):
-    """Rooms as scans ``scene9000_00`` and so on, each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
+    """Scenes as scans ``scene9000_00`` and so on, each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
 
     It is joined from records that were written separately. Time stamps are microseconds from the first frame.
     """
@@ -221,10 +221,10 @@ class ScannetLayout(Layout):
         names = *truth.truth_names(scan), truth.meta_name(scan)
         return SceneTarget(scene, key, folder, f"{scan}.sens", tuple(folder / name for name in names))
 
-    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: GeneratedScenes, scene: str, out: Path) -> None:
         write_shared_text(out / truth.TABLE_NAME, label_table_text(), "differs from the label table of the rooms")
 
-    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
         write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
 
     def frame_names(self, index: int) -> Sequence[str]:
@@ -235,7 +235,7 @@ class ScannetLayout(Layout):
         depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
         return (sens.SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
 
-    def join(self, dataset: Rooms, target: SceneTarget) -> None:
+    def join(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
         if not target.has_frames:
             n_frames = len(dataset.frames(target.scene, 1))
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]

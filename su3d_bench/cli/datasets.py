@@ -37,7 +37,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--stride N", "use every Nth frame (default: 48 frames in total)", type=count)
     parser.shared("--set")
     parser = add_verb(actions, "make", call_make, resumes=True)
-    parser.option("dataset", "dataset to generate: rooms")
+    parser.option("dataset", "dataset to generate: homes or rooms")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'DATASET/*')")
     parser.option(
         "--layout",

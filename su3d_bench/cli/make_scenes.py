@@ -74,7 +74,7 @@ def make(arguments: argparse.Namespace) -> None:
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:
     dataset_class = registry.load("dataset", name)
     if not all(hasattr(dataset_class, wanted) for wanted in LAYOUT_PARAMETERS):
-        raise ConfigError(f"datasets make {name}: scenes of this dataset cannot be generated; known: rooms")
+        raise ConfigError(f"datasets make {name}: scenes of this dataset cannot be generated; known: homes, rooms")
     default_name = str(dataset_class.name)
     # A setting may have the name of the dataset as prefix, as in `run --set`.
     texts = [text if text.partition("=")[0].count(".") else f"{default_name}.{text}" for text in assignments]

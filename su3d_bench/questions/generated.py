@@ -372,7 +372,7 @@ def _often_with(name: str | None, rooms: Rooms) -> list[str]:
 
 
 @cache
-def counted_rooms() -> tuple[tuple[str, ...], ...]:
-    """The class names in each of the built-in rooms, for the popular and adversarial samplings."""
-    table = parse_toml(file_text(Path(__file__).with_name("rooms.toml")))
-    return tuple(tuple(names) for names in table["rooms"].values())
+def counted_scenes(dataset: str) -> tuple[tuple[str, ...], ...]:
+    """The class names in each of 48 rooms or homes, for the popular and adversarial samplings."""
+    table = parse_toml(file_text(Path(__file__).with_name(f"{dataset}.toml")))
+    return tuple(tuple(names) for names in table[dataset].values())

@@ -19,7 +19,7 @@ from su3d_bench.metrics.questions.score import AnnotationTruth, PresenceTruth, R
 from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.appearance import Sight, sights
 from su3d_bench.questions.chains import chain_truth
-from su3d_bench.questions.generated import counted_rooms, generate_questions, presence_questions
+from su3d_bench.questions.generated import counted_scenes, generate_questions, presence_questions
 from su3d_bench.questions.generator import accuracy_by_name, chosen, generate
 from su3d_bench.questions.model import Question, new_question
 from su3d_bench.questions.refining import voted_names
@@ -71,9 +71,10 @@ def question_truth(
     if rules.kind == "object-chains":
         return chain_truth(f"{dataset.name}/{scene}", truth, objects, rules.per_kind)
     if rules.presence is not None:
-        rooms = counted_rooms()
-        asked = presence_questions(f"{dataset.name}/{scene}", truth, objects, rules.per_kind or len(objects), rooms)
-        return PresenceTruth(truth, asked, f"popular and adversarial by the contents of {len(rooms)} built-in rooms")
+        over = rules.presence.counted_over
+        counted = counted_scenes(over)
+        asked = presence_questions(f"{dataset.name}/{scene}", truth, objects, rules.per_kind or len(objects), counted)
+        return PresenceTruth(truth, asked, f"popular and adversarial by the contents of {len(counted)} built-in {over}")
     if rules.kind == "reasoning":
         return _reasoning_truth(rules, truth, objects, refine or voted_names, solver)
     if rules.questions == "dataset":

@@ -101,7 +101,7 @@ def test_one_and_two_workers_generate_identical_files(tmp_path: Path) -> None:
         ),
         (
             ["datasets", "make", "replica"],
-            "datasets make replica: scenes of this dataset cannot be generated; known: rooms",
+            "datasets make replica: scenes of this dataset cannot be generated; known: homes, rooms",
         ),
         (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
         (["datasets", "make", "rooms", "--scenes", "replica/*"], "no scene 'replica/*'; expected 'rooms/...'"),

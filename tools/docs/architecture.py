@@ -21,6 +21,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
     "core": "shared types, interfaces, registry, settings, errors, atomic files, locks, devices",
+    "sensors": "errors of depth cameras, colour cameras and poses",
     "numerics": "statistics, clustering, spatial relations, loading Open3D",
     "store": "run folders with records and predictions; the cache",
     "formats": "readers of plain data: images, PLY, HDF5, npz, torch archives, pickles, CSV",

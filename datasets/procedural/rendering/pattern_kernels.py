@@ -9,36 +9,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from su3d_bench.core.compiled import njit
+from su3d_bench.datasets.procedural.rendering.home_patterns import home_colour
+from su3d_bench.datasets.procedural.rendering.noise_kernels import hash01, noise
 
 inlined: Any = njit(cache=True, inline="never")
-
-
-@inlined
-def _hash(ix, iy, iz):  # type: ignore[no-untyped-def]
-    """A pseudo-random number in 0..1 for an integer cell."""
-    h = np.uint32(ix * 374761393 + iy * 668265263 + iz * 2147483647 + 1274126177)
-    h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(1274126177))
-    h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(2246822519))
-    return np.float32(np.uint32(h ^ (h >> np.uint32(15)))) * np.float32(2.3283064e-10)
-
-
-@inlined
-def _noise(x, y, z):  # type: ignore[no-untyped-def]
-    """Smooth value noise in 0..1."""
-    fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
-    ix, iy, iz = int(fx), int(fy), int(fz)
-    u, v, w = x - fx, y - fy, z - fz
-    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
-    low = (_hash(ix, iy, iz) * (1 - u) + _hash(ix + 1, iy, iz) * u) * (1 - v) + (
-        _hash(ix, iy + 1, iz) * (1 - u) + _hash(ix + 1, iy + 1, iz) * u
-    ) * v
-    high = (_hash(ix, iy, iz + 1) * (1 - u) + _hash(ix + 1, iy, iz + 1) * u) * (1 - v) + (
-        _hash(ix, iy + 1, iz + 1) * (1 - u) + _hash(ix + 1, iy + 1, iz + 1) * u
-    ) * v
-    return low * (1 - w) + high * w
 
 
 @inlined
@@ -47,10 +22,10 @@ def _wood(x, y, z, scale, axis, seed):  # type: ignore[no-untyped-def]
         x, y = y, x
     elif axis == 2:
         x, z = z, x
-    wander = 3.6 * _noise(x * 1.9 + seed, y * 7.0, z * 7.0)
+    wander = 3.6 * noise(x * 1.9 + seed, y * 7.0, z * 7.0)
     rings = (y + z * 1.3) / (2.2 * scale) + wander
     grain = 0.5 + 0.5 * math.sin(6.2832 * rings)
-    fibre = _noise(x * 9.0 + seed, y * 170.0, z * 170.0)
+    fibre = noise(x * 9.0 + seed, y * 170.0, z * 170.0)
     return 0.42 * grain * grain + 0.5 * fibre
 
 
@@ -82,18 +57,18 @@ def _tiles(u, v, scale, seed):  # type: ignore[no-untyped-def]
     edge = 0.0045 / scale
     if min(a, b) < edge or max(a, b) > 1 - edge:
         return 1.0
-    return 0.3 * _hash(int(ia), int(ib), int(seed))
+    return 0.3 * hash01(int(ia), int(ib), int(seed))
 
 
 @inlined
 def _planks(u, v, scale, seed, x, y, z):  # type: ignore[no-untyped-def]
     row = math.floor(v / 0.13)
-    offset = _hash(int(row), 3, int(seed))
+    offset = hash01(int(row), 3, int(seed))
     piece = math.floor(u / 1.1 + offset)
     a, b = u / 1.1 + offset - piece, v / 0.13 - row
     if b < 0.022 or a < 0.003:
         return 1.15
-    tint = _hash(int(row), int(piece), int(seed))
+    tint = hash01(int(row), int(piece), int(seed))
     return 0.55 * tint + 0.45 * _wood(x, y, z, scale, 0, seed + 17.0 * tint)
 
 
@@ -126,18 +101,18 @@ def _picture(u, v, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def
     style = int(seed) % 5
     k = seed * 0.37
     if style == 0:  # hills under a sky with a sun
-        d2 = (u - 0.3 - 0.4 * _hash(int(seed), 1, 1)) ** 2 + (v - 0.78) ** 2
+        d2 = (u - 0.3 - 0.4 * hash01(int(seed), 1, 1)) ** 2 + (v - 0.78) ** 2
         if v > 0.45 + 0.1 * math.sin(5 * u + k) + 0.05 * math.sin(13 * u + k):
             if d2 < 0.008:
                 return 0.95, 0.8, 0.35
             return 0.35 + 0.3 * v, 0.5 + 0.25 * v, 0.75
         if v > 0.28 + 0.08 * math.sin(4 * u + 2 * k):
             return 0.1 + 0.5 * ar, 0.2 + 0.5 * ag, 0.1 + 0.4 * ab
-        n = 0.7 + 0.5 * _noise(u * 18, v * 18, k)
+        n = 0.7 + 0.5 * noise(u * 18, v * 18, k)
         return 0.12 * n, 0.3 * n, 0.08 * n
     if style == 1:  # fields of colour
         iu, iv = int(u * 3.2 + 0.3 * math.sin(k)), int(v * 3.0 + 0.3 * math.cos(k))
-        h = _hash(iu, iv, int(seed))
+        h = hash01(iu, iv, int(seed))
         if h < 0.25:
             return ar, ag, ab
         if h < 0.5:
@@ -159,7 +134,7 @@ def _picture(u, v, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def
             return 0.08, 0.04, 0.02
         if ((u - 0.5) / 0.42) ** 2 + ((v - 0.02) / 0.38) ** 2 < 1:
             return ar, ag, ab
-        n = 0.8 + 0.3 * _noise(u * 6, v * 6, k)
+        n = 0.8 + 0.3 * noise(u * 6, v * 6, k)
         return br * n, bg * n, bb * n
     if style == 3:  # circles
         r = math.sqrt((u - 0.5) ** 2 + (v - 0.5) ** 2) * 9.0 + 0.4 * math.sin(k)
@@ -170,8 +145,8 @@ def _picture(u, v, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def
             return br, bg, bb
         return 0.85, 0.83, 0.78
     for i in range(7):  # flowers
-        cu = 0.15 + 0.7 * _hash(i, 2, int(seed))
-        cv = 0.45 + 0.4 * _hash(i, 5, int(seed))
+        cu = 0.15 + 0.7 * hash01(i, 2, int(seed))
+        cv = 0.45 + 0.4 * hash01(i, 5, int(seed))
         d = math.sqrt((u - cu) ** 2 + (v - cv) ** 2)
         petals = 0.085 + 0.03 * math.cos(5 * math.atan2(v - cv, u - cu))
         if d < 0.03:
@@ -182,7 +157,7 @@ def _picture(u, v, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-untyped-def
             return br, bg, bb
         if abs(u - (0.5 + (cu - 0.5) * max(0.0, v / cv))) < 0.008 and v < cv:
             return 0.08, 0.28, 0.08
-    n = 0.85 + 0.2 * _noise(u * 8, v * 8, k)
+    n = 0.85 + 0.2 * noise(u * 8, v * 8, k)
     return 0.8 * n, 0.78 * n, 0.66 * n
 
 
@@ -197,14 +172,14 @@ def _screen(u, v, lively, ar, ag, ab, br, bg, bb, seed):  # type: ignore[no-unty
             return 0.7, 0.7, 0.75
         return 0.03, 0.04, 0.07
     for i in range(2):
-        u0 = 0.08 + 0.42 * i + 0.06 * _hash(i, 7, int(seed))
-        v0 = 0.16 + 0.14 * _hash(i, 8, int(seed))
+        u0 = 0.08 + 0.42 * i + 0.06 * hash01(i, 7, int(seed))
+        v0 = 0.16 + 0.14 * hash01(i, 8, int(seed))
         if u0 < u < u0 + 0.4 and v0 < v < v0 + 0.6:
             if v > v0 + 0.53:
                 return 0.12, 0.2, 0.36
             line = (v - v0) * 26.0
             row = int(line)
-            if line - row < 0.4 and 0.03 < u - u0 < 0.1 + 0.27 * _hash(row, i, int(seed)):
+            if line - row < 0.4 and 0.03 < u - u0 < 0.1 + 0.27 * hash01(row, i, int(seed)):
                 return 0.2, 0.22, 0.28
             return br, bg, bb
     g = 0.7 + 0.5 * v
@@ -256,31 +231,33 @@ def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
     if style == 3 and z < 0.95:
         s = x / 0.45 - math.floor(x / 0.45)
         return 0.55 if s < 0.03 or z > 0.91 else 0.3
-    return 0.12 * _noise(x * 3.0 + seed, z * 3.0, seed)
+    return 0.12 * noise(x * 3.0 + seed, z * 3.0, seed)
 
 
 @inlined
 def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore[no-untyped-def]
     """Red, green and blue (0..1, linear) at a point; ``u`` and ``v`` are its position in the plane of the face."""
+    if kind > 24:
+        return home_colour(kind, x, y, z, u, v, row)
     ar, ag, ab, br, bg, bb = row[1], row[2], row[3], row[4], row[5], row[6]
     tone = 1.0
     if kind == 0:
-        share = 0.5 * _noise(x * 25.0 + seed, y * 25.0, z * 25.0)
+        share = 0.5 * noise(x * 25.0 + seed, y * 25.0, z * 25.0)
     elif kind == 1:
         share = _wood(x, y, z, scale, axis, seed)
     elif kind == 2 or (5 <= kind <= 7) or kind == 22:
         share = 0.0 if kind == 2 else _pattern(kind, u, v, scale, axis, seed)
         thread = 0.5 + 0.25 * (math.sin(u * 1300.0) + math.sin(v * 1300.0))
-        tone = 0.88 + 0.1 * thread + 0.1 * (_noise(x * 40.0, y * 40.0, z * 40.0) - 0.5)
+        tone = 0.88 + 0.1 * thread + 0.1 * (noise(x * 40.0, y * 40.0, z * 40.0) - 0.5)
     elif kind == 3:
         share = _tiles(u, v, scale, seed)
     elif kind == 4:
-        n = _noise(x / scale, y / scale, z / scale)
-        share = 1.0 if n > 0.68 else 0.35 * _noise(x * 30.0, y * 30.0, z * 30.0)
+        n = noise(x / scale, y / scale, z / scale)
+        share = 1.0 if n > 0.68 else 0.35 * noise(x * 30.0, y * 30.0, z * 30.0)
         if n < 0.25:
             tone = 1.3
     elif kind == 8:
-        share = 0.6 * _noise(x * 25.0 + seed, y * 25.0, z * 500.0)
+        share = 0.6 * noise(x * 25.0 + seed, y * 25.0, z * 500.0)
     elif kind == 9 or kind == 11 or kind == 16:
         fu, fv = (u - row[11]) / (row[12] - row[11]), (v - row[13]) / (row[14] - row[13])
         if kind == 9:
@@ -289,9 +266,9 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore
             return _screen(fu, fv, scale, ar, ag, ab, br, bg, bb, seed)
         hill = 0.3 + 0.06 * math.sin(7 * fu + seed) + 0.03 * math.sin(23 * fu + seed)
         if fv < hill:
-            n = 0.75 + 0.4 * _noise(fu * 40.0, fv * 40.0, seed)
+            n = 0.75 + 0.4 * noise(fu * 40.0, fv * 40.0, seed)
             return 0.16 * n, 0.34 * n, 0.13 * n
-        share = min(1.0, max(0.0, 1.6 * _noise(fu * 4.0 + seed, fv * 7.0, seed) - 0.5) + 0.5 * (1 - fv))
+        share = min(1.0, max(0.0, 1.6 * noise(fu * 4.0 + seed, fv * 7.0, seed) - 0.5) + 0.5 * (1 - fv))
     elif kind == 10:
         share = _keys(u, v, scale)
     elif kind == 12:
@@ -300,23 +277,23 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore
         a, b = math.floor(u / scale), math.floor(v / scale)
         over = (int(a) + int(b)) % 2 == 0
         f = (v / scale - b) if over else (u / scale - a)
-        share = 0.85 * (2 * f - 1) ** 2 + 0.15 * _noise(x * 200.0, y * 200.0, z * 200.0)
+        share = 0.85 * (2 * f - 1) ** 2 + 0.15 * noise(x * 200.0, y * 200.0, z * 200.0)
     elif kind == 14:
-        share = 0.7 * _noise(x * 60.0, y * 60.0, z * 60.0) * _noise(x * 9.0, y * 9.0, z * 9.0)
+        share = 0.7 * noise(x * 60.0, y * 60.0, z * 60.0) * noise(x * 9.0, y * 9.0, z * 9.0)
     elif kind == 15:
-        share = _noise(x / scale, y / scale, z / scale) * 0.7 + 0.3 * _noise(x * 300.0, y * 300.0, z * 300.0)
+        share = noise(x / scale, y / scale, z / scale) * 0.7 + 0.3 * noise(x * 300.0, y * 300.0, z * 300.0)
     elif kind == 17:
         cu, cv = 0.5 * (row[11] + row[12]), 0.5 * (row[13] + row[14])
         share = _clock((u - cu) / (0.5 * (row[12] - row[11])), (v - cv) / (0.5 * (row[14] - row[13])))
     elif kind == 18:
         share = _rug((x - row[11]) / (row[12] - row[11]), (y - row[13]) / (row[14] - row[13]), scale, seed)
-        tone = 0.8 + 0.35 * _noise(x * 180.0, y * 180.0, 1.5)
+        tone = 0.8 + 0.35 * noise(x * 180.0, y * 180.0, 1.5)
     elif kind == 19:
-        w = _noise(x * 4.0 + seed, y * 4.0, z * 4.0) * 5.0 + (x + y + z) * 6.0
+        w = noise(x * 4.0 + seed, y * 4.0, z * 4.0) * 5.0 + (x + y + z) * 6.0
         share = max(0.0, 1.0 - 5.0 * abs(w - math.floor(w) - 0.5)) * 0.8
     elif kind == 20:
         share = 0.5 + 0.5 * math.sin(u * 600.0)
-        tone = 0.94 + 0.12 * _noise(x * 12.0, y * 12.0, z * 12.0)
+        tone = 0.94 + 0.12 * noise(x * 12.0, y * 12.0, z * 12.0)
     elif kind == 21:
         s = (z if axis == 0 else x) / scale + 0.1 * (seed % 3)
         s -= math.floor(s)
@@ -328,5 +305,5 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore
         share = _wall(x, z, scale, axis, seed)
         if share < 0:
             return 0.72, 0.71, 0.68
-        tone = 0.98 + 0.04 * _noise(x * 60.0, y * 60.0, z * 60.0)
+        tone = 0.98 + 0.04 * noise(x * 60.0, y * 60.0, z * 60.0)
     return (ar + (br - ar) * share) * tone, (ag + (bg - ag) * share) * tone, (ab + (bb - ab) * share) * tone

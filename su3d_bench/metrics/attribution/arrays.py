@@ -158,7 +158,7 @@ def _values_after(pool: Pool[InstanceCounts], corrected: Sequence[Mapping[int, I
     for of_classes in corrected:
         for index, counts in of_classes.items():
             if index not in others:
-                others[index] = [instance_ap.only(one, index) for one in pool.others]
+                others[index] = [instance_ap.only(one, [index]) for one in pool.others]
             alone = replace(counts, class_index=np.zeros_like(counts.class_index))
             changed.append(InstanceCounts.joined([alone, *others[index]]))
     curves = iter(instance_ap.combine_each(changed, thresholds) if changed else [])

@@ -301,14 +301,15 @@ def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
     return InstanceCounts(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def only(counts: InstanceCounts, index: int) -> InstanceCounts:
-    """The counts of one class."""
-    rows = np.flatnonzero(counts.class_index == index)
+def only(counts: InstanceCounts, indices: Sequence[int]) -> InstanceCounts:
+    """The counts of some classes, in increasing order."""
+    rows = np.flatnonzero(np.isin(counts.class_index, indices))
     own = {
-        name: getattr(counts, name)[rows if names == (ROWS,) else [index]]
+        name: getattr(counts, name)[rows if names == (ROWS,) else list(indices)]
         for name, (_, names) in InstanceCounts.arrays().items()
     }
-    return InstanceCounts(**own | {"class_index": np.zeros(len(rows), np.int32)})
+    position = np.searchsorted(indices, counts.class_index[rows]).astype(np.int32)
+    return InstanceCounts(**own | {"class_index": position})
 
 
 def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> InstanceAP:

@@ -45,16 +45,25 @@ class CurveMetric(Metric[InstanceCounts]):
         small = np.flatnonzero((n_truth == 0) & (n_small_truth > 0))
         names = ", ".join(f"'{self.rules.curve_names[index]}'" for index in small)
         warning = f"not scored, because no scene has an instance of {self.rules.min_region_size} points: {names}"
-        return Pooled(_ap_values(curve), classes, groups, (warning,) if names else ())
+        return Pooled(self.combine(counts), classes, groups, (warning,) if names else ())
 
     def combine(self, counts: Sequence[InstanceCounts]) -> Values:
-        return _ap_values(instance_ap.combine(counts, self.rules.thresholds))
+        return self.combine_each([InstanceCounts.joined(counts)])[0]
 
     def combine_each(self, counts: Sequence[InstanceCounts]) -> list[Values]:
-        return [_ap_values(curve) for curve in instance_ap.combine_each(counts, self.rules.thresholds)]
+        rows = [_ap_values(curve) for curve in instance_ap.combine_each(counts, self.rules.thresholds)]
+        for name, (value, of_group) in self.rules.group_headline.items():
+            own = [instance_ap.only(of_scene, of_group) for of_scene in counts]
+            for row, curve in zip(rows, instance_ap.combine_each(own, self.rules.thresholds), strict=True):
+                row[name] = _ap_values(curve)[value]
+        return rows
 
     def resampled(self, counts: Sequence[InstanceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        return resampled_ap(counts, weights, self.rules.thresholds)
+        values = dict(resampled_ap(counts, weights, self.rules.thresholds))
+        for name, (value, of_group) in self.rules.group_headline.items():
+            own = [instance_ap.only(of_scene, of_group) for of_scene in counts]
+            values[name] = resampled_ap(own, weights, self.rules.thresholds)[value]
+        return values
 
     def resampled_classes(
         self, counts: Sequence[InstanceCounts], weights: Int64Array
@@ -63,7 +72,7 @@ class CurveMetric(Metric[InstanceCounts]):
         answer = {}
         for index, name in enumerate(self.rules.curve_names):
             if any(of_scene.n_truth[index] for of_scene in counts):
-                values = self.resampled([instance_ap.only(of_scene, index) for of_scene in counts], weights)
+                values = self.resampled([instance_ap.only(of_scene, [index]) for of_scene in counts], weights)
                 answer[name] = {column: values[column] for column in columns}
         return answer
 

@@ -21,6 +21,7 @@ class SemanticRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
         ("conceptgraphs", "scannet", "hovsg", "ovo"), ("mAcc", "mIoU", "F-mIoU")
     )
+    values_of_groups = ("mAcc", "mIoU")
     candidates = ("object-points",)
     takes_dense = True
     names_points = True
@@ -48,6 +49,7 @@ class InstanceRules(ProtocolRules):
     """Masks with a class."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
+    values_of_groups = AP_NAMES
     needs_instances = True
     confidences = ("ones", "prediction")
     allowed: ClassVar[Allowed] = {"confidence": confidences}

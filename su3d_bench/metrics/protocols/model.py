@@ -96,7 +96,7 @@ class PresenceRules(_Strict):
     canonical: Annotated[tuple[str, ...], Field(min_length=1)]
     sharpness: Annotated[float, Field(gt=0)]
     relevancy: Annotated[float, Field(gt=0, lt=1)]
-    counted_over: Literal["rooms"]
+    counted_over: Literal["rooms", "homes"]
 
 
 SECTIONS: dict[str, type[BaseModel]] = {
@@ -180,6 +180,7 @@ class ProtocolRules(_Strict):
 
     # What the kinds differ in
     values_of_metric: ClassVar[ValuesOfMetric] = {}  # names of the values of each metric
+    values_of_groups: ClassVar[tuple[str, ...]] = ()  # those that also exist for each group of classes
     candidates: ClassVar[tuple[str, ...]] = ("map-points",)
     confidences: ClassVar[tuple[str, ...]] = ()  # if there are precision-recall curves
     allowed: ClassVar[Mapping[str, tuple[object, ...]]] = {}  # for those of OWN_FIELDS that accept less than their type
@@ -275,7 +276,25 @@ class ProtocolRules(_Strict):
     @property
     def value_names(self) -> tuple[str, ...]:
         """The names of the metric's values that can be in the headline."""
-        return self.values_of_metric[self.metric]
+        of_groups = (f"{value} {group}" for value in self.values_of_groups for group in self.groups)
+        return (*self.values_of_metric[self.metric], *of_groups)
+
+    @property
+    def groups(self) -> dict[str, list[int]]:
+        """The scored classes of each group, by their positions among the scored classes."""
+        groups: dict[str, list[int]] = {}
+        for position, entry in enumerate(self.scored):
+            if entry.group:
+                groups.setdefault(entry.group, []).append(position)
+        return groups
+
+    @property
+    def group_headline(self) -> dict[str, tuple[str, list[int]]]:
+        """The headline values of a group, such as "AP novel": the value, and the positions of its classes."""
+        named = {
+            f"{value} {group}": (value, of) for value in self.values_of_groups for group, of in self.groups.items()
+        }
+        return {name: named[name] for name in self.headline if name in named}
 
     def is_ignored(self, name: str) -> bool:
         """Whether the class ``name`` is ignored, by exact name or, with the substring rule, by a part of it."""

@@ -16,10 +16,11 @@ from su3d_bench.metrics.matching import labelling, transfer
 from su3d_bench.metrics.matching import votes as neighbours
 from su3d_bench.metrics.matching.nearest import Points, are_same_points, ball_tree, kd_tree, nearest
 from su3d_bench.metrics.matching.rows import first_rows
-from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, first_row, present
 from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
+from su3d_bench.numerics.statistics import row_means
 
 GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # name of a group's value, and the class value that it averages
 
@@ -64,14 +65,30 @@ class SemanticMetric(Metric[SemanticCounts]):
             }
             for row, index in enumerate(metrics.class_index)
         }
-        return Pooled(self._values(metrics), classes, self.group_means(classes, GROUP_COLUMNS))
+        values = self._values(metrics) | first_row(self._of_groups(counts, np.ones((1, len(counts)), np.int64)))
+        return Pooled(values, classes, self.group_means(classes, GROUP_COLUMNS))
 
     def combine_each(self, counts: Sequence[SemanticCounts]) -> list[Values]:
-        return [self._values(self._metrics(of_scene, pooled=False)) for of_scene in counts]
+        rows = [self._values(self._metrics(of_scene, pooled=False)) for of_scene in counts]
+        of_groups = self._of_groups(counts, np.eye(len(counts), dtype=np.int64))
+        return [row | {name: float(each[k]) for name, each in of_groups.items()} for k, row in enumerate(rows)]
 
     def resampled(self, counts: Sequence[SemanticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         is_scored = labelling.scored_classes(self.rules) if self.rules.metric == "hovsg" else None
-        return semantic.resampled_semantic(counts, weights, self.rules.metric, is_scored)
+        values = semantic.resampled_semantic(counts, weights, self.rules.metric, is_scored)
+        return values | self._of_groups(counts, weights)
+
+    def _of_groups(self, counts: Sequence[SemanticCounts], weights: Int64Array) -> dict[str, Float64Array]:
+        """The headline values (R,) of groups: means over their classes with ground truth in the drawn scenes."""
+        wanted = self.rules.group_headline
+        classes = self.resampled_classes(counts, weights) if wanted else {}
+        values = {}
+        for name, (value, of_group) in wanted.items():
+            names = [self.rules.scored[position].name for position in of_group]
+            table = [classes[one][GROUP_COLUMNS[value]] for one in names if one in classes]
+            missing = np.full((len(weights), 1), np.nan)
+            values[name] = row_means(np.column_stack([missing, *table]))
+        return values
 
     def resampled_classes(
         self, counts: Sequence[SemanticCounts], weights: Int64Array

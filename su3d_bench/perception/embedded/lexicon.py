@@ -135,8 +135,11 @@ class NamingConfig(BaseModel):
 
 def vocabulary() -> tuple[str, ...]:
     """The class names for regions, in the order of the list file."""
-    text = files("su3d_bench.perception.embedded.weights").joinpath("vocabulary.txt").read_text(encoding="utf-8")
-    return listed_words(text)
+    return _weights_file("vocabulary.txt")
+
+
+def _weights_file(name: str) -> tuple[str, ...]:
+    return listed_words(files("su3d_bench.perception.embedded.weights").joinpath(name).read_text(encoding="utf-8"))
 
 
 def listed_words(text: str) -> tuple[str, ...]:
@@ -239,9 +242,10 @@ def class_words(class_name: str) -> tuple[str, ...]:
 @cache
 def trained_words() -> frozenset[str]:
     """All words that training captions may contain, as tokenized."""
-    names = (*vocabulary(), *SURFACES, *SYNONYMS)
+    names = frozenset(_weights_file("training_classes.txt"))
     texts = [*CLASS_TEMPLATES, *ANYTHING, *(word for name in names for word in class_words(name))]
-    texts += [*GROUPS, *AFFORDANCES, "room", *(name for name, _ in COLOURS), *MATERIALS]
+    texts += [text for table in (GROUPS, AFFORDANCES) for text, own in table.items() if not names.isdisjoint(own)]
+    texts += ["room", *(name for name, _ in COLOURS), *MATERIALS]
     for table in (ROOM_NAMES, COLOUR_WORDS, SIZE_WORDS, RELATION_WORDS):
         texts += [word for spellings in table.values() for word in spellings]
     return frozenset(word for text in texts for word in words(text))

@@ -182,7 +182,7 @@ def test_trajectory_is_smooth_and_keeps_clear(tmp_path: Path) -> None:
 
 def test_room_is_scored_by_an_aspect_and_objects_without_attribute_are_void(rooms: Rooms) -> None:
     truth = rooms.ground_truth(SCENE, "openscan-type")
-    of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type", Rooms.attributes)
+    of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type")
     assert np.array_equal(truth.semantic, of_object[truth.instance])
     assert (truth.instance > 0).all() and not truth.semantic.all() and truth.semantic.any()
     rules = load_protocol("openscan-type")

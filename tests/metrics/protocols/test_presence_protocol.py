@@ -20,7 +20,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
 from su3d_bench.metrics.questions.score import PresenceQuery, PresenceTruth
 from su3d_bench.metrics.scoring import metric_of, plain_json, score_scene
-from su3d_bench.questions.generated import absent_names, counted_rooms, drawn, presence_questions
+from su3d_bench.questions.generated import absent_names, counted_scenes, drawn, presence_questions
 from su3d_bench.questions.scene_map import is_called, is_room_surface, known_objects, plain_name
 
 RULES = load_protocol("rooms-presence")
@@ -139,7 +139,7 @@ def test_map_without_features_gives_a_reason_for_presence() -> None:
 
 def test_room_has_equally_many_present_and_absent_questions() -> None:
     objects = known_objects(TRUTH, 100)
-    asked = presence_questions("rooms/a", TRUTH, objects, 4, counted_rooms())
+    asked = presence_questions("rooms/a", TRUTH, objects, 4, counted_scenes("rooms"))
     names = {plain_name(name) for name in LABELS.names}
     for sampling in SAMPLINGS:
         mine = [thing for thing in asked if thing.sampling == sampling]
@@ -148,8 +148,8 @@ def test_room_has_equally_many_present_and_absent_questions() -> None:
         assert (len(there), len(absent), len(set(absent))) == (4, 4, 4)
         assert set(there) <= {"chair", "table", "lamp", "cushion", "book", "backpack"}
         assert set(absent) <= names - {"chair", "table", "lamp", "cushion", "book", "backpack", "wall", "floor"}
-    assert asked == presence_questions("rooms/a", TRUTH, objects, 4, counted_rooms())
-    assert asked != presence_questions("rooms/b", TRUTH, objects, 4, counted_rooms())
+    assert asked == presence_questions("rooms/a", TRUTH, objects, 4, counted_scenes("rooms"))
+    assert asked != presence_questions("rooms/b", TRUTH, objects, 4, counted_scenes("rooms"))
 
 
 def test_synonyms_of_present_objects_are_not_absent() -> None:
@@ -188,6 +188,6 @@ def test_fewer_questions_are_asked_if_no_absent_objects_remain() -> None:
 @pytest.mark.parametrize("scene", ["bedroom3", "bathroom0"])
 def test_co_occurrence_is_counted_over_the_generators_rooms(scene: str, tmp_path: Path) -> None:
     names = [plain_name(LABELS.name_of(thing.class_id)) for thing in Rooms(tmp_path).objects(scene)]
-    rooms = counted_rooms()
+    rooms = counted_scenes("rooms")
     assert tuple(dict.fromkeys(name for name in names if not is_room_surface(name))) in rooms
     assert len(rooms) == 48

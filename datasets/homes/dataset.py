@@ -1,0 +1,140 @@
+"""Procedural homes: generated on demand from a name, rendered by ray casting, fully annotated; with a sensor track."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError, nearest
+from su3d_bench.core.types import Float64Array, Frame, LabelSet
+from su3d_bench.datasets.homes.catalogue import HomeClass, catalogue, read_classes
+from su3d_bench.datasets.homes.furnish import furnish
+from su3d_bench.datasets.homes.plan import HomePlan
+from su3d_bench.datasets.homes.walk import walk_home
+from su3d_bench.datasets.procedural.dataset import (
+    FRAMES_PER_SECOND,
+    BuiltScene,
+    GeneratedScenes,
+    SceneOptions,
+    generator,
+)
+from su3d_bench.datasets.procedural.items import Placed
+from su3d_bench.datasets.procedural.rendering.light import lit_mesh
+from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
+from su3d_bench.datasets.procedural.rendering.render import Renderer
+from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
+
+N_NAMED = 24  # homes for tuning, and as many for testing
+SERIES = ("tuning", "test", "seed", "training")
+DEFAULT_SCENES = tuple(f"{series}{k}" for series in ("test", "tuning") for k in range(N_NAMED))
+
+
+class HomeOptions(SceneOptions):
+    """Image size, length of the trajectory, density of the scan; who carries the camera.
+
+    ``carrier``: ``person``, ``robot``, or ``either``: a robot in every third home.
+    """
+
+    carrier: Literal["either", "person", "robot"] = "either"
+
+
+@cache
+def label_set() -> LabelSet:
+    """The classes of the homes."""
+    rows = sorted(read_classes().items(), key=lambda item: item[1].id)
+    return LabelSet("homes", tuple(row.id for _, row in rows), tuple(name for name, _ in rows))
+
+
+def scene_name_parts(scene: str) -> tuple[str, int]:
+    """Series and number of a scene name; raises ``DataError`` if it is not a scene."""
+    match = re.fullmatch(rf"({'|'.join(SERIES)})(0|[1-9]\d{{0,5}})", scene)
+    if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
+        hint = nearest(scene, DEFAULT_SCENES) or ""
+        raise DataError(
+            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
+            f"up to 999999 such as seed7{hint}"
+        )
+    return match[1], int(match[2])
+
+
+class BuiltHome(BuiltScene):
+    """A furnished home."""
+
+    def __init__(self, scene: str, options: HomeOptions, folder: Path | None) -> None:
+        super().__init__(scene, options, folder)
+        self.series, self.number = scene_name_parts(scene)
+
+    @property
+    def classes(self) -> Mapping[str, HomeClass]:  # type: ignore[override]
+        return catalogue().classes
+
+    @cached_property
+    def plan(self) -> HomePlan:
+        return furnish(self._random("home"), catalogue(), training=self.series == "training")
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        return self.plan.kind
+
+    @property
+    def placed(self) -> list[Placed]:
+        return self.plan.placed
+
+    @property
+    def mount(self) -> dict[int, str]:
+        return self.plan.mount
+
+    def make_mesh(self) -> SceneMesh:
+        plan = self.plan
+        exposure = float(self._random("exposure").uniform(0.58, 0.72))
+        return lit_mesh(self.patches, plan.lights, plan.sun, plan.windows, exposure)
+
+    def make_renderer(self, width: int, height: int, like: Renderer | None = None) -> Renderer:
+        return SampledRenderer(self.mesh, width, height, like)
+
+    def make_trajectory(self) -> Float64Array:
+        plan, cell_m = self.plan, 0.1
+        free, origin = plan.free(cell_m)
+        carrier = self.options.carrier
+        if carrier == "either":
+            carrier = "robot" if self.number % 3 == 2 else "person"
+        return walk_home(
+            self.mesh, free, cell_m, origin, list(plan.boxes.values()), plan.n_structure, self.options.n_frames,
+            self._random("walk"), carrier,
+        )  # fmt: skip
+
+    def _random(self, what: str) -> np.random.Generator:
+        return generator(what, "homes", self.scene, self.options.seed_offset)
+
+
+class Homes(GeneratedScenes):
+    """Furnished homes, generated from their names."""
+
+    name = "homes"
+    headline_protocol = "homes-semantic"
+    label_space = "homes"
+    Options = HomeOptions
+    version = 1
+    options: HomeOptions
+    sources = ("datasets/homes", "datasets/procedural", "numerics")
+    default_scenes = DEFAULT_SCENES
+    label_set = staticmethod(label_set)
+
+    def check_name(self, scene: str) -> None:
+        scene_name_parts(scene)
+
+    def is_for_training(self, scene: str) -> bool:
+        return scene_name_parts(scene)[0] == "training"
+
+    def build(self, scene: str, folder: Path | None) -> BuiltHome:
+        return BuiltHome(scene, self.options, folder)
+
+    def frame(self, scene: str, index: int) -> Frame:
+        image = self.render(scene, index)
+        pose = self.trajectory(scene)[index]
+        return Frame(index, index / FRAMES_PER_SECOND, image.rgb, image.depth_m, pose, self.intrinsics)

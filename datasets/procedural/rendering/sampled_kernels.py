@@ -1,0 +1,170 @@
+"""Compiled shading of ``SampledRenderer``: linear light of rays, with textures filtered over the area of a pixel.
+
+Every ray is computed alone, so that results do not depend on how rays are shared among threads.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.compiled import njit
+from su3d_bench.datasets.procedural.materials import Texture
+from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
+from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
+from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, _highlight
+
+compiled: Any = njit(cache=True, nogil=True)
+inlined: Any = njit(cache=True, inline="never")
+
+SAMPLES = np.array([[-0.375, -0.125], [0.375, 0.125], [0.125, -0.375], [-0.125, 0.375]])  # rotated grid, in pixels
+ALIKE = 0.03  # two of the four samples suffice if they differ less, in linear light
+PLAIN, STAINS = int(Texture.PLAIN), int(Texture.STAINS)  # smooth at the scale of a pixel: one sample
+SMOOTH_COSINE = 0.92  # between the facets of a curved surface
+
+
+@compiled
+def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, material, is_edge):  # type: ignore[no-untyped-def]
+    """Marks the pixels of rows ``start`` to ``stop`` with a neighbour on another object, material or plane."""
+    height = t.shape[0] // width
+    for row in range(start, stop):
+        for column in range(width):
+            i = row * width + column
+            is_edge[i] = False
+            for k in range(4):
+                r, c = row + (k == 0) - (k == 1), column + (k == 2) - (k == 3)
+                if not (0 <= r < height and 0 <= c < width):
+                    continue
+                j = r * width + c
+                f, g = triangle[i], triangle[j]
+                if f == g or not (t[i] < 1e9 or t[j] < 1e9):
+                    continue
+                if not (t[i] < 1e9 and t[j] < 1e9) or instance[f] != instance[g] or material[f] != material[g]:
+                    is_edge[i] = True
+                    break
+                nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+                alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
+                off = (
+                    nx * (t[j] * rays[j, 3] - t[i] * rays[i, 3])
+                    + ny * (t[j] * rays[j, 4] - t[i] * rays[i, 4])
+                    + nz * (t[j] * rays[j, 5] - t[i] * rays[i, 5])
+                )
+                if alike < SMOOTH_COSINE or abs(off) > 0.002 * t[i] + 0.001:
+                    is_edge[i] = True
+                    break
+
+
+@compiled
+def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, vertices, triangles, normals, texture,  # type: ignore[no-untyped-def]
+               light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
+    """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
+
+    ``across`` and ``down`` are the steps of a ray's direction to the next pixels; zero for one sample of the texture. ``is_last`` makes glass and mirrors opaque.
+    """
+    pixel = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
+    for i in range(start, stop):
+        tint[i] = 0.0
+        colour[i] = 0.0
+        far = t[i]
+        if skip[i] or not far < 1e9:
+            continue
+        f = triangle[i]
+        i0, i1, i2 = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        b1, b2 = uv[i, 0], uv[i, 1]
+        b0 = 1 - b1 - b2
+        nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+        dx, dy, dz = rays[i, 3], rays[i, 4], rays[i, 5]
+        facing = nx * dx + ny * dy + nz * dz
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        row = materials[material[f]]
+        x, y, z = _between(texture, i0, i1, i2, b0, b1, b2)
+        e1x, e1y, e1z = _difference(texture, i1, i0)
+        e2x, e2y, e2z = _difference(texture, i2, i0)
+        px, py, pz = abs(e1y * e2z - e1z * e2y), abs(e1z * e2x - e1x * e2z), abs(e1x * e2y - e1y * e2x)
+        plane = 2 if pz >= px and pz >= py else (0 if px >= py else 1)
+        kind, n = int(row[0]), 1
+        foot = far * length * pixel * length / max(abs(facing), 0.1 * length)
+        gux, guy, guz, gvx, gvy, gvz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        if pixel > 0 and kind != PLAIN and not (kind == STAINS and z > 0.1 + foot):
+            n = 4
+            gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
+            gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)
+        r, g, b = 0.0, 0.0, 0.0
+        for k in range(n):
+            su, sv = (SAMPLES[k, 0], SAMPLES[k, 1]) if n > 1 else (0.0, 0.0)
+            sx, sy, sz = x + su * gux + sv * gvx, y + su * guy + sv * gvy, z + su * guz + sv * gvz
+            pu, pv = (sx, sy) if plane == 2 else ((sy, sz) if plane == 0 else (sx, sz))
+            kr, kg, kb = surface_colour(kind, sx, sy, sz, pu, pv, row, row[7], int(row[10]), row[15])
+            if k == 1 and abs(kr - r) + abs(kg - g) + abs(kb - b) < ALIKE:
+                n = 2
+            r, g, b = r + kr, g + kg, b + kb
+            if k + 1 == n:
+                break
+        r, g, b = r / n, g / n, b / n
+        if row[18] > 0:
+            large = noise3(x * 1.7, y * 1.7, z * 1.7, row[15])
+            middle = noise3(x * 8.3, y * 8.3, z * 8.3, row[15])
+            small = noise3(x * 40.0, y * 40.0, z * 40.0, row[15]) if foot < 0.02 else 0.5
+            worn = 1 + row[18] * ((0.78 + 0.44 * large) * (0.84 + 0.32 * middle) * (0.88 + 0.24 * small) - 1)
+            hue = 0.07 * row[18] * (middle + large - 1)
+            r, g, b = r * worn * (1 + hue), g * worn, b * worn * (1 - hue)
+        lr, lg, lb = _between(light, i0, i1, i2, b0, b1, b2)
+        mean = (lr + lg + lb) / 3
+        gloss, glow, mirror, clear = row[8], row[9], row[16], row[17]
+        fresnel = 0.04 + 0.96 * (1 - min(1.0, abs(facing) / length)) ** 5
+        shine = gloss * fresnel * min(1.0, 0.7 * mean)
+        spark = 0.0
+        if gloss > 0.1:
+            spark = _highlight(i, far, b0, b1, b2, i0, i1, i2, normals, rays[:, 3:], rays[i, :3], lights, gloss)
+            spark *= min(1.0, 1.3 * mean) * (0.6 + 2.0 * fresnel)
+        own = 1.0
+        if not is_last and (mirror > 0 or clear > 0):
+            share = mirror if mirror > 0 else clear * (1 - fresnel)
+            own = 1.0 - max(mirror, clear)
+            white = 0.8 if mirror > 0 else 0.5
+            tint[i, 0] = share * (white + (1 - white) * r)
+            tint[i, 1] = share * (white + (1 - white) * g)
+            tint[i, 2] = share * (white + (1 - white) * b)
+            wx, wy, wz = dx, dy, dz
+            if mirror > 0:
+                mx, my, mz = _between(normals, i0, i1, i2, b0, b1, b2)
+                into = 2 * (dx * mx + dy * my + dz * mz)
+                wx, wy, wz = dx - into * mx, dy - into * my, dz - into * mz
+            for k in range(3):
+                w = wx if k == 0 else (wy if k == 1 else wz)
+                onward[i, k] = rays[i, k] + far * rays[i, 3 + k] + 5e-4 * w / length
+                onward[i, 3 + k] = w
+        own *= 1 - gloss * fresnel
+        colour[i, 0] = own * r * (lr + glow) + shine + spark
+        colour[i, 1] = own * g * (lg + glow) + shine + spark
+        colour[i, 2] = own * b * (lb + glow) + shine + spark
+
+
+@inlined
+def _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, turn, texture):  # type: ignore[no-untyped-def]
+    """Change of the texture coordinates on a triangle's plane if a ray's direction changes by ``turn``."""
+    lean = turn[0] * nx + turn[1] * ny + turn[2] * nz
+    lean /= facing if abs(facing) > 1e-3 else 1e-3
+    wx, wy, wz = far * (turn[0] - lean * dx), far * (turn[1] - lean * dy), far * (turn[2] - lean * dz)
+    ax, ay, az = _difference(vertices, i1, i0)
+    bx, by, bz = _difference(vertices, i2, i0)
+    aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
+    wa, wb = wx * ax + wy * ay + wz * az, wx * bx + wy * by + wz * bz
+    scale = 1.0 / max(aa * bb - ab * ab, 1e-20)
+    u, v = (wa * bb - wb * ab) * scale, (wb * aa - wa * ab) * scale
+    ux, uy, uz = _difference(texture, i1, i0)
+    vx, vy, vz = _difference(texture, i2, i0)
+    return u * ux + v * vx, u * uy + v * vy, u * uz + v * vz
+
+
+CODES = 4096  # entries of the table of encoded values, by the square root of linear light up to 16
+
+
+@compiled
+def encode(start, stop, colour, gain, codes, rgb):  # type: ignore[no-untyped-def]
+    for i in range(start, stop):
+        for k in range(3):
+            value = colour[i, k] * gain
+            rgb[i, k] = codes[min(CODES - 1, int(math.sqrt(max(value, 0.0)) * (CODES / 4)))]
