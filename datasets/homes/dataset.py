@@ -11,10 +11,11 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError, nearest
-from su3d_bench.core.types import Float64Array, Frame, LabelSet
+from su3d_bench.core.types import Float64Array, Frame, LabelSet, UInt8Array
 from su3d_bench.datasets.homes.catalogue import HomeClass, catalogue, read_classes
 from su3d_bench.datasets.homes.furnish import furnish
 from su3d_bench.datasets.homes.plan import HomePlan
+from su3d_bench.datasets.homes.sensor import CameraContext, Materials, SensorSettings, drifted, metered, record
 from su3d_bench.datasets.homes.walk import walk_home
 from su3d_bench.datasets.procedural.dataset import (
     FRAMES_PER_SECOND,
@@ -28,7 +29,10 @@ from su3d_bench.datasets.procedural.rendering.light import lit_mesh
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import Renderer
 from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
+from su3d_bench.sensors.colour import mean_luminance
+from su3d_bench.sensors.poses import shutter
 
+METERED_WIDTH = 80  # of the images from which the exposure follows: a mean needs no more
 N_NAMED = 24  # homes for tuning, and as many for testing
 SERIES = ("tuning", "test", "seed", "training")
 DEFAULT_SCENES = tuple(f"{series}{k}" for series in ("test", "tuning") for k in range(N_NAMED))
@@ -56,8 +60,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
         hint = nearest(scene, DEFAULT_SCENES) or ""
         raise DataError(
-            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
-            f"up to 999999 such as seed7{hint}"
+            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or seed0 to "
+            f"seed999999{hint}"
         )
     return match[1], int(match[2])
 
@@ -116,6 +120,7 @@ class Homes(GeneratedScenes):
     """Furnished homes, generated from their names."""
 
     name = "homes"
+    cached_as = "homes"
     headline_protocol = "homes-semantic"
     label_space = "homes"
     Options = HomeOptions
@@ -124,6 +129,13 @@ class Homes(GeneratedScenes):
     sources = ("datasets/homes", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
     label_set = staticmethod(label_set)
+
+    @staticmethod
+    def model_sheet() -> tuple[UInt8Array, int, int]:
+        """A picture of every model, the number of models and of classes."""
+        from su3d_bench.datasets.homes.model_sheet import model_sheet
+
+        return model_sheet()
 
     def check_name(self, scene: str) -> None:
         scene_name_parts(scene)
@@ -138,3 +150,41 @@ class Homes(GeneratedScenes):
         image = self.render(scene, index)
         pose = self.trajectory(scene)[index]
         return Frame(index, index / FRAMES_PER_SECOND, image.rgb, image.depth_m, pose, self.intrinsics)
+
+
+class HomesSensor(Homes):
+    """The same homes as a hand-held RGB-D camera records them: noise, missing depth, blur, exposure, drifting poses.
+
+    Ground truth is that of the clean homes.
+    """
+
+    name = "homes-sensor"
+    settings = SensorSettings()
+    sources = (*Homes.sources, "sensors")
+
+    def __init__(self, root: Path, options: HomeOptions | None = None) -> None:
+        super().__init__(root, options)
+        self._drifted: dict[str, Float64Array] = {}
+
+    def frame(self, scene: str, index: int) -> Frame:
+        built, poses = self.built(scene), self.trajectory(scene)
+        if scene not in self._drifted:
+            self._drifted = {scene: drifted(poses, self.settings, self._random("drift", scene))}
+        small = built.coarser(METERED_WIDTH)
+        context = CameraContext(
+            self.intrinsics, poses[index], *shutter(poses, index, self.settings.exposure_s, FRAMES_PER_SECOND),
+            tuple(mean_luminance(small.render(poses[k]).rgb) for k in metered(index, self.settings)),
+            _materials(built.renderer, poses[index]),
+        )  # fmt: skip
+        rng = self._random("sensor", scene, index)
+        rgb, depth_m = record(built.renderer.render(poses[index]), context, self.settings, rng)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._drifted[scene][index], self.intrinsics)
+
+    def _random(self, *words: object) -> np.random.Generator:
+        return generator(self.name, self.options.seed_offset, *words)
+
+
+def _materials(renderer: Renderer, pose: Float64Array) -> Materials:
+    rows = renderer.material_rows(pose)
+    albedo = rows[..., 1:7].mean(axis=-1)
+    return Materials(albedo, rows[..., 8], clear=rows[..., 17], mirror=rows[..., 16])

@@ -40,8 +40,10 @@ class SensorSettings:
     metering_frames: int = 5  # ... 15 in all: 0.8^15 = 4 % of an older exposure remains
     min_ev: float = -2.0  # below a quarter, too many of an eight-bit image's saturated pixels would show as grey
     max_ev: float = 3.0  # gain 8, the end of libcamera's range for the IMX219
-    shot: float = 1.1e-3  # Brooks et al. 2019: the middle of 1e-4 .. 1.2e-2 on their logarithmic scale
-    read: float = 1.2e-6  # the same, log read = 2.18 log shot + 1.20
+    # In the range of Brooks et al. 2019, 1e-4 .. 1.2e-2, where middle grey is as noisy as in TUM's fr1/desk (about one
+    # level of 255 in the mean of the channels); ``read`` follows by their log read = 2.18 log shot + 1.20.
+    shot: float = 4e-4
+    read: float = 1.3e-7
     jpeg_quality: int | None = 95  # OpenCV's default, used by recorders that store colour as JPEG
     # RMS trajectory errors on TUM's fr1/desk, fr2/xyz, fr3/office and fr3/nst: BundleFusion 1.6, 1.1, 2.2, 1.2 cm;
     # ElasticFusion 2.0, 1.1, 1.7, 1.6 cm; ORB-SLAM2 1.6, 0.4, 1.0, 1.9 cm. Their mean is 1.5 cm.

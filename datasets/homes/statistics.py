@@ -20,10 +20,10 @@ def view_statistics(dataset: GeneratedScenes, scene: str, stride: int) -> dict[s
     poses = built.trajectory[::stride]
     renderer = built.coarser(min(WIDTH, dataset.options.width))
     pixels = np.arange(renderer.width * renderer.height)
-    instances = np.array([placed.id for placed in built.placed if built.mount[placed.id] != "room"])
-    n_ids = max(placed.id for placed in built.placed) + 1
-    counts = [np.bincount(renderer.depth_and_instance(pose, pixels)[1], minlength=n_ids) for pose in poses]
-    visible = np.array(counts)[:, instances] >= MIN_PIXEL_SHARE * len(pixels)
+    instances = [placed.id for placed in built.placed if built.mount[placed.id] != "room"]
+    shown = (renderer.depth_and_instance(pose, pixels)[1] for pose in poses)
+    counts = np.stack([np.bincount(ids, minlength=len(built.placed) + 1) for ids in shown])
+    visible = counts[:, instances] >= MIN_PIXEL_SHARE * len(pixels)
     translation_m, rotation_deg = motion(poses)
     return {
         "frames": len(built.trajectory),

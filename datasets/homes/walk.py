@@ -17,29 +17,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Float64Array
+from su3d_bench.datasets.procedural import trajectory
 from su3d_bench.datasets.procedural.items import Box
-from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh, caster
-from su3d_bench.datasets.procedural.trajectory import (
-    PITCHES,
-    YAWS,
-    along_loop,
-    backtrack,
-    camera_poses,
-    even_loop,
-    grid_graph,
-    inside_view,
-    largest_part,
-    low_furniture_cost,
-    smooth_through,
-    sphere_directions,
-)
-from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 
 FRAMES_PER_SECOND = 30.0
 SHORTEST_S = 40.0  # a walk with fewer frames passes through the whole home all the same, with longer steps
@@ -48,7 +34,7 @@ OPEN_M = 0.25  # stops are at least this far from the edge of the free cells, no
 MAX_STOPS = 14
 ROUNDED = 0.85  # length of a path with rounded corners over that of the same path on the grid
 KNOT_M = 0.35  # path between two chosen views: at a walking speed, about the 0.7 s of a head turn and a look
-CLEAR_M = 0.3  # from anything at the camera's height; 0.22 where a home is too narrow for that
+CLEAR_M = 0.28  # from anything at the camera's height to the middle of its cell: 0.2 m and half the diagonal of 0.1 m
 REVISIT_DEG = 60.0  # least turn between the first and the last view, which are at one place
 
 
@@ -72,13 +58,12 @@ class Carrier:
 
 
 CARRIERS = {
-    "person": Carrier((1.44, 1.66), 0.42, 60.0, 30.0, (0, 3), 2.0, PITCHES, False),
+    "person": Carrier((1.44, 1.66), 0.42, 60.0, 30.0, (0, 3), 2.0, trajectory.PITCHES, False),
     "robot": Carrier((0.5, 0.9), 0.42, 45.0, 30.0, (0, 3), 4.5, (5.0,), True),
 }
 
 
-@dataclass(frozen=True)
-class _Knots:
+class _Knots(NamedTuple):
     """Places (K,) along the path at which a view is chosen: metres from the start, whether the camera moves there,
     direction of the path in degrees, metres of height, cruising speed from there in m/s."""
 
@@ -110,15 +95,18 @@ def walk_home(
     pause = np.where(knots.moving[:-1] | knots.moving[1:], 0.2, rng.uniform(0.6, 1.4, len(knots.arc) - 1))
     at = np.concatenate([[0.0], np.cumsum(np.maximum.reduce([*steps, pause]))])
     at *= duration / at[-1]
-    time: Float64Array = np.arange(n_frames) * (duration / n_frames)
-    arc, height = smooth_through(at, knots.arc, time), smooth_through(at, knots.height, time)
-    position = np.column_stack([along_loop(path, arc / knots.arc[-1]), height])
-    turned = np.column_stack([smooth_through(at, yaw, time), smooth_through(at, pitch, time), np.zeros(n_frames)])
+    time = np.linspace(0.0, duration, n_frames, endpoint=False, dtype=np.float64)
+    values = knots.arc, knots.height, yaw, pitch, np.zeros(len(at))
+    arc, height, *turn = (trajectory.smooth_through(at, value, time) for value in values)
+    position, turned = (
+        np.column_stack([trajectory.along_loop(path, arc / knots.arc[-1]), height]),
+        np.column_stack(turn),
+    )
     if carrier == "person":
         moved, rotated = _shake(rng, time, np.gradient(arc, time) if n_frames > 1 else np.zeros(n_frames))
         position += moved * np.clip(field.clearance(position[:, :2]) / 0.045, 0, 1)[:, None]
         turned += rotated
-    return camera_poses(position, *turned.T)
+    return trajectory.camera_poses(position, *turned.T)
 
 
 def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -136,9 +124,8 @@ def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) ->
         (6.0, 12.0, 0.1, 0.1, np.ones_like(pace)),
     ):
         size = np.repeat([millimetres / 1000, degrees], 3) * np.sqrt(2 / 3)
-        for _ in range(3):
-            wave = np.sin(2 * np.pi * rng.uniform(low, high, 6) * time[:, None] + rng.uniform(0, 2 * np.pi, 6))
-            total += share * size * wave
+        for hertz, phase in zip(rng.uniform(low, high, (3, 6)), rng.uniform(0, 2 * np.pi, (3, 6)), strict=True):
+            total += share * size * np.sin(2 * np.pi * hertz * time[:, None] + phase)
     return total[:, :3], total[:, 3:]
 
 
@@ -168,16 +155,11 @@ def _clear_cells(
 ) -> BoolArray:
     """The largest part of ``free`` away from everything at the camera's height."""
     points = (np.moveaxis(np.indices(free.shape), 0, -1) + 0.5) * cell_m + origin
-    part = free
-    for margin in (CLEAR_M, 0.22):
-        near = np.zeros(free.shape, bool)
-        for box in boxes:
-            if box.high[2] > level[0] - margin and box.low[2] < level[1] + margin:
-                near |= ((points > box.low[:2] - margin) & (points < box.high[:2] + margin)).all(axis=-1)
-        part = largest_part(free & ~near)
-        if 2 * part.sum() >= free.sum():
-            break
-    return part
+    for box in boxes:
+        if box.high[2] > level[0] - CLEAR_M and box.low[2] < level[1] + CLEAR_M:
+            near = ((points > box.low[:2] - CLEAR_M) & (points < box.high[:2] + CLEAR_M)).all(axis=-1)
+            free = free & ~near
+    return trajectory.largest_part(free)
 
 
 def _round_trip(
@@ -186,50 +168,37 @@ def _round_trip(
     """A closed path (N, 2) through all parts of the home, and its stops in metres from its start."""
     from scipy.sparse.csgraph import dijkstra
 
-    points = field.points
-    clear = field.clearance(points)
-    cost = low_furniture_cost(points, boxes) ** (2 if kind.faces_path else 1) + (clear < 0.15)
-    graph, plain = (grid_graph(field.free, field.cells, weight) for weight in (cost, np.ones(len(points))))
-    open_floor = np.where(clear > min(OPEN_M, 0.9 * clear.max()), 1.0, 1e-3)
+    points, clear = field.points, field.clearance(field.points)
+    cost = trajectory.low_furniture_cost(points, boxes) ** (2 if kind.faces_path else 1) + (clear < 0.15)
+    graph, plain = (trajectory.grid_graph(field.free, field.cells, weight) for weight in (cost, np.ones(len(points))))
+    open_floor = np.where((clear > min(OPEN_M, 0.9 * clear.max())) & (cost <= 1), 1.0, 1e-3)
     chosen = [int((((points - points.mean(axis=0)) ** 2).sum(axis=1) * open_floor).argmax())]
-    nearest = np.full(len(points), np.inf)
-    metres: list[Float64Array] = []
-    before: list[NDArray[np.int32]] = []
+    found: list[tuple[Float64Array, NDArray[np.int32]]] = []  # from each chosen stop: distances, predecessors
     best, loop, first = np.inf, points[:1], [0]
     for _ in range(min(MAX_STOPS, len(points))):
-        cells, way = dijkstra(graph, directed=False, indices=chosen[-1], return_predecessors=True)
-        metres.append(cells * field.cell_m)
-        before.append(way)
-        order = _tour(np.stack(metres)[:, chosen])
-        legs = [backtrack(before[a], chosen[a], chosen[b]) for a, b in pairwise([*order, 0])]
-        way_cells = [cell for leg in legs for cell in leg]
-        steps = points[way_cells]
-        nearest = np.minimum(nearest, dijkstra(plain, directed=False, indices=chosen[-1]) * field.cell_m)
-        lasts = ROUNDED * _lengths(steps)[-1] / kind.speed + kind.stop_s * len(order)
-        aside = dijkstra(plain, directed=False, indices=way_cells or [chosen[0]], min_only=True).max() * field.cell_m
+        found.append(dijkstra(graph, directed=False, indices=chosen[-1], return_predecessors=True))
+        distance = np.stack([cells for cells, _ in found])
+        order = _tour(distance[:, chosen])
+        legs = [trajectory.backtrack(found[a][1], chosen[a], chosen[b]) for a, b in pairwise([*order, 0])]
+        way = [cell for leg in legs for cell in leg] or chosen[:1]
+        lasts = ROUNDED * trajectory.closed_loop(points[way])[1][-1] / kind.speed + kind.stop_s * len(order)
+        aside = dijkstra(plain, directed=False, indices=way, min_only=True).max() * field.cell_m
         mismatch = abs(lasts - duration) + 30.0 * max(0.0, aside - REACH_M)
         if len(order) > 1 and mismatch < best:
-            best, loop, first = mismatch, steps, [0, *np.cumsum([len(leg) for leg in legs])[:-1]]
-        chosen.append(int((nearest * open_floor).argmax()))
-    along = _lengths(loop)
-    path = even_loop(loop)
+            best, loop, first = mismatch, points[way], [0, *np.cumsum([len(leg) for leg in legs])[:-1]]
+        chosen.append(int((distance.min(axis=0) * open_floor).argmax()))
+    along, path = trajectory.closed_loop(loop)[1], trajectory.even_loop(loop)
     at_stop = np.round(along[first] / along[-1] * len(path)).astype(int)
     path = _relaxed(path, field)
-    arc = _lengths(path)
+    arc = trajectory.closed_loop(path)[1]
     return path, np.append(arc[at_stop], arc[-1])
 
 
-def _lengths(loop: Float64Array) -> Float64Array:
-    """Metres (N + 1,) along a closed path from its first point to each and back to it."""
-    steps = np.linalg.norm(np.diff(loop, axis=0, append=loop[:1]), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _tour(metres: Float64Array) -> list[int]:
+def _tour(distance: Float64Array) -> list[int]:
     """A short closed order of all places, by cheapest insertion."""
     order = [0]
-    for place in range(1, len(metres)):
-        extra = [metres[a, place] + metres[place, b] - metres[a, b] for a, b in pairwise([*order, 0])]
+    for place in range(1, len(distance)):
+        extra = [distance[a, place] + distance[place, b] - distance[a, b] for a, b in pairwise([*order, 0])]
         order.insert(int(np.argmin(extra)) + 1, place)
     return order
 
@@ -252,84 +221,45 @@ def _place_knots(
     length = stops[-1]
     for start, end in pairwise(stops):
         speed = kind.speed * float(rng.uniform(0.75, 1.25))
-        n_looks = int(rng.integers(*kind.looks, endpoint=True)) if rows else kind.looks[1]
-        rows += [(start, False, start, speed)] * n_looks
+        n_looks = int(rng.integers(*kind.looks, endpoint=True))
+        rows += [(start, False, start, speed)] * (n_looks if rows else kind.looks[1])
         between = np.linspace(start, end, max(2, int(np.ceil((end - start) / KNOT_M))) + 1)
         inner = min(0.1, (end - start) / 2)
         for arc in between if kind.faces_path else between[1:-1]:
             rows.append((float(arc), True, float(np.clip(arc, start + inner, end - inner)), speed))
     rows += [(length, False, length, kind.speed)] * kind.looks[1]
     arc, moving, aim, speeds = (np.array(column) for column in zip(*rows, strict=True))
-    ahead, behind = ((np.clip(aim + step, 0, length) / length) for step in (0.1, -0.1))
-    direction = along_loop(path, ahead) - along_loop(path, behind)
+    behind, ahead = (trajectory.along_loop(path, np.clip(aim + step, 0, length) / length) for step in (-0.1, 0.1))
+    direction = ahead - behind
     heading = np.rad2deg(np.arctan2(direction[:, 1], direction[:, 0]))
-    height = smooth_through(stops, rng.uniform(*level, len(stops)), arc)
-    return _Knots(arc, moving, heading, height, speeds)
+    return _Knots(arc, moving, heading, trajectory.smooth_through(stops, rng.uniform(*level, len(stops)), arc), speeds)
 
 
 def _choose_views(
     mesh: SceneMesh, path: Float64Array, knots: _Knots, kind: Carrier, n_structure: int
 ) -> tuple[Float64Array, Float64Array]:
     """Yaw and pitch (degrees, yaw unwrapped) at each knot, chosen to show every object repeatedly and well."""
-    candidates = np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in kind.pitches])
-    arcs, station = np.unique(knots.arc, return_inverse=True)
-    height = knots.height[np.searchsorted(knots.arc, arcs)]
-    stations = np.column_stack([along_loop(path, arcs / arcs[-1]), height])
-    shares, near = _visible_shares(mesh, stations, candidates, n_structure)
-    aside = _turn(candidates[:, 0], knots.heading[:, None])
+    candidates = trajectory.candidate_views(kind.pitches)
+    arcs, first, station = np.unique(knots.arc, return_index=True, return_inverse=True)
+    stations = np.column_stack([trajectory.along_loop(path, arcs / arcs[-1]), knots.height[first]])
+    shares, near = trajectory.visible_shares(mesh, stations, candidates, n_structure)
+    turn = trajectory.turn_between(candidates[:, :1], candidates[:, 0])
+    aside = trajectory.turn_between(candidates[:, 0], knots.heading[:, None])
     # A person looks around, but seldom backwards while walking.
-    prior = np.where(knots.moving[:, None], np.clip(1.5 - aside / 120.0, 0.2, 1.0), 1.0)
-    if kind.faces_path:
-        prior = np.where(knots.moving[:, None], aside <= aside.min(axis=1, keepdims=True), prior)
+    ahead = np.clip(1.5 - aside / 120.0, 0.2, 1.0) if not kind.faces_path else aside <= aside.min(axis=1)[:, None]
+    prior = np.where(knots.moving[:, None], ahead, 1.0)
     last = len(station) - 1
-    picked = np.full(last + 1, -1)
-    seen = np.zeros(shares.shape[2])
-    for _ in range(3):
-        for knot, place in enumerate(station):
-            if picked[knot] >= 0:
-                seen = seen - shares[place, picked[knot]]
-            gain = (shares[place] / (0.25 + np.maximum(seen, 0.0)) ** 1.5).sum(axis=1)
-            score = np.maximum(gain - 1.5 * near[place], 0.01 * gain) * prior[knot]
-            for other in (knot - 1, knot + 1):
-                if 0 <= other <= last and picked[other] >= 0:
-                    turn = _turn(candidates[:, 0], candidates[picked[other], 0])
-                    swing = np.hypot(turn, candidates[:, 1] - candidates[picked[other], 1])
-                    score = score / (1.0 + (swing / kind.swing) ** 2)
-            if knot in (0, last) and picked[last - knot] >= 0:
-                score = np.where(_turn(candidates[:, 0], candidates[picked[last - knot], 0]) < REVISIT_DEG, -1.0, score)
-            picked[knot] = int(score.argmax())
-            seen = seen + shares[place, picked[knot]]
+
+    def weigh(knot: int, picked: NDArray[np.intp], score: Float64Array) -> Float64Array:
+        score = np.maximum(score, 1e-3) * prior[knot]
+        for other in (knot - 1, knot + 1):
+            if 0 <= other <= last and picked[other] >= 0:
+                tilt = candidates[:, 1] - candidates[picked[other], 1]
+                score = score / (1.0 + (turn[:, picked[other]] ** 2 + tilt**2) / kind.swing**2)
+        if knot in (0, last) and picked[last - knot] >= 0:
+            score = np.where(turn[:, picked[last - knot]] < REVISIT_DEG, -1.0, score)
+        return np.round(score, 9)  # the last bit may depend on the number of threads
+
+    picked = trajectory.pick_views(shares[station], near[station], weigh)
     yaw = np.where(knots.moving & kind.faces_path, knots.heading, candidates[picked, 0])
     return np.rad2deg(np.unwrap(np.deg2rad(yaw))), candidates[picked, 1]
-
-
-def _turn(first: Any, second: Any) -> Float64Array:
-    """The angle (0..180 degrees) between two directions in degrees."""
-    return np.asarray(np.abs((first - second + 180.0) % 360.0 - 180.0))
-
-
-def _visible_shares(
-    mesh: SceneMesh, stations: Float64Array, candidates: Float64Array, n_structure: int
-) -> tuple[Float64Array, Float64Array]:
-    """How well each candidate view of each station shows each object (S, C, O; 0..1), how much is too near (S, C)."""
-    from scipy.sparse import csr_matrix
-
-    o3d = compiled_open3d()
-    directions, weight = sphere_directions()
-    inside = inside_view(candidates, directions).T
-    rays = np.empty((len(stations), len(directions), 6), np.float32)
-    rays[..., :3], rays[..., 3:] = stations[:, None], directions
-    answer = caster(mesh.vertices, mesh.triangles).cast_rays(o3d.core.Tensor(rays.reshape(-1, 6)))  # type: ignore[attr-defined]
-    t = answer["t_hit"].numpy().reshape(len(stations), -1)
-    row = np.where(np.isfinite(t), answer["primitive_ids"].numpy().reshape(t.shape), 0)
-    ids = np.where(np.isfinite(t), mesh.instance_of_triangle[row], 0)
-    value = weight * np.interp(t, [0.4, 0.7, 2.5, 5.0], [0.2, 1.0, 1.0, 0.3])
-    n_objects, ray = int(mesh.instance_of_triangle.max()) + 1, np.arange(len(directions))
-    tables = [csr_matrix((value[k], (ids[k], ray)), (n_objects, len(ray))) for k in range(len(stations))]
-    best = np.max([np.asarray(table.sum(axis=1)).ravel() for table in tables], axis=0)
-    shares = np.stack([(table @ inside).T for table in tables])
-    shares = np.clip(shares / np.clip(0.5 * best, 0.002, 0.3), 0, 1)  # half of the best view is a good view
-    shares[:, :, 0] = 0.0
-    shares[:, :, 1 : n_structure + 1] *= 0.25
-    near = np.stack([(inside[close] * weight[close, None]).sum(axis=0) for close in t < 0.6])
-    return shares, near

@@ -135,6 +135,7 @@ class GeneratedScenes(ABC):
     extra_ground_truths = openscan.EXTRA_GROUND_TRUTHS
     image_domain: ImageDomain = "rendered-rooms"
     Options: type[SceneOptions] = SceneOptions
+    cached_as: ClassVar[str]  # the folder of cached data, shared by datasets with the same scenes
     version: ClassVar[int]  # increase it whenever a scene of the same name changes
     sources: ClassVar[tuple[str, ...]]  # what affects a scene: part of the key of cached data
     default_scenes: ClassVar[tuple[str, ...]]
@@ -221,7 +222,7 @@ class GeneratedScenes(ABC):
 
     def scan(self, scene: str) -> SceneScan:
         """The ground-truth surface; computed once, then read from the cache."""
-        path = self.root / self.name / self._scan_key(scene) / f"{scene}.npz"
+        path = self.root / self.cached_as / self._scan_key(scene) / f"{scene}.npz"
         return kept_scan(path, self.name, lambda: self.built(scene).scan)
 
     def _scan_key(self, scene: str) -> str:
@@ -243,7 +244,7 @@ class GeneratedScenes(ABC):
         packages = package_versions(NUMERIC_PACKAGES)  # another Open3D version may differ in the last bit
         options = self.options.n_frames, self.options.seed_offset
         words = package_digest(*self.sources), *options, sorted(packages.items())
-        return self.root / self.name / digest_json(words)[:16]
+        return self.root / self.cached_as / digest_json(words)[:16]
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``).

@@ -42,8 +42,8 @@ class Material:
     """The look of a part: ``texture`` paints with colours ``a`` and ``b`` at ``scale`` metres along ``axis``.
 
     ``extent`` (u0, u1, v0, v1) bounds textures that fill a face (pictures, screens, rugs); ``gloss`` 0..1 is the
-    strength of the highlight, ``glow`` the light it emits. ``mirror`` and ``clear`` are the shares of light reflected and
-    let through, ``wear`` the strength of variation at 0.6 m, 0.12 m and 0.025 m: ``SampledRenderer`` shows these.
+    strength of the highlight, ``glow`` the light it emits. ``mirror`` and ``clear`` are the shares of light reflected
+    and let through, ``wear`` the strength of variation at 0.6 m, 0.12 m and 0.025 m: ``SampledRenderer`` shows these.
     """
 
     texture: Texture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -139,10 +139,15 @@ def backtrack(before: NDArray[np.int32], start: int, end: int) -> list[int]:
     return leg[:0:-1]
 
 
+def closed_loop(loop: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """The loop with its first point once more at the end, and metres (N + 1,) from the start to each point."""
+    closed = np.concatenate([loop, loop[:1]])
+    return closed, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+
+
 def even_loop(loop: Float64Array) -> Float64Array:
     """The closed polyline at steps of 2 cm."""
-    closed = np.concatenate([loop, loop[:1]])
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    closed, length = closed_loop(loop)
     at = np.linspace(0.0, length[-1], max(8, int(length[-1] / 0.02)), endpoint=False)
     return np.column_stack([np.interp(at, length, closed[:, k]) for k in range(2)])
 
@@ -154,8 +159,7 @@ def _blur_loop(loop: Float64Array, sigma_m: float) -> Float64Array:
 
 
 def along_loop(loop: Float64Array, share: Float64Array) -> Float64Array:
-    closed = np.concatenate([loop, loop[:1]])
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    closed, length = closed_loop(loop)
     return np.column_stack([np.interp(share * length[-1], length, closed[:, k]) for k in range(2)])
 
 
@@ -191,27 +195,51 @@ def camera_poses(position: Float64Array, yaw: Float64Array, pitch: Float64Array,
 
 def _choose_views(mesh: SceneMesh, stations: Float64Array, n_structure: int) -> tuple[Float64Array, Float64Array]:
     """Yaw and pitch (degrees, yaw unwrapped) at each station, chosen to show every object repeatedly and well."""
-    directions, weight = sphere_directions()
-    candidates = np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in PITCHES])
-    inside = inside_view(candidates, directions)
-    shares, near = _visible_shares(mesh, stations, directions, weight, inside, n_structure)
-    n_views = len(stations)
+    candidates = candidate_views(PITCHES)
+    shares, near = visible_shares(mesh, stations, candidates, n_structure)
+
+    def smoother(view: int, picked: NDArray[np.intp], score: Float64Array) -> Float64Array:
+        for neighbour in (view - 1, view + 1):
+            if 0 <= neighbour < len(picked) and picked[neighbour] >= 0:
+                swing = turn_between(candidates[:, 0], candidates[picked[neighbour], 0])
+                score = score * np.clip(1.35 - swing / 100.0, 0.02, 1.0)
+        return score
+
+    picked = pick_views(shares, near, smoother)
+    yaw = np.rad2deg(np.unwrap(np.deg2rad(candidates[picked, 0])))
+    return yaw, candidates[picked, 1]
+
+
+def candidate_views(pitches: Sequence[float]) -> Float64Array:
+    """Yaw and pitch in degrees (C, 2) of views all around."""
+    return np.array([(360.0 * k / YAWS, p) for k in range(YAWS) for p in pitches])
+
+
+def turn_between(first: Any, second: Any) -> Float64Array:
+    """The angle (0..180) between directions in degrees."""
+    return np.asarray(np.abs((first - second + 180) % 360 - 180))
+
+
+def pick_views(
+    shares: Float64Array, near: Float64Array, weigh: Callable[[int, NDArray[np.intp], Float64Array], Float64Array]
+) -> NDArray[np.intp]:
+    """A candidate (V,) for each view, such that together they show every object repeatedly and well.
+
+    ``weigh`` receives a view, the candidates picked so far (-1: none yet) and the scores (C,) of the view's
+    candidates, and returns the scores that decide.
+    """
+    n_views = len(shares)
     picked = np.full(n_views, -1)
     for sweep in range(3):
         for view in range(n_views):
             others = np.delete(np.arange(n_views), view)[:view] if sweep == 0 else np.delete(np.arange(n_views), view)
             seen = shares[others, picked[others]].sum(axis=0) if len(others) else np.zeros(shares.shape[2])
             score = shares[view] @ (1.0 / (0.25 + seen) ** 1.5) - 1.5 * near[view]
-            for neighbour in (view - 1, view + 1):
-                if 0 <= neighbour < n_views and picked[neighbour] >= 0:
-                    swing = np.abs((candidates[:, 0] - candidates[picked[neighbour], 0] + 180) % 360 - 180)
-                    score = score * np.clip(1.35 - swing / 100.0, 0.02, 1.0)
-            picked[view] = int(score.argmax())
-    yaw = np.rad2deg(np.unwrap(np.deg2rad(candidates[picked, 0])))
-    return yaw, candidates[picked, 1]
+            picked[view] = int(weigh(view, picked, score).argmax())
+    return picked
 
 
-def sphere_directions() -> tuple[Float64Array, Float64Array]:
+def _sphere() -> tuple[Float64Array, Float64Array]:
     """Unit directions (N, 3) all around and the solid angle of each."""
     turn = (np.arange(96) + 0.5) * 2 * np.pi / 96
     rise = np.deg2rad(np.linspace(-80, 50, 44))
@@ -220,7 +248,7 @@ def sphere_directions() -> tuple[Float64Array, Float64Array]:
     return np.stack([np.cos(r) * np.cos(t), np.cos(r) * np.sin(t), np.sin(r)], axis=1), weight
 
 
-def inside_view(candidates: Float64Array, directions: Float64Array) -> Float64Array:
+def _inside_view(candidates: Float64Array, directions: Float64Array) -> Float64Array:
     poses = camera_poses(np.zeros((len(candidates), 3)), candidates[:, 0], candidates[:, 1], np.zeros(len(candidates)))
     local = np.einsum("nd,cdk->cnk", directions, poses[:, :3, :3])
     ahead = local[..., 2] > 0.05
@@ -229,12 +257,13 @@ def inside_view(candidates: Float64Array, directions: Float64Array) -> Float64Ar
     return np.asarray(inside, np.float64)
 
 
-def _visible_shares(
-    mesh: SceneMesh, stations: Float64Array, directions: Float64Array, weight: Float64Array, inside: Float64Array,
-    n_structure: int,
-) -> tuple[Float64Array, Float64Array]:  # fmt: skip
-    """How well each candidate view of each station shows each object (0..1), and how much of it is too near."""
+def visible_shares(
+    mesh: SceneMesh, stations: Float64Array, candidates: Float64Array, n_structure: int
+) -> tuple[Float64Array, Float64Array]:
+    """How well each candidate view of each station shows each object (S, C, O; 0..1), how much is too near (S, C)."""
     o3d = compiled_open3d()
+    directions, weight = _sphere()
+    inside = _inside_view(candidates, directions)
     rays = np.empty((len(stations), len(directions), 6), np.float32)
     rays[..., :3], rays[..., 3:] = stations[:, None], directions
     answer = caster(mesh.vertices, mesh.triangles).cast_rays(o3d.core.Tensor(rays.reshape(-1, 6)))  # type: ignore[attr-defined]

@@ -90,7 +90,7 @@ class BuiltRoom(BuiltScene):
 class Rooms(GeneratedScenes):
     """Furnished rooms, generated from their names."""
 
-    name = "rooms"
+    name = cached_as = "rooms"
     headline_protocol = "rooms-semantic"  # the paper's mAcc and F-mIoU on Replica, whose classes the rooms have
     label_space = "replica"
     Options = RoomOptions

@@ -200,7 +200,7 @@ PIECES = ".frames"
 
 
 class ScannetLayout(Layout):
-    """Scenes as scans ``scene9000_00`` and so on, each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
+    """Scenes as scans ``scene9000_00`` etc., each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
 
     It is joined from records that were written separately. Time stamps are microseconds from the first frame.
     """

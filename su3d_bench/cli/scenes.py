@@ -14,9 +14,11 @@ from su3d_bench.cli.output import answer, answer_either, answer_json, file_name_
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
+from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.types import WorldUp
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.frame_checks import Finding
+from su3d_bench.formats.images import png_bytes
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line, look_at
 from su3d_bench.runs.executors import Event
 from su3d_bench.runs.job import build_dataset, part_of
@@ -138,7 +140,16 @@ def _truth_text(variant: TruthVariant) -> str:
 
 
 def show(arguments: argparse.Namespace) -> None:
-    """Draw the scene and print its counts and the path of the picture."""
+    """Draw the scene and print its counts and the path of the picture; or the models or statistics of a dataset."""
+    if arguments.models:
+        _show_models(arguments)
+    elif arguments.statistics:
+        _show_statistics(arguments)
+    else:
+        _show_scene(arguments)
+
+
+def _show_scene(arguments: argparse.Namespace) -> None:
     scenes = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)
     if len(scenes) > 1:
         names = ", ".join(f"{dataset.name}/{scene}" for dataset, scene in scenes[:3])
@@ -161,10 +172,40 @@ def show(arguments: argparse.Namespace) -> None:
         "no_frames": look.no_frames or None,
     }
     if answer_json(arguments, printable_json(table)):
-        return
+        return None
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:
         answer(f"up: {printable(up_text(look.up))}")
     for reason in filter(None, (look.no_frames, look.no_truth)):
         answer(printable(reason))
     answer(f"picture: {printable(str(path))}")
+
+
+def _show_models(arguments: argparse.Namespace) -> None:
+    name = arguments.scene.rstrip("/*")
+    draw = getattr(registry.load("dataset", name), "model_sheet", None)
+    if draw is None:
+        raise ConfigError(f"datasets show {printable(name)} --models: this dataset has no models; known: homes")
+    path = arguments.out or Path(f"{name}-models.png")
+    sheet, n_models, n_classes = draw()
+    write_bytes(path, png_bytes(sheet[..., ::-1]))
+    table = {"dataset": name, "picture": str(path), "n_models": n_models, "n_classes": n_classes}
+    answer_either(
+        arguments, table, f"{name}: {n_models} models of {n_classes} classes", f"picture: {printable(str(path))}"
+    )
+
+
+def _show_statistics(arguments: argparse.Namespace) -> None:
+    from su3d_bench.datasets.homes.statistics import view_statistics
+
+    rows = []
+    for dataset, scene in chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet):
+        if not hasattr(dataset, "built"):
+            raise ConfigError(f"datasets show {dataset.name} --statistics: only for generated scenes: homes, rooms")
+        rows.append({"scene": f"{dataset.name}/{scene}", **view_statistics(dataset, scene, arguments.stride or 40)})
+    columns = list(rows[0])
+    lines = ["  ".join([f"{columns[0]:16}", *columns[1:]])]
+    for row in rows:
+        values = [f"{row[name]:{len(name)}.1f}".removesuffix(".0").rjust(len(name)) for name in columns[1:]]
+        lines.append("  ".join([f"{row['scene']:16}", *values]))
+    answer_either(arguments, {"scenes": rows}, *lines)

@@ -28,7 +28,7 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
-from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.registry import CEILING_METHOD, GENERATED
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.types import ImageDomain
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
@@ -252,7 +252,7 @@ def make_plan(
         existing = existing_run(place.folder.path)
     if place.url is None:
         place.folder.check_is_run_folder()
-    domain: ImageDomain = "rendered-rooms" if set(targets) == {"rooms"} else "camera"
+    domain: ImageDomain = "rendered-rooms" if set(targets) <= GENERATED else "camera"
     profile = resolve_profile(config.profile, domain, of_perception)
     uses_captions = profile == "paper" and of_perception.paper.captions == "model"
     has_replies = config.offline or (place.folder.path / "language").is_dir()  # else requests are sent

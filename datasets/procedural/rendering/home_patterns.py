@@ -1,4 +1,4 @@
-"""Compiled textures of homes: views from windows, paintings, packaging, plaster, woven fabric, bricks, parquet, tiles."""
+"""Compiled textures of homes: views from windows, paintings, packaging, plaster, fabric, bricks, parquet, tiles."""
 
 from __future__ import annotations
 
@@ -20,6 +20,12 @@ def _blend(a, b, share):  # type: ignore[no-untyped-def]
 @inlined
 def _times(a, factor):  # type: ignore[no-untyped-def]
     return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@inlined
+def _line(distance, wide, foot):  # type: ignore[no-untyped-def]
+    """Share of a pixel of size ``foot`` that a line covers, at a distance from its middle."""
+    return min(1.0, max(0.0, (0.5 * (wide + foot) - distance) / max(foot, 1e-4))) * min(1.0, wide / max(foot, 1e-4))
 
 
 @inlined
@@ -117,7 +123,7 @@ def _view(u, v, style, seed, is_night):  # type: ignore[no-untyped-def]
 
 @inlined
 def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
-    """A picture in 0..1: six painted scenes, a still life, abstract blots, fields, leaves, a photograph; 11 is a poster."""
+    """A picture in 0..1: six painted scenes, a still life, blots, fields, leaves, a photograph; 11 is a poster."""
     paper = (0.78, 0.75, 0.68)
     if style in (7, 8, 9) and min(min(u, 1 - u), min(v, 1 - v)) < 0.13:
         return paper
@@ -132,13 +138,16 @@ def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
             return grey * edge, 0.97 * grey * edge, 0.9 * grey * edge
         return _times(_blend(scene, _blend(a, b, v), 0.3), 0.65 + 0.35 * stroke)
     if style == 6:  # fruit and jars on a table, lit from the left
-        ground = _times((0.2, 0.12, 0.07), 0.8 + 0.4 * stroke) if v < 0.36 else _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
+        ground = _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
+        if v < 0.36:
+            ground = _times((0.2, 0.12, 0.07), 0.8 + 0.4 * stroke)
         for k in range(5):
             wide = 0.06 + 0.06 * hash01(k, 1, seed)
             tall = wide * (1.0 if k < 3 else 2.2)
             p, q = (u - 0.2 - 0.14 * k) / wide, (v - 0.26 - 0.05 * hash01(k, 2, seed) - tall) / tall
             if p * p + q * q < 1:
-                body = _blend(a, b, 0.5 * k) if k % 2 == 0 else _blend((0.5, 0.22, 0.05), (0.35, 0.33, 0.1), hash01(k, 3, seed))
+                ripe = _blend((0.5, 0.22, 0.05), (0.35, 0.33, 0.1), hash01(k, 3, seed))
+                body = _blend(a, b, 0.5 * k) if k % 2 == 0 else ripe
                 ground = _times(body, (0.25 + 0.75 * max(0.0, 0.6 - 0.55 * p + 0.3 * q)) * (0.8 + 0.3 * stroke))
         return ground
     if style == 7:
@@ -157,7 +166,8 @@ def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
             along = (u - 0.5) * side * 0.8 + (v - root) * 0.6
             across = (v - root) * 0.8 - (u - 0.5) * side * 0.6
             if 0 < along < 0.24 and abs(across) < 0.16 * along * (0.24 - along) / 0.06:
-                return _times(_blend(_blend((0.08, 0.14, 0.06), a, 0.5), paper, 0.3 * stroke), 0.8 if abs(across) < 0.004 else 1.0)
+                vein = 0.8 if abs(across) < 0.004 else 1.0
+                return _times(_blend(_blend((0.08, 0.14, 0.06), a, 0.5), paper, 0.3 * stroke), vein)
         return _blend(a, paper, 0.2) if abs(u - 0.5) < 0.005 and 0.16 < v < 0.8 else _times(paper, 0.96 + 0.04 * stroke)
     picture = _view(u, (v - 0.36) / 0.6, int(seed) % 6, seed, False)
     if v > 0.36:
@@ -195,10 +205,10 @@ def _herringbone(u, v, wide, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _plaster(u, v, a, b, part, seed):  # type: ignore[no-untyped-def]
+def _plaster(u, v, a, b, part, seed, foot):  # type: ignore[no-untyped-def]
     """Painted plaster; ``part`` 0 is a wall, 1 one with a skirting board, 2 a ceiling."""
     if part == 1 and v < 0.075:
-        line = 0.55 if v > 0.069 or v < 0.006 else 1.0
+        line = 1 - 0.45 * max(_line(abs(v - 0.072), 0.006, foot), _line(v, 0.012, foot))
         return _times((0.66, 0.65, 0.61), line * (0.9 + 0.12 * cloudy(u * 7, v * 30, seed)))
     broad = cloudy(u * 1.2, v * 1.2, seed)
     tone = 0.95 + 0.06 * broad + 0.05 * (noise2(u * 260, v * 260, seed) - 0.5) - 0.5 * max(0.0, broad - 0.64)
@@ -219,7 +229,7 @@ def _plaster(u, v, a, b, part, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
+def home_colour(kind, x, y, z, u, v, row, foot):  # type: ignore[no-untyped-def]
     """Red, green and blue (linear) of the textures from ``VIEW`` on; parameters as in ``surface_colour``."""
     a, b = (row[1], row[2], row[3]), (row[4], row[5], row[6])
     a, b = _times(a, 1.0), _times(b, 1.0)
@@ -230,7 +240,7 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
     if kind == 26 or kind == 32:
         return _painting(fu, fv, 11 if kind == 32 else seed % 11, a, b, seed)
     if kind == 27:
-        return _plaster(u, v, a, b, int(row[10]), seed)
+        return _plaster(u, v, a, b, int(row[10]), seed, foot)
     if kind == 28:  # woven yarn of two tones, with folds
         i, j = math.floor(u / scale), math.floor(v / scale)
         p, q = u / scale - i - 0.5, v / scale - j - 0.5
@@ -250,18 +260,19 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
         grain = rough(along * 7 + shift, across * 130 + shift, seed) - 0.5
         rings = math.sin(6.3 * (across / 0.011 + 3 * noise2(along * 4 + shift, across * 20, seed)))
         gap = min(min(across, scale - across), min(along, 5 * scale - along))
-        dark = 0.35 if gap < 0.0008 else (0.85 if gap < 0.0022 else 1.0)
-        return _times(_blend(a, b, 0.35 + 0.7 * grain + 0.13 * rings), tone * dark)
+        tone *= 1 - 0.6 * _line(gap, 0.0016, foot) - 0.15 * _line(gap, 0.0044, foot)
+        return _times(_blend(a, b, 0.35 + 0.7 * grain + 0.13 * rings), tone)
     if kind == 31:
         i, j = math.floor(u / scale), math.floor(v / scale)
         p, q = u - i * scale, v - j * scale
         edge = min(min(p, scale - p), min(q, scale - q))
-        if edge < 0.002:
-            return _times(b, 0.55 + 0.75 * rough(u * 9, v * 9, seed))
         tone = 0.9 + 0.16 * hash01(i, j, seed) + 0.12 * (rough(u * 14 + 7 * i, v * 14 + 3 * j, seed) - 0.5)
         warm = 0.05 * (hash01(i, j, seed + 1) - 0.5)
-        tone *= 1.06 if edge < 0.004 else 1.0 - 0.12 * max(0.0, 1 - edge / 0.02) * rough(u * 20, v * 20, seed + 2)
-        return a[0] * tone * (1 + warm), a[1] * tone, a[2] * tone * (1 - warm)
+        tone *= 1.0 - 0.12 * max(0.0, 1 - edge / 0.02) * rough(u * 20, v * 20, seed + 2)
+        grout = _times(b, 0.55 + 0.75 * rough(u * 9, v * 9, seed))
+        return _blend(
+            (a[0] * tone * (1 + warm), a[1] * tone, a[2] * tone * (1 - warm)), grout, _line(edge, 0.004, foot)
+        )
     if kind == 33:
         return _package(fu, fv, a, b, seed)
     if row[12] - row[11] > row[14] - row[13]:  # a spine that lies
@@ -271,4 +282,5 @@ def home_colour(kind, x, y, z, u, v, row):  # type: ignore[no-untyped-def]
     if abs(fv - band) < 0.012 or abs(fv - 1 + band) < 0.012 or (fv > 0.84 and seed % 4 == 0):
         return _times(b, cloth)
     ink = _text((0.8 - fv) / 0.55, (fu - 0.2) / 0.6, 1 + seed % 2, seed)
-    return _times(_blend(a, b if abs(a[1] - b[1]) > 0.15 else ((0.7, 0.68, 0.6) if a[1] < 0.3 else (0.04, 0.04, 0.05)), ink), cloth)
+    gilt = (0.7, 0.68, 0.6) if a[1] < 0.3 else (0.04, 0.04, 0.05)
+    return _times(_blend(a, b if abs(a[1] - b[1]) > 0.15 else gilt, ink), cloth)

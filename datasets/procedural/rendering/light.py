@@ -18,6 +18,7 @@ from su3d_bench.datasets.procedural.rendering.mesh import (
     SceneMesh,
     _blocked,
     _fill_buried,
+    _open_sky,
     at_rows,
     caster,
     cut,
@@ -34,6 +35,7 @@ BOUNCE_SPACING_M = 0.1  # between points at which reflected light is gathered: i
 N_BOUNCE, N_GATHERS, N_NEIGHBOURS = 24, 3, 8  # rays per point; bounces; points averaged (so 192 rays)
 SUN_PIECE_M = 0.4  # a patch of sunlight is replaced by lamps this far apart
 AMBIENT = 0.03  # of the mean light, for what three bounces miss
+NARROW = 0.55  # of reflected light reaches a crevice, which is smaller than the spacing of the points
 GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
@@ -222,8 +224,8 @@ def _reflected(
 ) -> Float64Array:  # fmt: skip
     """Light (V, 3) that arrives from other surfaces, gathered at some of the points and averaged around each.
 
-    ``corners`` are the rows of ``direct`` at the corners of ``triangles``, which have a mean ``albedo`` each. Patches of
-    sunlight are too small and bright for so few rays: their light is that of lamps on them.
+    ``corners`` are the rows of ``direct`` at the corners of ``triangles``, which have a mean ``albedo`` each. Patches
+    of sunlight are too small and bright for so few rays: their light is that of lamps on them.
     """
     keys = np.column_stack([np.round(start / BOUNCE_SPACING_M), np.round(facing * 1.5), owner]).astype(np.int64)
     open_points = np.flatnonzero(~buried)
@@ -257,7 +259,7 @@ def _reflected(
         gathered = from_sun + np.where(seen[:, None], sent[hit], 0.0).reshape(-1, N_BOUNCE, 3).mean(axis=1)
         received = np.einsum("vk,vkc->vc", weight, gathered[near.reshape(len(start), -1)])
         received += AMBIENT * direct[chosen].mean(axis=0)
-    return received
+    return received * (NARROW + (1 - NARROW) * _open_sky(scene, start, facing)[:, None])
 
 
 def _sunlit_patches(

@@ -235,10 +235,13 @@ def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore[no-untyped-def]
-    """Red, green and blue (0..1, linear) at a point; ``u`` and ``v`` are its position in the plane of the face."""
+def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # type: ignore[no-untyped-def]
+    """Red, green and blue (0..1, linear) at a point; ``u`` and ``v`` are its position in the plane of the face.
+
+    Lines thinner than ``foot`` metres, the width of a pixel, are blurred in the textures from ``VIEW`` on.
+    """
     if kind > 24:
-        return home_colour(kind, x, y, z, u, v, row)
+        return home_colour(kind, x, y, z, u, v, row, foot)
     ar, ag, ab, br, bg, bb = row[1], row[2], row[3], row[4], row[5], row[6]
     tone = 1.0
     if kind == 0:

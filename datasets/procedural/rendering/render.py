@@ -60,6 +60,13 @@ class Renderer:
         ids = self._mesh.instance_of_triangle[np.where(hit, primitive, 0)]
         return np.where(hit, t_hit, np.float32(0)), np.where(hit, ids, np.int32(0))
 
+    def material_rows(self, camera_to_world: Float64Array) -> Float32Array:
+        """The row (H, W, columns) of ``SceneMesh.materials`` of the surface in each pixel; zeros for a miss."""
+        _, t_hit, primitive, _ = self._cast(camera_to_world, self._directions)
+        hit, mesh = np.isfinite(t_hit), self._mesh
+        rows = mesh.materials[mesh.material_of_triangle[np.where(hit, primitive, 0)]] * hit[:, None]
+        return np.asarray(rows.reshape(self.height, self.width, -1), np.float32)
+
     def _cast(
         self, pose: Float64Array, directions: Float64Array
     ) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:

@@ -89,7 +89,7 @@ class SampledRenderer(Renderer):
         return colour
 
     def _in_threads(self, kernel: Callable[..., None], n: int, *values: Any) -> None:
-        """``kernel(start, stop, *values)`` on pieces of ``range(n)``; threads end with the call, so that forks are safe."""
+        """``kernel(start, stop, *values)`` on pieces of ``range(n)``; the threads end with the call: forks are safe."""
         if self._threads == 1:
             kernel(0, n, *values)
             return

@@ -61,7 +61,8 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
                light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
     """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
 
-    ``across`` and ``down`` are the steps of a ray's direction to the next pixels; zero for one sample of the texture. ``is_last`` makes glass and mirrors opaque.
+    ``across`` and ``down`` are the steps of a ray's direction to the next pixels; zero for one sample of the texture.
+    ``is_last`` makes glass and mirrors opaque.
     """
     pixel = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
     for i in range(start, stop):
@@ -96,7 +97,7 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
             su, sv = (SAMPLES[k, 0], SAMPLES[k, 1]) if n > 1 else (0.0, 0.0)
             sx, sy, sz = x + su * gux + sv * gvx, y + su * guy + sv * gvy, z + su * guz + sv * gvz
             pu, pv = (sx, sy) if plane == 2 else ((sy, sz) if plane == 0 else (sx, sz))
-            kr, kg, kb = surface_colour(kind, sx, sy, sz, pu, pv, row, row[7], int(row[10]), row[15])
+            kr, kg, kb = surface_colour(kind, sx, sy, sz, pu, pv, row, row[7], int(row[10]), row[15], foot)
             if k == 1 and abs(kr - r) + abs(kg - g) + abs(kb - b) < ALIKE:
                 n = 2
             r, g, b = r + kr, g + kg, b + kb
