@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.homes.layout import DOOR_HEIGHT_M, PARTITION_M, Rect, Room, Wall
-from su3d_bench.datasets.homes.plan import GAP_M, HomePlan, Span, upright
+from su3d_bench.datasets.homes.plan import GAP_M, PERSON_M, HomePlan, Span, upright
 from su3d_bench.datasets.homes.solids import Solids
 from su3d_bench.datasets.procedural.items import Item, Part
 from su3d_bench.datasets.procedural.materials import Material, Rgb, Texture, mix, shade, tone
@@ -147,8 +147,9 @@ def add_openings(plan: HomePlan, new: New) -> None:
         along = 0.2 + half if plan.rng.random() < 0.5 else wall.length - 0.2 - half
         placed = plan.hang(door, Span(wall, 0.0, wall.length), along, GAP_M)
         if placed:
-            plan.keep_free.append(_before(wall, along, half + 0.05, 0.9))
-            plan.doors.append(wall.point(along, 0.5))
+            ahead = max(0.5, float(door.size[1]) + PERSON_M + 0.1)  # of a leaf that stands ajar
+            plan.keep_free.append(_before(wall, along, half + 0.05, ahead + 0.4))
+            plan.doors.append(wall.point(along, ahead))
             side = 1.0 if along < wall.length / 2 else -1.0
             plan.hang_new(new("switch"), Span(wall, 0.0, wall.length), along + side * (half + 0.2), 1.05)
             break
