@@ -22,7 +22,7 @@ class SensorSettings:
     step_px: float = depth.STEP_PX
     baseline_m: float = depth.BASELINE_M
     camera_offset_m: float = 0.025  # infrared camera left of the colour camera (the ROS page of ``sensors/depth.py``)
-    near_m: float = 0.5  # Khoshelham and Elberink 2012 (Sensors 12), section 4.3: depth from 0.5 m to 5 m
+    near_m: float = 0.5  # Khoshelham and Elberink 2012 (Sensors 12) measure errors from here to 5 m
     far_m: float = 5.0
     # The Kinect is specified to 4 m (Microsoft, DepthRange.Default); there a grey card (0.18) still faces it seen.
     min_signal: float = 0.18 / 4.0**2
