@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.datasets.homes.catalogue import Catalogue
-from su3d_bench.datasets.homes.groups import FREE, RELATIVE, Thing, stood_up
+from su3d_bench.datasets.homes.groups import FREE, RELATIVE, Thing
 from su3d_bench.datasets.homes.layout import Zone, draw_layout
 from su3d_bench.datasets.homes.model_format import Strict
 from su3d_bench.datasets.homes.plan import HomePlan
@@ -19,6 +19,7 @@ from su3d_bench.datasets.procedural.items import Item, Light, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
 N_OBJECTS = (95, 145)  # of a home, from its first to its last object
+FEWEST = 90  # a home that has space for fewer is drawn again
 SMALLEST_M = 0.06  # longest side of what the filler adds: smaller things have too few pixels to be annotated
 MAX_FAILURES = 160  # of the filler before a home counts as full
 HIGH_M = 1.5  # tops above hold what is put on shelves
@@ -56,9 +57,12 @@ def furnish(
     rng: np.random.Generator, catalogue: Catalogue, training: bool = False, layout: str | None = None
 ) -> HomePlan:
     """A furnished home, of the named layout or any."""
-    plan = HomePlan(rng, draw_layout(rng, layout), muted=bool(rng.random() < 0.5), is_evening=bool(rng.random() < 0.3))
+    muted, is_evening = bool(rng.random() < 0.5), bool(rng.random() < 0.3)
     target = int(rng.integers(N_OBJECTS[0], N_OBJECTS[1] + 1))
-    return _Furnisher(plan, catalogue, training).run(target)
+    while True:
+        home = _Furnisher(HomePlan(rng, draw_layout(rng, layout), muted, is_evening), catalogue, training)
+        if home.is_begun() and len(home.finished(target).placed) >= FEWEST:
+            return home.plan
 
 
 class _Furnisher:
@@ -67,11 +71,14 @@ class _Furnisher:
         self.rng = plan.rng
         self.n_of: dict[str, int] = {}
 
-    def run(self, target: int) -> HomePlan:
+    def is_begun(self) -> bool:
+        """Builds the bare home; whether it has its doors and a window in each room."""
+        rooms = self.plan.layout.rooms
+        add_shell(self.plan, [str(self.rng.choice(KINDS[room.kinds[0]].covers)) for room in rooms])
+        return add_openings(self.plan, self.new)
+
+    def finished(self, target: int) -> HomePlan:
         plan = self.plan
-        covers = [str(self.rng.choice(KINDS[room.kinds[0]].covers)) for room in plan.layout.rooms]
-        add_shell(plan, covers)
-        add_openings(plan, self.new)
         for zone in plan.layout.zones:
             self.do("ceiling_lamp", zone)
         for zone in plan.layout.zones:
@@ -83,9 +90,9 @@ class _Furnisher:
         self.finish_lights()
         return plan
 
-    def new(self, class_name: str, tall: tuple[float, float] = (0.0, 5.0)) -> Item | None:
-        """A new instance of a class, with a height in the range; ``None`` if the class has no such model."""
-        models = self.catalogue.models(class_name, self.training)
+    def new(self, class_name: str, tall: tuple[float, float] = (0.0, 5.0), model: str = "") -> Item | None:
+        """A new instance of a class (of a model), with a height in the range; ``None`` if there is no such model."""
+        models = [one for one in self.catalogue.models(class_name, self.training) if model in ("", one.name)]
         for k in self.rng.permutation(len(models)):
             item = models[int(k)].build(self.rng, self.plan.muted)
             if tall[0] <= item.size[2] <= tall[1]:
@@ -158,9 +165,6 @@ class _Furnisher:
         areas = np.array([(s.x1 - s.x0) * (s.y1 - s.y0) for _, s in places]) ** 0.5
         for k in self.rng.choice(len(places), min(len(places), 4), replace=False, p=areas / areas.sum()):
             holder, spot = places[int(k)]
-            is_shelved = mode == "shelf" and name in ("book", "binder", "magazine", "board-game")
-            if is_shelved and item.size[2] < 0.4 * item.size[1] and self.rng.random() < 0.75:
-                item = stood_up(item)
             placed = self.plan.on_spot(item, holder, spot, "any", 25.0 if mode == "seat" else 6.0)
             if placed:
                 self._repeat(item, placed, spot, most, zone)
@@ -191,22 +195,17 @@ class _Furnisher:
     def _repeat(self, item: Item, first: Placed, spot: Spot | None, most: int, zone: Zone) -> None:
         """More objects of the class beside, on or around the first one."""
         for row in REPEATS.get(item.class_name, ()):
-            if self.rng.random() >= row.chance:
+            tall = item.size[2] / item.size[0]
+            if self.rng.random() >= row.chance or (row.how == "stack" and tall > 1) or (row.how == "row" and tall < 0.3):
                 continue
             last = first
             for _ in range(min(most, int(self.rng.integers(row.n[0], row.n[1] + 1))) - 1):
-                other = item if row.same else self._another(item)
+                other = item if row.same else self.new(item.class_name, model=item.model) or item
                 placed = self._next(row.how, other, last, spot, zone)
                 if placed is None:
                     return
                 last = placed
             return
-
-    def _another(self, item: Item) -> Item:
-        """Another instance of the class, stood up if the first is."""
-        other = self.new(item.class_name) or item
-        is_standing = not item.spots and item.size[0] < 0.4 * item.size[2] and other.size[2] < 0.4 * other.size[1]
-        return stood_up(other) if is_standing else other
 
     def _next(self, how: str, item: Item, last: Placed, spot: Spot | None, zone: Zone) -> Placed | None:
         plan = self.plan

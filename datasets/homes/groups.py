@@ -55,16 +55,6 @@ def resized(item: Item, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Item:
     return replace(item, parts=parts, spots=spots, size=item.size * np.array([x, y, z]))
 
 
-def stood_up(item: Item) -> Item:
-    """A lying book, plate or board on its longer edge, its narrow side to the front."""
-    parts = [Part(part.shape.turned("x", 90).turned("z", 90), part.material) for part in item.parts]
-    corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in parts])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
-    moved = tuple(Part(part.shape.moved(*shift), part.material) for part in parts)
-    return replace(item, parts=moved, spots=(), size=high - low)
-
-
 def _draw(plan: HomePlan, span: Range) -> float:
     return plan.uniform(*span) if span[1] > span[0] else span[0]
 

@@ -8,8 +8,9 @@ from itertools import product
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.homes.groups import resized
 from su3d_bench.datasets.homes.layout import DOOR_HEIGHT_M, PARTITION_M, Rect, Room, Wall
-from su3d_bench.datasets.homes.plan import GAP_M, PERSON_M, HomePlan, Span, upright
+from su3d_bench.datasets.homes.plan import GAP_M, HomePlan, Span, upright
 from su3d_bench.datasets.homes.solids import Solids
 from su3d_bench.datasets.procedural.items import Item, Part
 from su3d_bench.datasets.procedural.materials import Material, Rgb, Texture, mix, shade, tone
@@ -21,6 +22,8 @@ SKIRTING = (0.012, 0.08)  # thickness and height, m
 CASING_M = 0.06  # width of the boards around a doorway
 WALL_COLOURS = ("white", "white", "beige", "grey", "yellow", "green", "blue", "pink")
 SKY, NIGHT_SKY = (0.75, 0.83, 0.94), (0.02, 0.025, 0.04)
+LINTEL_M = 2.3  # highest top of a window: the rod of a curtain fits under the ceiling
+CURTAIN_OPENING_M = 1.1  # between the open halves of a curtain as modelled
 SUNLIGHT = 4.0  # times the sky's: 100 klx of direct sun to 25 klx of blue sky, at noon
 
 
@@ -135,37 +138,48 @@ def _add_wall(plan: HomePlan, room: Room, wall: Wall, paint: Material, colour: s
     _add(plan, "wall", colour, "stone", parts, np.append(wall.start, 0.0), wall.yaw)
 
 
-def add_openings(plan: HomePlan, new: New) -> None:
-    """The entrance, the door between the rooms, and windows with what belongs to them."""
+def add_openings(plan: HomePlan, new: New) -> bool:
+    """The entrance, the door between the rooms, and windows with what belongs to them; whether all found a place."""
     rooms = plan.layout.rooms
-    _add_inner_door(plan)
-    walls = [wall for wall in rooms[0].walls if plan.layout.hole(wall) is None and wall.length > 1.6]
-    for k in plan.rng.permutation(len(walls)):
-        wall, door = walls[int(k)], new("door")
-        assert door is not None
-        half = door.size[0] / 2
-        along = 0.2 + half if plan.rng.random() < 0.5 else wall.length - 0.2 - half
-        placed = plan.hang(door, Span(wall, 0.0, wall.length), along, GAP_M)
-        if placed:
-            ahead = max(0.5, float(door.size[1]) + PERSON_M + 0.1)  # of a leaf that stands ajar
-            plan.keep_free.append(_before(wall, along, half + 0.05, ahead + 0.4))
-            plan.doors.append(wall.point(along, ahead))
-            side = 1.0 if along < wall.length / 2 else -1.0
-            plan.hang_new(new("switch"), Span(wall, 0.0, wall.length), along + side * (half + 0.2), 1.05)
-            break
+    if not (_add_inner_door(plan) and _add_entrance(plan, new)):
+        return False
     for room in rooms:
         n = 1 if len(rooms) > 1 else 2 + int(plan.rng.random() < 0.3)
         walls = [w for w in room.walls if plan.layout.hole(w) is None and w.length > 1.9]
+        before = len(plan.windows)
         for k in plan.rng.permutation(len(walls)):
             n -= bool(n > 0 and _add_window(plan, walls[int(k)], new))
+        if len(plan.windows) == before:
+            return False
     _add_sun(plan)
+    return True
 
 
-def _add_inner_door(plan: HomePlan) -> None:
+def _add_entrance(plan: HomePlan, new: New) -> bool:
+    walls = [w for w in plan.layout.rooms[0].walls if plan.layout.hole(w) is None and w.length > 1.6]
+    for k in plan.rng.permutation(len(walls)):
+        wall, door = walls[int(k)], new("door")
+        assert door is not None
+        half, deep = door.size[0] / 2, float(door.size[1])  # deep if it is ajar
+        along = 0.2 + half if plan.rng.random() < 0.5 else wall.length - 0.2 - half
+        plan.doors.append(wall.point(along, deep + 0.35))
+        if plan.hang(door, Span(wall, 0.0, wall.length), along, GAP_M):
+            plan.keep_free.append(_before(wall, along, half + 0.05, deep + 0.8))
+            side = 1.0 if along < wall.length / 2 else -1.0
+            plan.hang_new(new("switch"), Span(wall, 0.0, wall.length), along + side * (half + 0.2), 1.05)
+            return True
+        plan.doors.pop()
+    return False
+
+
+def _add_inner_door(plan: HomePlan) -> bool:
     """A door leaf ajar, hinged at the second room's side of the doorway."""
     if plan.layout.doorway is None:
-        return
-    wall, hole = next((w, h) for w in plan.layout.rooms[1].walls if (h := plan.layout.hole(w)) is not None)
+        return True
+    for room in plan.layout.rooms:
+        wall, hole = next((w, h) for w in room.walls if (h := plan.layout.hole(w)) is not None)
+        plan.keep_free.append(_before(wall, sum(hole) / 2, (hole[1] - hole[0]) / 2 + 0.05, 0.8))
+        plan.doors.append(wall.point(sum(hole) / 2, 0.35))
     width, height = hole[1] - hole[0] - 0.02, DOOR_HEIGHT_M - 0.02
     colour = str(plan.rng.choice(["white", "white", "brown", "beige", "grey"]))
     paint = Material(Texture.PLAIN, tone(colour), shade(tone(colour), 0.9), gloss=0.1)
@@ -173,21 +187,16 @@ def _add_inner_door(plan: HomePlan) -> None:
     panels = [block(width - 0.24, 0.052, h, z=z) for z, h in ((0.15, 0.7), (1.05, 0.8))]
     handles = [block(0.12, 0.03, 0.02, width / 2 - 0.1, side * 0.045, 0.98) for side in (-1, 1)]
     parts = (Part(join([block(width, 0.04, height), *panels]), paint), Part(join(handles), steel))
-    leaf = Item("door", colour, "wooden", "medium", parts, (), np.array([width, 0.12, height]), "")
+    leaf = Item("door", colour, "wooden", "medium", parts, (), np.array([width, 0.12, height]))
     hinges = [(hole[0], 1.0), (hole[1], -1.0)]
     if plan.rng.random() < 0.5:
         hinges.reverse()
     for opened, (hinge, sign) in product((plan.uniform(75, 110), 90.0, 80.0), hinges):
         angle = np.deg2rad(opened)
-        along = hinge + sign * np.cos(angle) * width / 2
-        at = wall.point(along, np.sin(angle) * width / 2 + 0.05)
+        at = wall.point(hinge + sign * np.cos(angle) * width / 2, np.sin(angle) * width / 2 + 0.05)
         if plan.put(leaf, at, wall.yaw - sign * opened, GAP_M, "wall"):
-            break
-    for room in plan.layout.rooms:
-        side = next((w, h) for w in room.walls if (h := plan.layout.hole(w)) is not None)
-        middle = (side[1][0] + side[1][1]) / 2
-        plan.keep_free.append(_before(side[0], middle, width / 2 + 0.05, 0.8))
-        plan.doors.append(side[0].point(middle, 0.35))
+            return True
+    return False
 
 
 def _before(wall: Wall, along: float, half: float, reach: float, z0: float = 0.0, z1: float = 2.0) -> Solids:
@@ -198,10 +207,11 @@ def _before(wall: Wall, along: float, half: float, reach: float, z0: float = 0.0
 def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     item = new("window")
     assert item is not None
-    margin = item.size[0] / 2 + 0.45
+    margin = item.size[0] / 2 + 0.5
     if wall.length < 2 * margin:
         return False
     along, sill = plan.uniform(margin, wall.length - margin), plan.uniform(0.86, 1.0)
+    sill = min(sill, LINTEL_M - float(item.size[2]))
     span = Span(wall, 0.0, wall.length)
     placed = plan.hang(item, span, along, sill)
     if placed is None:
@@ -213,14 +223,13 @@ def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     plan.windows.append(Window((x, y, sill + float(item.size[2]) / 2), u, (0.0, 0.0, float(height)), sky))
     plan.keep_free.append(_before(wall, along, item.size[0] / 2, 0.45, sill + 0.05, 2.3))
     plan.hang_new(new("radiator"), span, along, 0.12)
-    cover = plan.rng.random()
-    if cover < 0.5:
-        panel = new("curtain")
-        for side in (-1, 1):
-            if panel is not None:
-                plan.hang_new(panel, span, along + side * (item.size[0] / 2 + panel.size[0] / 2 + 0.05), GAP_M + 0.02)
-    elif cover < 0.65 and (blind := new("blinds")) is not None:
-        plan.hang_new(blind, span, along, sill + item.size[2] - 0.9 * blind.size[2], float(item.size[1]) + GAP_M)
+    top, cover = sill + float(item.size[2]), plan.rng.random()
+    if cover < 0.6 and (curtain := new("curtain")) is not None:
+        curtain = resized(curtain, x=max(1.0, float(item.size[0]) / CURTAIN_OPENING_M))
+        plan.hang_new(curtain, span, along, max(GAP_M, top + 0.1 - float(curtain.size[2])))
+    elif cover < 0.8 and (blind := new("blinds")) is not None:
+        blind = resized(blind, x=float(item.size[0] / blind.size[0]), z=min(1.0, float(item.size[2] / blind.size[2])))
+        plan.hang_new(blind, span, along, top - float(blind.size[2]), float(item.size[1]) + GAP_M)
     return True
 
 
