@@ -22,11 +22,11 @@ class SensorSettings:
     step_px: float = depth.STEP_PX
     baseline_m: float = depth.BASELINE_M
     camera_offset_m: float = 0.025  # infrared camera left of the colour camera (the ROS page of ``sensors/depth.py``)
-    near_m: float = 0.5  # Khoshelham and Elberink 2012 (Sensors 12), section 4.3: depth from 0.5 m to 5 m
+    near_m: float = 0.5  # Khoshelham and Elberink 2012 (Sensors 12) measure errors from here to 5 m
     far_m: float = 5.0
     # The Kinect is specified to 4 m (Microsoft, DepthRange.Default); there a grey card (0.18) still faces it seen.
     min_signal: float = 0.18 / 4.0**2
-    signal_spread: float = 0.3  # contrast of the speckle pattern within windows: a third of a stop either way
+    signal_spread: float = 0.3  # a guess at the contrast of the speckle pattern between windows: 0.4 stops
     min_gloss: float = 0.5  # above it the renderer's highlight is narrower than 10 degrees
     lobe_deg: float = 4.0  # half of that highlight's half width: projector and camera are both near the normal
     edge_width_px: int = 2  # less than half of a 9-pixel window, which then contains more of the other surface
@@ -39,7 +39,7 @@ class SensorSettings:
     metering_stride: int = 3  # measure every third frame ...
     metering_frames: int = 5  # ... 15 in all: 0.8^15 = 4 % of an older exposure remains
     min_ev: float = -2.0  # below a quarter, too many of an eight-bit image's saturated pixels would show as grey
-    max_ev: float = 3.0  # gain 8, the end of libcamera's range for the IMX219
+    max_ev: float = 3.0  # gain 8; imx219.json goes to 8 or 10
     # In the range of Brooks et al. 2019, 1e-4 .. 1.2e-2, where middle grey is as noisy as in TUM's fr1/desk (about one
     # level of 255 in the mean of the channels); ``read`` follows by their log read = 2.18 log shot + 1.20.
     shot: float = 4e-4

@@ -38,9 +38,8 @@ def view_statistics(dataset: GeneratedScenes, scene: str, stride: int) -> dict[s
 
 
 def motion(poses: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Metres and degrees (N - 1,) between consecutive poses (N, 4, 4); one zero each if there are fewer than two."""
-    if len(poses) < 2:
-        return np.zeros(1), np.zeros(1)
+    """Metres and degrees (N - 1,) between consecutive poses (N, 4, 4); one zero each for a single pose."""
+    poses = np.repeat(poses, 2, axis=0) if len(poses) == 1 else poses
     turn = np.einsum("nji,njk->nik", poses[:-1, :3, :3], poses[1:, :3, :3])
     cosine = (np.trace(turn, axis1=1, axis2=2) - 1) / 2
     translation = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)

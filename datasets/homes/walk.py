@@ -27,12 +27,13 @@ from su3d_bench.datasets.procedural import trajectory
 from su3d_bench.datasets.procedural.items import Box
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 
+Pair = tuple[Float64Array, Float64Array]
+Range = tuple[float, float]
 FRAMES_PER_SECOND = 30.0
 SHORTEST_S = 40.0  # a walk with fewer frames passes through the whole home all the same, with longer steps
 REACH_M = 2.5  # from the path to every free place: half of the 5 m to which depth cameras are accurate
 OPEN_M = 0.25  # stops are at least this far from the edge of the free cells, not in corners
-MAX_STOPS = 14
-ROUNDED = 0.85  # length of a path with rounded corners over that of the same path on the grid
+MAX_STOPS, ROUNDED = 14, 0.85  # ROUNDED: length of a path with rounded corners over that of the path on the grid
 KNOT_M = 0.35  # path between two chosen views: at a walking speed, about the 0.7 s of a head turn and a look
 CLEAR_M = 0.28  # from anything at the camera's height to the middle of its cell: 0.2 m and half the diagonal of 0.1 m
 REVISIT_DEG = 60.0  # least turn between the first and the last view, which are at one place
@@ -47,7 +48,7 @@ class Carrier:
     looks where it drives, and turns at stops.
     """
 
-    height: tuple[float, float]
+    height: Range
     speed: float
     turn: float
     swing: float
@@ -85,7 +86,7 @@ def walk_home(
     """
     kind = CARRIERS[carrier]
     level = kind.height if not kind.faces_path else (float(rng.uniform(*kind.height)),) * 2
-    field = _Field(_clear_cells(free, cell_m, origin, boxes, level), cell_m, origin)
+    field = _Field(free, cell_m, origin, boxes, level)
     duration = max(n_frames / FRAMES_PER_SECOND, SHORTEST_S)
     path, stops = _round_trip(field, boxes, kind, duration)
     knots = _place_knots(path, stops, kind, level, rng)
@@ -98,10 +99,8 @@ def walk_home(
     time = np.linspace(0.0, duration, n_frames, endpoint=False, dtype=np.float64)
     values = knots.arc, knots.height, yaw, pitch, np.zeros(len(at))
     arc, height, *turn = (trajectory.smooth_through(at, value, time) for value in values)
-    position, turned = (
-        np.column_stack([trajectory.along_loop(path, arc / knots.arc[-1]), height]),
-        np.column_stack(turn),
-    )
+    position = np.column_stack([trajectory.along_loop(path, arc / knots.arc[-1]), height])
+    turned = np.column_stack(turn)
     if carrier == "person":
         moved, rotated = _shake(rng, time, np.gradient(arc, time) if n_frames > 1 else np.zeros(n_frames))
         position += moved * np.clip(field.clearance(position[:, :2]) / 0.045, 0, 1)[:, None]
@@ -109,7 +108,7 @@ def walk_home(
     return trajectory.camera_poses(position, *turned.T)
 
 
-def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) -> tuple[Float64Array, Float64Array]:
+def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) -> Pair:
     """Metres (N, 3) and degrees (N, 3: yaw, pitch, roll) by which steps, slow drift and tremor move a held camera.
 
     Root mean squares per band are those of the TUM sequence fr1/desk: 4 mm and 0.7 degrees around the step
@@ -130,14 +129,23 @@ def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) ->
 
 
 class _Field:
-    """Free cells of a home and their distances to the others."""
+    """The largest part of the free cells that keeps away from boxes at the camera's height, and distances in it."""
 
-    def __init__(self, free: BoolArray, cell_m: float, origin: Float64Array) -> None:
+    def __init__(
+        self, free: BoolArray, cell_m: float, origin: Float64Array, boxes: Sequence[Box], level: Range
+    ) -> None:
         from scipy.ndimage import distance_transform_edt
 
-        self.free, self.cell_m, self.origin = free, cell_m, np.asarray(origin, np.float64)
-        self.cells = np.argwhere(free)
-        self.points = self.origin + (self.cells + 0.5) * cell_m
+        points = (np.moveaxis(np.indices(free.shape), 0, -1) + 0.5) * cell_m + origin
+        clear = free
+        for box in boxes:
+            if box.high[2] > level[0] - CLEAR_M and box.low[2] < level[1] + CLEAR_M:
+                near = (points > box.low[:2] - CLEAR_M) & (points < box.high[:2] + CLEAR_M)
+                clear = clear & ~near.all(axis=-1)
+        clear = trajectory.largest_part(clear)
+        free = clear if 2 * clear.sum() >= free.sum() else free  # the box of a slanted object may close a door
+        self.free, self.cell_m, self.origin = free, cell_m, origin
+        self.cells, self.points = np.argwhere(free), points[free]
         self._fine_m = cell_m / 4
         fine = np.pad(np.kron(free, np.ones((4, 4), bool)), 1)
         self._distance = np.asarray(distance_transform_edt(fine)) * self._fine_m
@@ -150,21 +158,7 @@ class _Field:
         return np.asarray(map_coordinates(self._distance, at, order=1)) - 0.75 * self._fine_m
 
 
-def _clear_cells(
-    free: BoolArray, cell_m: float, origin: Float64Array, boxes: Sequence[Box], level: tuple[float, float]
-) -> BoolArray:
-    """The largest part of ``free`` away from everything at the camera's height."""
-    points = (np.moveaxis(np.indices(free.shape), 0, -1) + 0.5) * cell_m + origin
-    for box in boxes:
-        if box.high[2] > level[0] - CLEAR_M and box.low[2] < level[1] + CLEAR_M:
-            near = ((points > box.low[:2] - CLEAR_M) & (points < box.high[:2] + CLEAR_M)).all(axis=-1)
-            free = free & ~near
-    return trajectory.largest_part(free)
-
-
-def _round_trip(
-    field: _Field, boxes: Sequence[Box], kind: Carrier, duration: float
-) -> tuple[Float64Array, Float64Array]:
+def _round_trip(field: _Field, boxes: Sequence[Box], kind: Carrier, duration: float) -> Pair:
     """A closed path (N, 2) through all parts of the home, and its stops in metres from its start."""
     from scipy.sparse.csgraph import dijkstra
 
@@ -215,8 +209,9 @@ def _relaxed(path: Float64Array, field: _Field) -> Float64Array:
 
 
 def _place_knots(
-    path: Float64Array, stops: Float64Array, kind: Carrier, level: tuple[float, float], rng: np.random.Generator
+    path: Float64Array, stops: Float64Array, kind: Carrier, level: Range, rng: np.random.Generator
 ) -> _Knots:
+    """Knots every ``KNOT_M`` between stops, and several at a stop, where the camera pans."""
     rows: list[tuple[float, bool, float, float]] = []
     length = stops[-1]
     for start, end in pairwise(stops):
@@ -235,9 +230,7 @@ def _place_knots(
     return _Knots(arc, moving, heading, trajectory.smooth_through(stops, rng.uniform(*level, len(stops)), arc), speeds)
 
 
-def _choose_views(
-    mesh: SceneMesh, path: Float64Array, knots: _Knots, kind: Carrier, n_structure: int
-) -> tuple[Float64Array, Float64Array]:
+def _choose_views(mesh: SceneMesh, path: Float64Array, knots: _Knots, kind: Carrier, n_structure: int) -> Pair:
     """Yaw and pitch (degrees, yaw unwrapped) at each knot, chosen to show every object repeatedly and well."""
     candidates = trajectory.candidate_views(kind.pitches)
     arcs, first, station = np.unique(knots.arc, return_index=True, return_inverse=True)

@@ -48,7 +48,7 @@ def motion_blur(
     """The mean of the image over an exposure, sampled along each pixel's projected motion.
 
     Poses (4, 4) are camera-to-world, of the image and at both ends of the exposure. Each pixel moves by its own depth;
-    one without depth is taken as infinitely far. At most ``n_samples``, fewer where nothing moves by as many pixels.
+    one without depth is taken as infinitely far. At most ``n_samples``, fewer if nothing moves by as many pixels.
     """
     import cv2
 
@@ -67,7 +67,7 @@ def motion_blur(
         return x / z, y / z
 
     flow_u, flow_v = (end - start for start, end in zip(seen_from(at_open), seen_from(at_close), strict=True))
-    n = min(n_samples, 1 + int(np.ceil(max(np.abs(flow_u).max(), np.abs(flow_v).max()))))
+    n = min(n_samples, max(1, int(np.ceil(max(np.abs(flow_u).max(), np.abs(flow_v).max())))))
     total, shifted = np.zeros_like(linear), np.empty_like(linear)
     for share in ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32):
         to_u, to_v = u - share * flow_u, v - share * flow_v

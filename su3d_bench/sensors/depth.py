@@ -16,7 +16,7 @@ from numpy.random import Generator
 from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.core.types import Float32Array as Image
 
-FOCAL_PX = 585.0  # of the infrared camera at 640 px; Nguyen et al. 2012, section 2.2, give lateral noise at this scale
+FOCAL_PX = 585.0  # of the infrared camera at 640 px, by which Nguyen et al. 2012 convert lateral noise
 BASELINE_M = 0.075  # Konolige and Mihelich, "Technical description of Kinect calibration", ROS wiki
 STEP_PX = 1 / 8  # the same page: disparity is interpolated to 1/8 pixel
 WINDOW_PX = 9  # the same page: disparity is found by correlating windows of 9x9 pixels
