@@ -13,7 +13,7 @@ from su3d_bench.datasets.homes.catalogue import Catalogue
 from su3d_bench.datasets.homes.groups import FREE, RELATIVE, Thing
 from su3d_bench.datasets.homes.layout import Zone, draw_layout
 from su3d_bench.datasets.homes.model_format import Strict
-from su3d_bench.datasets.homes.plan import HomePlan
+from su3d_bench.datasets.homes.plan import GAP_M, HomePlan
 from su3d_bench.datasets.homes.shell import add_openings, add_shell
 from su3d_bench.datasets.procedural.items import Item, Light, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
@@ -130,6 +130,8 @@ class _Furnisher:
         if any(self.do(need, zone, placed) is None for need in thing.needs):
             plan.back_to(before)
             return None
+        if thing.repeat:
+            self._repeat(item, placed)
         for name in thing.then:
             self.do(name, zone, placed)
         return placed
@@ -160,14 +162,14 @@ class _Furnisher:
             height = self.catalogue.classes[name].row.height
             placed = FREE[mode](self.plan, item, Thing(z=height, air=0.02), zone)
             if placed and mode == "floor":
-                self._repeat(item, placed, None, most, zone)
+                self._repeat(item, placed, most)
             return
         areas = np.array([(s.x1 - s.x0) * (s.y1 - s.y0) for _, s in places]) ** 0.5
         for k in self.rng.choice(len(places), min(len(places), 4), replace=False, p=areas / areas.sum()):
             holder, spot = places[int(k)]
             placed = self.plan.on_spot(item, holder, spot, "any", 25.0 if mode == "seat" else 6.0)
             if placed:
-                self._repeat(item, placed, spot, most, zone)
+                self._repeat(item, placed, most)
                 return
 
     def _open_spots(self, mode: str, zone: Zone) -> list[tuple[Placed, Spot]]:
@@ -192,7 +194,7 @@ class _Furnisher:
         item = self.new(rows[int(self.rng.choice(len(rows), p=weights / weights.sum()))][0])
         return item if item is not None and item.size.max() >= SMALLEST_M else None
 
-    def _repeat(self, item: Item, first: Placed, spot: Spot | None, most: int, zone: Zone) -> None:
+    def _repeat(self, item: Item, first: Placed, most: int = 6) -> None:
         """More objects of the class beside, on or around the first one."""
         for row in REPEATS.get(item.class_name, ()):
             tall = item.size[2] / item.size[0]
@@ -201,25 +203,28 @@ class _Furnisher:
             last = first
             for _ in range(min(most, int(self.rng.integers(row.n[0], row.n[1] + 1))) - 1):
                 other = item if row.same else self.new(item.class_name, model=item.model) or item
-                placed = self._next(row.how, other, last, spot, zone)
+                placed = self._next(row.how, other, last)
                 if placed is None:
                     return
                 last = placed
             return
 
-    def _next(self, how: str, item: Item, last: Placed, spot: Spot | None, zone: Zone) -> Placed | None:
+    def _next(self, how: str, item: Item, last: Placed) -> Placed | None:
         plan = self.plan
         if how == "stack":
             return plan.on_top(item, last, 10.0)
         jitter = plan.uniform(-4, 4) if how == "pair" else 0.0
         x = (last.item.size[0] + item.size[0]) / 2 + (0.02 if how == "pair" else 0.003)
-        if spot is None:
+        if last.id not in plan.parent:
             if how == "scatter":
                 x, y = self.rng.uniform(-0.6, 0.6, 2)
                 return plan.by(item, last, float(x), float(y), plan.uniform(-180, 180))
             return plan.by(item, last, x, 0.0, jitter)
         holder = plan.placed[plan.parent[last.id][0] - 1]
         local = rotation("z", -holder.yaw) @ (last.position - holder.position)
+        spot = next((s for s in holder.item.spots if abs(s.z + GAP_M - local[2]) < GAP_M and s.x0 <= local[0] <= s.x1 and s.y0 <= local[1] <= s.y1), None)
+        if spot is None:
+            return None
         if how == "scatter":
             return plan.on_spot(item, holder, spot, "any", 180.0)
         turn = last.yaw - holder.yaw

@@ -21,7 +21,7 @@ class Thing(Strict):
     """An object of a recipe and what belongs to it.
 
     ``put``: classes, one is drawn, or "=" for the very item of the anchor; or ``any``: other things, the first that
-    fits. ``at``: a word of ``FREE`` or ``RELATIVE``; ``n``: how many, ``same``: identical ones. ``gap``: m to the
+    fits. ``at``: a word of ``FREE`` or ``RELATIVE``; ``n``: how many, ``same``: identical ones; ``repeat``: also as the filler does. ``gap``: m to the
     anchor; ``shift``: m to its right; ``turn``: degrees at random; ``air``: m kept free around; ``z``: m of the lower
     edge; ``tall``: m, the height that the object may have. ``needs``: things without which it is removed again;
     ``then``: further things.
@@ -32,6 +32,7 @@ class Thing(Strict):
     at: str = "wall"
     n: tuple[int, int] = (1, 1)
     same: bool = False
+    repeat: bool = False
     chance: float = 1.0
     gap: Range = (0.0, 0.0)
     shift: Range = (0.0, 0.0)

@@ -256,7 +256,7 @@ class HomePlan:
         spans = self.spans(zone)
         for _ in range(TRIES):
             at, turn = self.rng.uniform(low, high), self.uniform(-180, 180)
-            if not is_middle and self.rng.random() < NEAR_WALL:
+            if not is_middle and (item.size[2] > LOW_M or self.rng.random() < NEAR_WALL):
                 span = spans[int(self.rng.integers(len(spans)))]
                 off = float(item.size[:2].max()) / 2 + BACK_M + self.uniform(0.0, 0.3)
                 at, turn = span.wall.point(self.uniform(span.a, span.b), off), span.wall.yaw + self.uniform(-25, 25)

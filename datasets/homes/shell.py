@@ -226,7 +226,9 @@ def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     top, cover = sill + float(item.size[2]), plan.rng.random()
     if cover < 0.6 and (curtain := new("curtain")) is not None:
         curtain = resized(curtain, x=max(1.0, float(item.size[0]) / CURTAIN_OPENING_M))
-        plan.hang_new(curtain, span, along, max(GAP_M, top + 0.1 - float(curtain.size[2])))
+        z = max(GAP_M, top + 0.1 - float(curtain.size[2]))
+        if plan.hang_new(curtain, span, along, z) is None:  # half drawn: in front of the window
+            plan.hang_new(curtain, span, along, z, float(item.size[1]) + GAP_M)
     elif cover < 0.8 and (blind := new("blinds")) is not None:
         blind = resized(blind, x=float(item.size[0] / blind.size[0]), z=min(1.0, float(item.size[2] / blind.size[2])))
         plan.hang_new(blind, span, along, top - float(blind.size[2]), float(item.size[1]) + GAP_M)
