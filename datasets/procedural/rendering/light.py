@@ -136,7 +136,7 @@ class _Room:
         self, start: Float64Array, facing: Float64Array, point: Float64Array, plane: Float64Array | None, area: float,
         gap_m: float,
     ) -> Float64Array:  # fmt: skip
-        """Form factors of a piece of ``area`` square metres that lies in ``plane`` or, without one, faces everywhere."""
+        """Form factors of a piece of ``area`` m2 that lies in ``plane`` or, without one, faces everywhere."""
         away = point - start
         square = (away**2).sum(axis=1) + 1e-9
         height = np.sqrt(square) if plane is None else np.abs(away @ _unit(plane))
