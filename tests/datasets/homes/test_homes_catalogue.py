@@ -71,7 +71,7 @@ def test_models_build_and_their_spots_are_inside(known) -> None:  # type: ignore
             corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in item.parts])
             assert np.isfinite(corners).all() and all(np.isfinite(part.shape.normals).all() for part in item.parts)
             assert abs(corners[:, 2].min()) < 1e-9 and np.allclose(np.ptp(corners, axis=0), item.size)
-            assert 0.004 < item.size.min() and item.size.max() < 3.2, (model.name, item.size)
+            assert item.size.min() > 0.004 and item.size.max() < 3.2, (model.name, item.size)
             assert item.class_name == known.name and item.model == model.name
             for spot in item.spots:
                 assert spot.x0 < spot.x1 and spot.y0 < spot.y1, model.name
