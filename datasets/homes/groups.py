@@ -21,10 +21,10 @@ class Thing(Strict):
     """An object of a recipe and what belongs to it.
 
     ``put``: classes, one is drawn, or "=" for the very item of the anchor; or ``any``: other things, the first that
-    fits. ``at``: a word of ``FREE`` or ``RELATIVE``; ``n``: how many, ``same``: identical ones; ``repeat``: also as the filler does. ``gap``: m to the
-    anchor; ``shift``: m to its right; ``turn``: degrees at random; ``air``: m kept free around; ``z``: m of the lower
-    edge; ``tall``: m, the height that the object may have. ``needs``: things without which it is removed again;
-    ``then``: further things.
+    fits. ``at``: a word of ``FREE`` or ``RELATIVE``; ``n``: how many, ``same``: identical ones; ``repeat``: also as the
+    filler does. ``gap``: m to the anchor; ``shift``: m to its right; ``turn``: degrees at random; ``air``: m kept free
+    around; ``z``: m of the lower edge; ``tall``: m, the height that the object may have. ``needs``: things without
+    which it is removed again; ``then``: further things.
     """
 
     put: tuple[str, ...] = ()

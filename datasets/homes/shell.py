@@ -23,7 +23,6 @@ CASING_M = 0.06  # width of the boards around a doorway
 WALL_COLOURS = ("white", "white", "beige", "grey", "yellow", "green", "blue", "pink")
 SKY, NIGHT_SKY = (0.75, 0.83, 0.94), (0.02, 0.025, 0.04)
 LINTEL_M = 2.3  # highest top of a window: the rod of a curtain fits under the ceiling
-CURTAIN_OPENING_M = 1.1  # between the open halves of a curtain as modelled
 SUNLIGHT = 4.0  # times the sky's: 100 klx of direct sun to 25 klx of blue sky, at noon
 
 
@@ -225,10 +224,9 @@ def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     plan.hang_new(new("radiator"), span, along, 0.12)
     top, cover = sill + float(item.size[2]), plan.rng.random()
     if cover < 0.6 and (curtain := new("curtain")) is not None:
-        curtain = resized(curtain, x=max(1.0, float(item.size[0]) / CURTAIN_OPENING_M))
         z = max(GAP_M, top + 0.1 - float(curtain.size[2]))
-        if plan.hang_new(curtain, span, along, z) is None:  # half drawn: in front of the window
-            plan.hang_new(curtain, span, along, z, float(item.size[1]) + GAP_M)
+        for side in (-1, 1):  # the same panel on both sides
+            plan.hang_new(curtain, span, along + side * float(item.size[0] + curtain.size[0] + 0.02) / 2, z)
     elif cover < 0.8 and (blind := new("blinds")) is not None:
         blind = resized(blind, x=float(item.size[0] / blind.size[0]), z=min(1.0, float(item.size[2] / blind.size[2])))
         plan.hang_new(blind, span, along, top - float(blind.size[2]), float(item.size[1]) + GAP_M)
