@@ -59,8 +59,9 @@ class CropSet:
 
     def first(self, n: int) -> CropSet:
         """The first ``n`` crops."""
-        each = (self.pixels, self.log_sizes, self.truths, self.ratios, self.is_exact, self.homes)
-        return CropSet(*(values[:n] for values in each))
+        return CropSet(
+            self.pixels[:n], self.log_sizes[:n], self.truths[:n], self.ratios[:n], self.is_exact[:n], self.homes[:n]
+        )
 
 
 def home_names(series: str, n_homes: int, first_number: int = 0) -> list[str]:

@@ -172,7 +172,7 @@ def _show_scene(arguments: argparse.Namespace) -> None:
         "no_frames": look.no_frames or None,
     }
     if answer_json(arguments, printable_json(table)):
-        return None
+        return
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:
         answer(f"up: {printable(up_text(look.up))}")

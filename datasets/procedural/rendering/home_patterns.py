@@ -65,132 +65,103 @@ def _view(u, v, style, seed, is_night):  # type: ignore[no-untyped-def]
     sky = _blend(sky, (0.86, 0.87, 0.9), 4.0 * puff if style != 5 else 0.65 + 2 * puff)
     if is_night:
         sky = _blend((0.5, 0.36, 0.3), (0.07, 0.11, 0.26), 2.2 * v - 0.4)
-    dark = 0.16 if is_night else 1.0
-    lamp = (5.0, 3.2, 1.5)
-    if style == 0:
-        for k in range(4):  # from the nearest ridge
-            if v < 0.14 + 0.12 * k + (0.2 + 0.05 * k) * (cloudy(u * (1.4 + k) + 7 * k, 0.5, seed + k) - 0.35):
-                grass = 0.7 + 0.6 * cloudy(u * 30, v * 50, seed + k)
-                near = _times((0.09, 0.15, 0.035), grass) if k else _times((0.16, 0.24, 0.06), grass)
-                return _times(_blend(near, (0.45, 0.55, 0.68), 0.27 * k), dark)
-    elif style == 1 or style == 3:
-        for k in range(2 if style == 1 else 3):
-            wide = 0.3 - 0.1 * k if style == 1 else 0.19 - 0.05 * k
-            a = u / wide + hash01(k, 9, seed)
-            house = math.floor(a)
-            a -= house
-            tall = (0.5 if style == 1 else 0.3) + 0.15 * k + 0.25 * hash01(house, k, seed)
-            roof = tall + (0.13 * (1 - abs(2 * a - 1)) if style == 1 else 0.0)
-            if v < roof:
-                tone = hash01(house, k + 20, seed)
-                wall = _blend((0.5, 0.43, 0.34), (0.36, 0.2, 0.14), tone)
-                wall = _blend(wall, (0.36, 0.39, 0.43), 0.0 if style == 1 else 0.8)
-                if v > tall:
-                    wall = _times((0.16, 0.09, 0.07), 0.8 + 0.4 * noise2(u * 90, v * 160, seed))
-                p, q = a * (3.0 if style == 1 else 5.0), v * (7.0 + 5.0 * k if style == 1 else 22.0)
-                if 0.3 < p - math.floor(p) < 0.75 and 0.3 < q - math.floor(q) < 0.8 and v < tall - 0.04:
-                    if is_night and hash01(int(p) + 9 * house, int(q), seed) < 0.4:
-                        return lamp
-                    wall = _blend((0.05, 0.06, 0.08), sky, 0.4 * hash01(int(p) + 9 * house, int(q), seed + 1))
-                if style == 1 and k == 0 and v < 0.1:
-                    wall = (0.12, 0.12, 0.13) if v < 0.07 else (0.3, 0.3, 0.29)
-                shaded = 0.85 + 0.3 * cloudy(u * 12, v * 12, seed)
-                return _times(_blend(wall, sky, 0.22 * k), dark * shaded)
-    elif style == 2:
-        for k in range(3):
-            leaves = cloudy(u * (4 + 3 * k) + 11 * k, v * (4 + 3 * k), seed + k)
-            if leaves > 0.3 + 0.55 * (v - 0.28 - 0.16 * k) and v > 0.1:
-                lit = 0.25 + 2.0 * max(0.0, cloudy(u * 26 + 0.4, v * 26 - 0.4, seed + k) - 0.25)
-                green = _blend((0.07, 0.15, 0.03), (0.2, 0.23, 0.05), hash01(k, 4, seed))
-                return _times(_blend(_times(green, lit * (0.6 + v)), sky, 0.13 * k), dark)
-        if v < 0.3:
-            return _times((0.15, 0.23, 0.06), dark * (0.6 + 0.8 * cloudy(u * 20, v * 60, seed)))
-    elif style == 4:
-        tone = _bricks(u * 1.6, v * 1.3, 0.16, seed)
-        p, q = abs(u - 0.3 - 0.4 * hash01(5, 5, seed)), abs(v - 0.55)
-        if p < 0.17 and q < 0.24:
-            if p > 0.15 or q > 0.22 or p < 0.008:
-                return _times((0.6, 0.6, 0.57), dark)
-            return lamp if is_night else _blend((0.06, 0.07, 0.09), sky, 0.3 * v + 0.5 * puff)
+    dark, lamp = 0.16 if is_night else 1.0, (5.0, 3.2, 1.5)
+    if style == 4:
+        tone, p, q = _bricks(u * 1.6, v * 1.3, 0.16, seed), abs(u - 0.3 - 0.4 * hash01(5, 5, seed)), abs(v - 0.55)
         wall = (0.3, 0.28, 0.26) if tone < 0 else _times((0.3, 0.13, 0.09), tone)
+        if p < 0.17 and q < 0.24:
+            wall = _blend((0.06, 0.07, 0.09), sky, 0.3 * v + 0.5 * puff)
+            if p > 0.15 or q > 0.22 or p < 0.008:
+                wall = (0.6, 0.6, 0.57)
+            elif is_night:
+                return lamp
         return _times(wall, dark * (0.75 + 0.4 * v))
-    elif v < 0.42:
-        wave = noise2(u * 12 + 30 * v, 5.0 / (0.46 - v) * 1.7, seed) - 0.5
-        foam = max(0.0, cloudy(u * 9, 3.0 / (0.45 - v), seed + 3) - 0.68) * 3
-        return _times(_blend(_times((0.2, 0.28, 0.32), 1.0 + 0.6 * wave), (0.8, 0.8, 0.8), foam), dark)
+    if style == 5:
+        if v > 0.42:
+            return sky
+        wave = 0.7 + 0.6 * noise2(u * 12 + 30 * v, 8.5 / (0.46 - v), seed)
+        foam = 3 * max(0.0, cloudy(u * 9, 3.0 / (0.45 - v), seed + 3) - 0.68)
+        return _times(_blend(_times((0.2, 0.28, 0.32), wave), (0.8, 0.8, 0.8), foam), dark)
+    for k in range(4):  # layers, from the nearest
+        fine = cloudy(u * 24 + 3 * k, v * (40 if style == 0 else 24), seed + k)
+        if style == 0:
+            top = 0.14 + 0.12 * k + (0.2 + 0.05 * k) * (cloudy(u * (1.4 + k) + 7 * k, 0.5, seed + k) - 0.35)
+            tint = _times(_blend((0.16, 0.24, 0.06), (0.09, 0.15, 0.035), k), 0.7 + 0.6 * fine)
+        elif style == 2:
+            top = 0.28 + 0.16 * k + 1.8 * (cloudy(u * (4 + 3 * k) + 11 * k, v * (4 + 3 * k), seed + k) - 0.3)
+            lit = (0.25 + 2.0 * max(0.0, fine - 0.25)) * (0.6 + v)
+            tint = _times(_blend((0.07, 0.15, 0.03), (0.2, 0.23, 0.05), hash01(k, 4, seed)), lit)
+        else:
+            is_street = style == 1
+            a = u / (0.3 - 0.05 * k if is_street else 0.2 - 0.03 * k) + hash01(k, 9, seed)
+            house = math.floor(a)
+            eaves = (0.45 if is_street else 0.25) + 0.12 * k + 0.25 * hash01(house, k, seed)
+            top = eaves + (0.13 * (1 - abs(2 * (a - house) - 1)) if is_street else 0.0)
+            tint = _blend((0.5, 0.43, 0.34), (0.36, 0.2, 0.14), hash01(house, k + 20, seed))
+            tint = _times(_blend(tint, (0.36, 0.39, 0.43), 0.0 if is_street else 0.8), 0.8 + 0.4 * fine)
+            p, q = (a - house) * (3 if is_street else 5), v * (7 + 4 * k if is_street else 22)
+            if v > eaves:
+                tint = _times((0.16, 0.09, 0.07), 0.6 + 0.8 * fine)
+            elif is_street and k == 0 and v < 0.1:
+                tint = (0.12, 0.12, 0.13) if v < 0.07 else (0.3, 0.3, 0.29)
+            elif 0.3 < p - math.floor(p) < 0.75 and 0.3 < q - math.floor(q) < 0.8 and v < eaves - 0.04:
+                pick = hash01(int(p) + 9 * house, int(q), seed + k)
+                if is_night and pick < 0.4:
+                    return lamp
+                tint = _blend((0.05, 0.06, 0.08), sky, 0.4 * pick)
+        if v < top:
+            return _times(_blend(tint, sky, 0.2 * k), dark)
     return sky
 
 
 @inlined
 def _painting(u, v, style, a, b, seed):  # type: ignore[no-untyped-def]
-    """A picture in 0..1: six painted scenes, a still life, blots, fields, leaves, a photograph; 11 is a poster."""
+    """A picture in 0..1: six painted views, a still life, blots, fields of colour, a photograph; 10 is a poster."""
     paper = (0.78, 0.75, 0.68)
-    if style in (7, 8, 9) and min(min(u, 1 - u), min(v, 1 - v)) < 0.13:
-        return paper
-    stroke = noise2(u * 90 + 40 * noise2(u * 5, v * 5, seed), v * 45, seed)
-    if style < 6 or style == 10:  # strokes displace what is painted
-        drift = 0.03 if style < 6 else 0.0
-        p, q = u + drift * (noise2(u * 35, v * 35, seed) - 0.5), v + drift * (noise2(u * 35, v * 35, seed + 1) - 0.5)
-        scene = _view(p, q, style if style < 6 else int(seed) % 6, seed, False)
-        if style == 10:
-            grey = 0.75 * (0.3 * scene[0] + 0.55 * scene[1] + 0.15 * scene[2])
-            edge = 1 - 1.3 * ((u - 0.5) ** 2 + (v - 0.5) ** 2)
-            return grey * edge, 0.97 * grey * edge, 0.9 * grey * edge
-        return _times(_blend(scene, _blend(a, b, v), 0.3), 0.65 + 0.35 * stroke)
+    stroke = 0.75 + 0.4 * noise2(u * 90 + 40 * noise2(u * 5, v * 5, seed), v * 45, seed)
+    if style < 6:  # strokes displace what is painted
+        p, q = 0.03 * (noise2(u * 35, v * 35, seed) - 0.5), 0.03 * (noise2(u * 35, v * 35, seed + 1) - 0.5)
+        return _times(_blend(_view(u + p, v + q, style, seed, False), _blend(a, b, v), 0.3), stroke)
     if style == 6:  # fruit and jars on a table, lit from the left
-        ground = _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
-        if v < 0.36:
-            ground = _times((0.2, 0.12, 0.07), 0.8 + 0.4 * stroke)
+        ground = (0.2, 0.12, 0.07) if v < 0.36 else _times((0.09, 0.08, 0.07), 0.7 + 0.8 * u)
         for k in range(5):
             wide = 0.06 + 0.06 * hash01(k, 1, seed)
             tall = wide * (1.0 if k < 3 else 2.2)
             p, q = (u - 0.2 - 0.14 * k) / wide, (v - 0.26 - 0.05 * hash01(k, 2, seed) - tall) / tall
             if p * p + q * q < 1:
                 ripe = _blend((0.5, 0.22, 0.05), (0.35, 0.33, 0.1), hash01(k, 3, seed))
-                body = _blend(a, b, 0.5 * k) if k % 2 == 0 else ripe
-                ground = _times(body, (0.25 + 0.75 * max(0.0, 0.6 - 0.55 * p + 0.3 * q)) * (0.8 + 0.3 * stroke))
-        return ground
+                ground = _blend(_blend(a, b, 0.5 * k), ripe, k % 2)
+                ground = _times(ground, 0.25 + 0.75 * max(0.0, 0.6 - 0.55 * p + 0.3 * q))
+        return _times(ground, stroke)
+    if style < 9 and min(min(u, 1 - u), min(v, 1 - v)) < 0.13:
+        return paper
     if style == 7:
-        p = cloudy(u * 2.3, v * 2.3, seed) + 0.5 * cloudy(u * 5, v * 5, seed + 2)
-        q = cloudy(u * 2 + 9, v * 3, seed + 4)
-        tint = _blend(paper, a, 9 * (p - 0.74)) if p < 0.9 else _blend(a, (0.05, 0.05, 0.06), 8 * (p - 0.95))
-        return _times(_blend(tint, b, 12 * (q - 0.58)), 0.85 + 0.25 * stroke)
+        p, q = rough(u * 2.3, v * 2.3, seed), rough(u * 2 + 9, v * 3, seed + 4)
+        return _times(_blend(_blend(paper, a, 9 * (p - 0.5)), b, 12 * (q - 0.58)), stroke)
     if style == 8:
         band = math.floor(v * 3.2 + 0.25 * (noise2(u * 3, v, seed) - 0.5))
-        tint = _blend(_blend(a, b, 0.5 * band), paper, 0.35 * hash01(band, 5, seed))
-        return _times(tint, 0.82 + 0.3 * stroke)
-    if style == 9:  # a twig with leaves
-        for k in range(9):
-            root = 0.2 + 0.065 * k
-            side = 1 if k % 2 else -1
-            along = (u - 0.5) * side * 0.8 + (v - root) * 0.6
-            across = (v - root) * 0.8 - (u - 0.5) * side * 0.6
-            if 0 < along < 0.24 and abs(across) < 0.16 * along * (0.24 - along) / 0.06:
-                vein = 0.8 if abs(across) < 0.004 else 1.0
-                return _times(_blend(_blend((0.08, 0.14, 0.06), a, 0.5), paper, 0.3 * stroke), vein)
-        return _blend(a, paper, 0.2) if abs(u - 0.5) < 0.005 and 0.16 < v < 0.8 else _times(paper, 0.96 + 0.04 * stroke)
-    picture = _view(u, (v - 0.36) / 0.6, int(seed) % 6, seed, False)
-    if v > 0.36:
-        return _blend(picture, a, 0.35)
+        return _times(_blend(_blend(a, b, 0.5 * band), paper, 0.35 * hash01(band, 5, seed)), stroke)
+    scene = _view(u, v if style == 9 else (v - 0.36) / 0.6, seed % 6, seed, False)
+    if style == 9:
+        grey = (0.3 * scene[0] + 0.6 * scene[1] + 0.1 * scene[2]) * (0.8 - (u - 0.5) ** 2 - (v - 0.5) ** 2)
+        return grey, 0.97 * grey, 0.9 * grey
     ink = max(_text((u - 0.1) / 0.8, (v - 0.2) / 0.13, 1, seed), _text((u - 0.1) / 0.8, (v - 0.05) / 0.12, 4, seed + 1))
-    return _blend(b, (0.03, 0.03, 0.04) if b[1] > 0.2 else paper, ink)
+    return _blend(scene, a, 0.35) if v > 0.36 else _blend(b, (0.03, 0.03, 0.04) if b[1] > 0.2 else paper, ink)
 
 
 @inlined
 def _package(u, v, a, b, seed):  # type: ignore[no-untyped-def]
     """Packaging in 0..1: bands, a picture, a title, small print, a bar code."""
-    cut = 0.3 + 0.3 * hash01(1, 1, seed)
-    ground = a if v > cut + 0.05 * math.sin(6 * u) * (int(seed) % 2) else b
-    paper = (0.8, 0.79, 0.75)
-    dark = (0.03, 0.03, 0.04)
+    cut, paper, dark = 0.3 + 0.3 * hash01(1, 1, seed), (0.8, 0.79, 0.75), (0.03, 0.03, 0.04)
+    ground = a if v > cut + 0.05 * math.sin(6 * u) * (seed % 2) else b
     if 0.72 < u < 0.95 and 0.04 < v < 0.16:
         return dark if hash01(int(u * 150), 7, seed) < 0.5 and v > 0.06 else paper
-    if _text((u - 0.08) / 0.84, (v - 0.72) / 0.2, 1, seed) > 0:
-        return paper if a[1] < 0.35 else dark
     p, q = u - 0.5, (v - cut) * 1.2
-    if p * p + q * q < 0.035 and int(seed) % 3:
-        return _times(_blend(_blend(b, paper, 0.4), a, 3 * (cloudy(u * 6, v * 6, seed) - 0.3)), 0.8 + p)
-    ink = _text((u - 0.07) / 0.6, (v - 0.03) / 0.2, 7, seed + 2)
+    if p * p + q * q < 0.035 and seed % 3:
+        ground = _times(_blend(_blend(b, paper, 0.4), a, 3 * (cloudy(u * 6, v * 6, seed) - 0.3)), 0.8 + p)
+    ink = max(
+        _text((u - 0.07) / 0.6, (v - 0.03) / 0.2, 7, seed + 2), _text((u - 0.08) / 0.84, (v - 0.72) / 0.2, 1, seed)
+    )
     return _blend(ground, paper if ground[1] < 0.35 else dark, 0.85 * ink)
 
 
@@ -231,22 +202,21 @@ def _plaster(u, v, a, b, part, seed, foot):  # type: ignore[no-untyped-def]
 @inlined
 def home_colour(kind, x, y, z, u, v, row, foot):  # type: ignore[no-untyped-def]
     """Red, green and blue (linear) of the textures from ``VIEW`` on; parameters as in ``surface_colour``."""
-    a, b = (row[1], row[2], row[3]), (row[4], row[5], row[6])
-    a, b = _times(a, 1.0), _times(b, 1.0)
+    a, b = _times((row[1], row[2], row[3]), 1.0), _times((row[4], row[5], row[6]), 1.0)
     scale, seed = row[7] * 1.0, int(row[15])
     fu, fv = (u - row[11]) / (row[12] - row[11]), (v - row[13]) / (row[14] - row[13])
+    i, j = math.floor(u / scale), math.floor(v / scale)
     if kind == 25:
         return _view(fu, fv, seed % 6, seed, row[9] < 0.3)
     if kind == 26 or kind == 32:
-        return _painting(fu, fv, 11 if kind == 32 else seed % 11, a, b, seed)
+        return _painting(fu, fv, 10 if kind == 32 else seed % 10, a, b, seed)
     if kind == 27:
         return _plaster(u, v, a, b, int(row[10]), seed, foot)
     if kind == 28:  # woven yarn of two tones, with folds
-        i, j = math.floor(u / scale), math.floor(v / scale)
         p, q = u / scale - i - 0.5, v / scale - j - 0.5
-        over = (i + j) % 2 == 0
-        yarn = hash01(i, 1, seed) if over else hash01(j, 2, seed)
-        relief = 1.08 - (1.1 * p * p + 0.5 * q * q if over else 1.1 * q * q + 0.5 * p * p)
+        if (i + j) % 2:
+            i, p, q = j + 4096, q, p
+        relief, yarn = 1.08 - 1.1 * p * p - 0.5 * q * q, hash01(i, 1, seed)
         folds = 0.8 + 0.26 * noise3(x * 5.0, y * 5.0, z * 5.0, seed) + 0.14 * noise3(x * 17.0, y * 17.0, z * 17.0, seed)
         return _times(_blend(a, b, 0.75 * yarn), relief * folds)
     if kind == 29:
@@ -263,16 +233,13 @@ def home_colour(kind, x, y, z, u, v, row, foot):  # type: ignore[no-untyped-def]
         tone *= 1 - 0.6 * _line(gap, 0.0016, foot) - 0.15 * _line(gap, 0.0044, foot)
         return _times(_blend(a, b, 0.35 + 0.7 * grain + 0.13 * rings), tone)
     if kind == 31:
-        i, j = math.floor(u / scale), math.floor(v / scale)
         p, q = u - i * scale, v - j * scale
         edge = min(min(p, scale - p), min(q, scale - q))
         tone = 0.9 + 0.16 * hash01(i, j, seed) + 0.12 * (rough(u * 14 + 7 * i, v * 14 + 3 * j, seed) - 0.5)
-        warm = 0.05 * (hash01(i, j, seed + 1) - 0.5)
+        warm = _blend(a, b, 0.1 * hash01(i, j, seed + 1))
         tone *= 1.0 - 0.12 * max(0.0, 1 - edge / 0.02) * rough(u * 20, v * 20, seed + 2)
         grout = _times(b, 0.55 + 0.75 * rough(u * 9, v * 9, seed))
-        return _blend(
-            (a[0] * tone * (1 + warm), a[1] * tone, a[2] * tone * (1 - warm)), grout, _line(edge, 0.004, foot)
-        )
+        return _blend(_times(warm, tone), grout, _line(edge, 0.004, foot))
     if kind == 33:
         return _package(fu, fv, a, b, seed)
     if row[12] - row[11] > row[14] - row[13]:  # a spine that lies

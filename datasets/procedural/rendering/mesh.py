@@ -140,18 +140,23 @@ def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> Sc
     normals = at_rows(patches.normals, grid.rows)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     texture = at_rows(patches.texture, grid.rows)
-    faces = grid.faces.astype(np.int32)
-    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    quad = np.concatenate([grid.quad_of_face, grid.quad_of_face])
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-10
-    triangles, quad = triangles[solid], quad[solid]
+    triangles, quad = triangles_of(grid, points)
     light = _bake(grid, patches, points, normals, triangles, lights, exposure)
     sources = np.array([[*source.position, max(source.colour)] for source in lights], np.float32)
     return SceneMesh(
         points.astype(np.float32), normals.astype(np.float32), texture.astype(np.float32), light,
         triangles.astype(np.int32), patches.object_id[quad], patches.material[quad], patches.materials, sources,
     )  # fmt: skip
+
+
+def triangles_of(grid: Grid, points: Float64Array) -> tuple[Int32Array, Int32Array]:
+    """Two triangles (T, 3) of each face, unless they are empty, and their quads (T,)."""
+    faces = grid.faces.astype(np.int32)
+    triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    quad = np.concatenate([grid.quad_of_face, grid.quad_of_face])
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-10
+    return triangles[solid], quad[solid]
 
 
 def caster(vertices: Float32Array, triangles: Int32Array) -> object:
@@ -175,21 +180,26 @@ def _bake(
     first, group = merge_equal(keys.astype(np.int64))
     where, facing = points[first], normals[first]
     scene = caster(points.astype(np.float32), triangles)
-    inward = patches.corners[quad[first]].mean(axis=1) - where
-    far = np.linalg.norm(inward, axis=1, keepdims=True)
-    start = where + facing * 0.004 + inward * np.minimum(0.1, 0.015 / np.maximum(far, 1e-9))  # away from the edges
+    start = off_surface(where, facing, patches.corners[quad[first]].mean(axis=1))
     total = np.zeros((len(first), 3))
     for source in lights:
         total += _direct(scene, start, facing, source)[:, None] * np.array(source.colour)
-    share = _open_sky(scene, start, facing)
+    share = open_sky(scene, start, facing)
     up = 0.86 + 0.14 * facing[:, 2:]
     total += AMBIENT * (0.4 + 0.6 * share[:, None]) * up * np.array([1.0, 0.985, 0.96])
-    total = _fill_buried(total, share == 0, group[triangles])
+    total = fill_buried(total, share == 0, group[triangles])
     total *= exposure / np.percentile(total.mean(axis=1), 70)
     return total[group].astype(np.float32)
 
 
-def _fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDArray[np.intp]) -> Float64Array:
+def off_surface(where: Float64Array, facing: Float64Array, middle: Float64Array) -> Float64Array:
+    """Starts of rays: above the surface, and away from the edges of a quad with this ``middle``."""
+    inward = middle - where
+    far = np.linalg.norm(inward, axis=1, keepdims=True)
+    return np.asarray(where + facing * 0.004 + inward * np.minimum(0.1, 0.015 / np.maximum(far, 1e-9)))
+
+
+def fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDArray[np.intp]) -> Float64Array:
     """Light of vertices inside another solid, taken from their neighbours, so that darkness does not bleed out."""
     turned = triangles[:, [1, 2, 0]]
     tail, head = np.concatenate([triangles, turned]).ravel(), np.concatenate([turned, triangles]).ravel()
@@ -205,12 +215,12 @@ def _fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDAr
     return filled
 
 
-_DISC = np.array([[0.0, 0.0, 0.0], [0.8, 0.3, -0.5], [-0.7, 0.5, 0.4], [0.1, -0.85, 0.5], [-0.2, 0.4, -0.85]])
+DISC = np.array([[0.0, 0.0, 0.0], [0.8, 0.3, -0.5], [-0.7, 0.5, 0.4], [0.1, -0.85, 0.5], [-0.2, 0.4, -0.85]])
 
 
 def _direct(scene: object, start: Float64Array, facing: Float64Array, light: Light) -> Float64Array:
     received = np.zeros(len(start))
-    for offset in _DISC:
+    for offset in DISC:
         away = np.array(light.position) + light.radius * offset - start
         distance = np.linalg.norm(away, axis=1)
         cosine = (facing * away).sum(axis=1) / distance
@@ -218,13 +228,13 @@ def _direct(scene: object, start: Float64Array, facing: Float64Array, light: Lig
         if not len(lit):
             continue
         rays = np.concatenate([start[lit], away[lit]], axis=1).astype(np.float32)
-        free = ~_blocked(scene, rays, 0.985)
+        free = ~blocked(scene, rays, 0.985)
         falloff = 1.0 / (1.0 + (distance[lit] / 1.9) ** 2)
         received[lit] += np.where(free, (0.15 + 0.85 * cosine[lit]) * falloff, 0.0)
-    return received / len(_DISC)
+    return received / len(DISC)
 
 
-def _open_sky(scene: object, start: Float64Array, facing: Float64Array) -> Float64Array:
+def open_sky(scene: object, start: Float64Array, facing: Float64Array) -> Float64Array:
     """Share of a few fixed directions around the normal that are unobstructed nearby."""
     helper = np.where(np.abs(facing[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
     side = np.cross(facing, helper)
@@ -238,11 +248,11 @@ def _open_sky(scene: object, start: Float64Array, facing: Float64Array) -> Float
             angle = 2 * np.pi * (k / count + phase)
             ray = facing * np.sqrt(1 - sine**2) + sine * (side * np.cos(angle) + over * np.sin(angle))
             rays = np.concatenate([start, ray * OCCLUSION_REACH_M], axis=1).astype(np.float32)
-            free += ~_blocked(scene, rays, 1.0)
+            free += ~blocked(scene, rays, 1.0)
     return free / n
 
 
-def _blocked(scene: object, rays: Float32Array, far: float) -> NDArray[np.bool_]:
+def blocked(scene: object, rays: Float32Array, far: float) -> NDArray[np.bool_]:
     o3d = compiled_open3d()
     hit = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=far)  # type: ignore[attr-defined]
     return np.asarray(hit.numpy(), bool)

@@ -28,32 +28,24 @@ SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 @compiled
 def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, material, is_edge):  # type: ignore[no-untyped-def]
     """Marks the pixels of rows ``start`` to ``stop`` with a neighbour on another object, material or plane."""
-    height = t.shape[0] // width
-    for row in range(start, stop):
-        for column in range(width):
-            i = row * width + column
-            is_edge[i] = False
-            for k in range(4):
-                r, c = row + (k == 0) - (k == 1), column + (k == 2) - (k == 3)
-                if not (0 <= r < height and 0 <= c < width):
+    for i in range(start * width, stop * width):
+        is_edge[i] = False
+        for k in range(4):
+            j = i + (1, -1, width, -width)[k]
+            if not 0 <= j < t.shape[0] or (k < 2 and j // width != i // width):
+                continue
+            f, g, hit = triangle[i], triangle[j], t[i] < 1e9
+            if f == g or not (hit or t[j] < 1e9):
+                continue
+            if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
+                alike, off = 0.0, 0.0
+                for c in range(3):
+                    alike += face_normals[f, c] * face_normals[g, c]
+                    off += face_normals[f, c] * (t[j] * rays[j, 3 + c] - t[i] * rays[i, 3 + c])
+                if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
                     continue
-                j = r * width + c
-                f, g = triangle[i], triangle[j]
-                if f == g or not (t[i] < 1e9 or t[j] < 1e9):
-                    continue
-                if not (t[i] < 1e9 and t[j] < 1e9) or instance[f] != instance[g] or material[f] != material[g]:
-                    is_edge[i] = True
-                    break
-                nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
-                alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
-                off = (
-                    nx * (t[j] * rays[j, 3] - t[i] * rays[i, 3])
-                    + ny * (t[j] * rays[j, 4] - t[i] * rays[i, 4])
-                    + nz * (t[j] * rays[j, 5] - t[i] * rays[i, 5])
-                )
-                if alike < SMOOTH_COSINE or abs(off) > 0.002 * t[i] + 0.001:
-                    is_edge[i] = True
-                    break
+            is_edge[i] = True
+            break
 
 
 @compiled
@@ -123,20 +115,14 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
         own = 1.0
         if not is_last and (mirror > 0 or clear > 0):
             share = mirror if mirror > 0 else clear * (1 - fresnel)
-            own = 1.0 - max(mirror, clear)
-            white = 0.8 if mirror > 0 else 0.5
-            tint[i, 0] = share * (white + (1 - white) * r)
-            tint[i, 1] = share * (white + (1 - white) * g)
-            tint[i, 2] = share * (white + (1 - white) * b)
-            wx, wy, wz = dx, dy, dz
-            if mirror > 0:
-                mx, my, mz = _between(normals, i0, i1, i2, b0, b1, b2)
-                into = 2 * (dx * mx + dy * my + dz * mz)
-                wx, wy, wz = dx - into * mx, dy - into * my, dz - into * mz
+            own, white = 1.0 - max(mirror, clear), (0.8 if mirror > 0 else 0.5)
+            mx, my, mz = _between(normals, i0, i1, i2, b0, b1, b2)
+            into = 2 * (dx * mx + dy * my + dz * mz) if mirror > 0 else 0.0
+            tint[i, 0], onward[i, 3] = share * (white + (1 - white) * r), dx - into * mx
+            tint[i, 1], onward[i, 4] = share * (white + (1 - white) * g), dy - into * my
+            tint[i, 2], onward[i, 5] = share * (white + (1 - white) * b), dz - into * mz
             for k in range(3):
-                w = wx if k == 0 else (wy if k == 1 else wz)
-                onward[i, k] = rays[i, k] + far * rays[i, 3 + k] + 5e-4 * w / length
-                onward[i, 3 + k] = w
+                onward[i, k] = rays[i, k] + far * rays[i, 3 + k] + 5e-4 * onward[i, 3 + k] / length
         own *= 1 - gloss * fresnel
         colour[i, 0] = own * r * (lr + glow) + shine + spark
         colour[i, 1] = own * g * (lg + glow) + shine + spark
