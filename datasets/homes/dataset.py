@@ -60,8 +60,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
         hint = nearest(scene, DEFAULT_SCENES) or ""
         raise DataError(
-            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or seed0 to "
-            f"seed999999{hint}"
+            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
+            f"such as seed7{hint}"
         )
     return match[1], int(match[2])
 
