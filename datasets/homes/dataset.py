@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
 from su3d_bench.sensors.colour import mean_luminance
 from su3d_bench.sensors.poses import shutter
 
+LIGHT_M, TRAINING_LIGHT_M = 0.06, 0.15  # between points at which light is computed; coarser where speed counts more
 METERED_WIDTH = 80  # of the images from which the exposure follows: a mean needs no more
 N_NAMED = 24  # homes for tuning, and as many for testing
 SERIES = ("tuning", "test", "seed", "training")
@@ -96,7 +97,8 @@ class BuiltHome(BuiltScene):
     def make_mesh(self) -> SceneMesh:
         plan = self.plan
         exposure = float(self._random("exposure").uniform(0.58, 0.72))
-        return lit_mesh(self.patches, plan.lights, plan.sun, plan.windows, exposure)
+        spacing_m = TRAINING_LIGHT_M if self.series == "training" else LIGHT_M
+        return lit_mesh(self.patches, plan.lights, plan.sun, plan.windows, exposure, spacing_m)
 
     def make_renderer(self, width: int, height: int, like: Renderer | None = None) -> Renderer:
         return SampledRenderer(self.mesh, width, height, like)
@@ -126,7 +128,7 @@ class Homes(GeneratedScenes):
     Options = HomeOptions
     version = 1
     options: HomeOptions
-    sources = ("datasets/homes", "datasets/procedural", "numerics")
+    sources: ClassVar[tuple[str, ...]] = ("datasets/homes", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
     label_set = staticmethod(label_set)
 
