@@ -69,7 +69,8 @@ def _add_floor(plan: HomePlan, room: Room, cover: str) -> None:
     colours = {"wooden": ["brown", "beige", "beige", "grey"], "tiles": ["beige", "grey", "white"],
                "carpet": ["grey", "beige", "blue", "green"]}[cover]  # fmt: skip
     colour = str(rng.choice(colours[:2] if plan.muted else colours))
-    base, seed = tone(colour, rng), int(rng.integers(1, 999))
+    base = mix(tone(colour, rng), tone("grey"), 0.55 if cover == "carpet" else 0.0)  # carpets are dull
+    seed = int(rng.integers(1, 999))
     material = {
         "wooden": Material(Texture.PLANKS, base, shade(base, 0.55), 0.035, 0.15, seed=seed),
         "tiles": Material(Texture.TILES, base, shade(base, 0.6), plan.uniform(0.28, 0.42), 0.25, seed=seed),
