@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError, nearest
 from su3d_bench.core.types import Float64Array, Frame, LabelSet, UInt8Array
 from su3d_bench.datasets.homes.catalogue import HomeClass, catalogue, read_classes
 from su3d_bench.datasets.homes.furnish import furnish
-from su3d_bench.datasets.homes.plan import HomePlan
+from su3d_bench.datasets.homes.plan import PERSON_M, HomePlan
 from su3d_bench.datasets.homes.sensor import CameraContext, Materials, SensorSettings, drifted, metered, record
 from su3d_bench.datasets.homes.walk import walk_home
 from su3d_bench.datasets.procedural.dataset import (
@@ -105,12 +105,12 @@ class BuiltHome(BuiltScene):
 
     def make_trajectory(self) -> Float64Array:
         plan, cell_m = self.plan, 0.1
-        free, origin = plan.free(cell_m)
+        free, origin = plan.free(cell_m, PERSON_M)  # where people fit; all of it is connected
         carrier = self.options.carrier
         if carrier == "either":
             carrier = "robot" if self.number % 3 == 2 else "person"
         return walk_home(
-            self.unlit, free, cell_m, origin, list(plan.boxes.values()), plan.n_structure, self.options.n_frames,
+            self.unlit, free, cell_m, origin, (), plan.n_structure, self.options.n_frames,
             self._random("walk"), carrier,
         )  # fmt: skip
 

@@ -18,7 +18,7 @@ from su3d_bench.datasets.homes.shell import add_openings, add_shell
 from su3d_bench.datasets.procedural.items import Item, Light, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
-N_OBJECTS = (95, 145)  # of a home: the fewest and the most
+N_OBJECTS = (95, 145)  # of a home without its shell: the fewest and the most
 PER_M2 = (2.4, 3.6)  # objects: small homes hold the fewest, large ones would look empty with them
 FEWEST = 90  # a home that has space for fewer is drawn again
 SMALLEST_M = 0.06  # longest side of what the filler adds: smaller things have too few pixels to be annotated
@@ -62,7 +62,7 @@ def furnish(
     layout = layout or str(rng.choice(list(LAYOUTS)))  # before homes are drawn again, so that all are equally frequent
     while True:
         home = _Furnisher(HomePlan(rng, draw_layout(rng, layout), muted, is_evening), catalogue, training)
-        if home.is_begun() and len(home.finished().placed) >= FEWEST:
+        if home.is_begun() and home.finished().n_objects >= FEWEST:
             return home.plan
 
 
@@ -146,7 +146,7 @@ class _Furnisher:
         for placed in plan.placed:
             self.n_of[placed.item.class_name] += 1
         failures = 0
-        while len(plan.placed) < target and failures < MAX_FAILURES:
+        while plan.n_objects < target and failures < MAX_FAILURES:
             before = len(plan.placed)
             zone = plan.layout.zones[int(self.rng.integers(len(plan.layout.zones)))]
             self._fill_one(modes[int(self.rng.choice(len(modes), p=weights / weights.sum()))], zone, target - before)

@@ -71,6 +71,11 @@ class HomePlan:
         """Use and corners (N, 2) of each room."""
         return tuple((" and ".join(room.kinds), room.corners) for room in self.layout.rooms)
 
+    @property
+    def n_objects(self) -> int:
+        """Objects besides walls, floors and ceilings."""
+        return len(self.placed) - self.n_structure
+
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
 
