@@ -175,7 +175,7 @@ def _one_room(name: str, width: tuple[float, float], depth: tuple[float, float],
 
 def _l_shaped(rng: np.random.Generator) -> Layout:
     """A main part with a wing; the notch is at the upper right."""
-    w, d = float(rng.uniform(6.6, 8.4)), float(rng.uniform(6.0, 7.4))
+    w, d = float(rng.uniform(6.4, 7.8)), float(rng.uniform(5.6, 6.8))
     nx, ny = w - float(rng.uniform(2.5, 3.4)), d - float(rng.uniform(2.4, 3.2))
     kinds = (("living", "dining"), ("living", "kitchen"), ("dining", "kitchen"), ("bedroom", "office"),
              ("living", "office"), ("hobby", "bedroom"), ("children", "office"), ("living", "bedroom"))  # fmt: skip
@@ -228,10 +228,9 @@ LAYOUTS: dict[str, Draw] = {
 }  # fmt: skip
 
 
-def draw_layout(rng: np.random.Generator, name: str | None = None) -> Layout:
+def draw_layout(rng: np.random.Generator, name: str) -> Layout:
     """A floor plan of 25 to 60 square metres, seen from any side."""
-    chosen = name or str(rng.choice(list(LAYOUTS)))
-    layout = LAYOUTS[chosen](rng)
+    layout = LAYOUTS[name](rng)
     return _swapped(layout) if rng.random() < 0.5 else layout
 
 
