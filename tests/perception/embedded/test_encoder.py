@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.datasets.procedural.materials import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
@@ -125,10 +124,6 @@ def test_words_missing_from_training_captions_are_listed() -> None:
     assert encoder.unseen_words('"Xqzzy", plant; xqzzy') == ("Xqzzy", "xqzzy")
     assert encoder.unseen_words("\u6905\u5b50") == ("\u6905\u5b50",)
     assert encoder.unseen_words("the") == ("the",)  # contains nothing that the encoder uses
-
-
-def test_material_words_match_those_of_the_rooms() -> None:
-    assert lexicon.MATERIALS == MATERIALS
 
 
 @pytest.mark.slow
