@@ -11,7 +11,7 @@ from su3d_bench.core.system.files import file_text, parse_toml
 
 @dataclass(frozen=True)
 class RoomClass:
-    """``id`` and ``name`` as in Replica's info_semantic.json; ``called``: everyday names of models that differ from it."""
+    """``id`` and ``name`` as in Replica's info_semantic.json; ``called``: the everyday names of models with another."""
 
     id: int
     name: str
