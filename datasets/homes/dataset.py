@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError, nearest
 from su3d_bench.core.types import Float64Array, Frame, LabelSet, UInt8Array
 from su3d_bench.datasets.homes.catalogue import HomeClass, catalogue, read_classes
 from su3d_bench.datasets.homes.furnish import furnish
-from su3d_bench.datasets.homes.plan import HomePlan
+from su3d_bench.datasets.homes.plan import PERSON_M, HomePlan
 from su3d_bench.datasets.homes.sensor import CameraContext, Materials, SensorSettings, drifted, metered, record
 from su3d_bench.datasets.homes.walk import walk_home
 from su3d_bench.datasets.procedural.dataset import (
@@ -33,6 +33,7 @@ from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
 from su3d_bench.sensors.colour import mean_luminance
 from su3d_bench.sensors.poses import shutter
 
+LIGHT_M, TRAINING_LIGHT_M = 0.06, 0.15  # between points at which light is computed; coarser where speed counts more
 METERED_WIDTH = 80  # of the images from which the exposure follows: a mean needs no more
 N_NAMED = 24  # homes for tuning, and as many for testing
 SERIES = ("tuning", "test", "seed", "training")
@@ -65,8 +66,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
         hint = nearest(scene, DEFAULT_SCENES) or ""
         raise DataError(
-            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or seed0 to "
-            f"seed999999{hint}"
+            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
+            f"such as seed7{hint}"
         )
     return match[1], int(match[2])
 
@@ -101,19 +102,20 @@ class BuiltHome(BuiltScene):
     def make_mesh(self) -> SceneMesh:
         plan = self.plan
         exposure = float(self._random("exposure").uniform(0.58, 0.72))
-        return lit_mesh(self.patches, plan.lights, plan.sun, plan.windows, exposure)
+        spacing_m = TRAINING_LIGHT_M if self.series == "training" else LIGHT_M
+        return lit_mesh(self.patches, plan.lights, plan.sun, plan.windows, exposure, spacing_m)
 
     def make_renderer(self, width: int, height: int, like: Renderer | None = None) -> Renderer:
         return SampledRenderer(self.mesh, width, height, like)
 
     def make_trajectory(self) -> Float64Array:
         plan, cell_m = self.plan, 0.1
-        free, origin = plan.free(cell_m)
+        free, origin = plan.free(cell_m, PERSON_M)  # where people fit; all of it is connected
         carrier = self.options.carrier
         if carrier == "either":
             carrier = "robot" if self.number % 3 == 2 else "person"
         return walk_home(
-            self.mesh, free, cell_m, origin, list(plan.boxes.values()), plan.n_structure, self.options.n_frames,
+            self.unlit, free, cell_m, origin, (), plan.n_structure, self.options.n_frames,
             self._random("walk"), carrier,
         )  # fmt: skip
 
@@ -131,7 +133,7 @@ class Homes(GeneratedScenes):
     Options = HomeOptions
     version = 1
     options: HomeOptions
-    sources = ("datasets/homes", "datasets/procedural", "numerics")
+    sources: ClassVar[tuple[str, ...]] = ("datasets/homes", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
     label_set = staticmethod(label_set)
 
@@ -191,5 +193,5 @@ class HomesSensor(Homes):
 
 def _materials(renderer: Renderer, pose: Float64Array) -> Materials:
     rows = renderer.material_rows(pose)
-    albedo = rows[..., 1:7].mean(axis=-1)
+    albedo = (rows[..., 1] + rows[..., 4]) / 2  # red: nearest to the projector's 830 nm, where most dyes are bright
     return Materials(albedo, rows[..., 8], clear=rows[..., 17], mirror=rows[..., 16])

@@ -13,12 +13,12 @@ from su3d_bench.datasets.homes.catalogue import Catalogue
 from su3d_bench.datasets.homes.groups import FREE, RELATIVE, Thing
 from su3d_bench.datasets.homes.layout import LAYOUTS, Zone, draw_layout
 from su3d_bench.datasets.homes.model_format import Strict
-from su3d_bench.datasets.homes.plan import GAP_M, HomePlan
+from su3d_bench.datasets.homes.plan import GAP_M, HomePlan, first
 from su3d_bench.datasets.homes.shell import add_openings, add_shell
 from su3d_bench.datasets.procedural.items import Item, Light, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
-N_OBJECTS = (95, 145)  # of a home: the fewest and the most
+N_OBJECTS = (95, 145)  # of a home without its shell: the fewest and the most
 PER_M2 = (2.4, 3.6)  # objects: small homes hold the fewest, large ones would look empty with them
 FEWEST = 90  # a home that has space for fewer is drawn again
 SMALLEST_M = 0.06  # longest side of what the filler adds: smaller things have too few pixels to be annotated
@@ -62,7 +62,7 @@ def furnish(
     layout = layout or str(rng.choice(list(LAYOUTS)))  # before homes are drawn again, so that all are equally frequent
     while True:
         home = _Furnisher(HomePlan(rng, draw_layout(rng, layout), muted, is_evening), catalogue, training)
-        if home.is_begun() and len(home.finished().placed) >= FEWEST:
+        if home.is_begun() and home.finished().n_objects >= FEWEST:
             return home.plan
 
 
@@ -108,8 +108,7 @@ class _Furnisher:
         if self.rng.random() >= thing.chance:
             return None
         if thing.any:
-            options = (self.do(thing.any[int(k)], zone, anchor) for k in self.rng.permutation(len(thing.any)))
-            return next(filter(None, options), None)
+            return first(self.do(thing.any[int(k)], zone, anchor) for k in self.rng.permutation(len(thing.any)))
         n = 1 if thing.at == "run" else int(self.rng.integers(thing.n[0], thing.n[1] + 1))
         item, last = None, None
         for _ in range(n):
@@ -147,7 +146,7 @@ class _Furnisher:
         for placed in plan.placed:
             self.n_of[placed.item.class_name] += 1
         failures = 0
-        while len(plan.placed) < target and failures < MAX_FAILURES:
+        while plan.n_objects < target and failures < MAX_FAILURES:
             before = len(plan.placed)
             zone = plan.layout.zones[int(self.rng.integers(len(plan.layout.zones)))]
             self._fill_one(modes[int(self.rng.choice(len(modes), p=weights / weights.sum()))], zone, target - before)
@@ -193,11 +192,12 @@ class _Furnisher:
         rows = [(name, row) for name, row in rows if not row.rooms or set(row.rooms) & set(suits)]
         if not rows:
             return None
-        weights = np.array([row.often * RARER ** self.n_of[name] for name, row in rows])
+        rarer = RARER**2 if mode in FREE else RARER  # a second piece of furniture is rarer than a second cup
+        weights = np.array([row.often * rarer ** self.n_of[name] for name, row in rows])
         item = self.new(rows[int(self.rng.choice(len(rows), p=weights / weights.sum()))][0])
         return item if item is not None and item.size.max() >= SMALLEST_M else None
 
-    def _repeat(self, item: Item, first: Placed, most: int = 6) -> None:
+    def _repeat(self, item: Item, begun_by: Placed, most: int = 6) -> None:
         """More objects of the class beside, on or around the first one."""
         for row in REPEATS.get(item.class_name, ()):
             tall = item.size[2] / item.size[0]
@@ -207,7 +207,7 @@ class _Furnisher:
                 or (row.how == "row" and tall < 0.3)
             ):
                 continue
-            last = first
+            last = begun_by
             for _ in range(min(most, int(self.rng.integers(row.n[0], row.n[1] + 1))) - 1):
                 other = item if row.same else self.new(item.class_name, model=item.model) or item
                 placed = self._next(row.how, other, last)

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.datasets.homes.layout import Zone
 from su3d_bench.datasets.homes.model_format import Strict
-from su3d_bench.datasets.homes.plan import BACK_M, GAP_M, TRIES, HomePlan
+from su3d_bench.datasets.homes.plan import BACK_M, GAP_M, TRIES, HomePlan, first
 from su3d_bench.datasets.procedural.items import Item, Part, Placed, Spot
 from su3d_bench.datasets.procedural.shapes import rotation
 
@@ -80,8 +80,7 @@ def _angled(plan: HomePlan, item: Item, thing: Thing, zone: Zone) -> Placed | No
         if span.b - span.a < 2 * along + 0.1:
             continue
         at = span.wall.point(plan.uniform(span.a + along + 0.03, span.b - along - 0.03), off + 0.03)
-        placed = plan.put(item, at, span.wall.yaw + turn, gap=thing.air)
-        if placed:
+        if placed := plan.put(item, at, span.wall.yaw + turn, gap=thing.air):
             return placed
     return None
 
@@ -108,8 +107,7 @@ def _ceiling(plan: HomePlan, item: Item, thing: Thing, zone: Zone) -> Placed | N
         share = plan.rng.uniform(0.5 - spread, 0.5 + spread, 2)
         at = np.array([x0 + share[0] * (x1 - x0), y0 + share[1] * (y1 - y0)])
         z = room.height - float(item.size[2]) - GAP_M
-        placed = plan.put(item, at, 0.0, z, "ceiling")
-        if placed:
+        if placed := plan.put(item, at, 0.0, z, "ceiling"):
             return placed
     return None
 
@@ -140,8 +138,7 @@ def _before(sign: float) -> Callable[..., Placed | None]:
         for _ in range(5):
             y = -(anchor.item.size[1] / 2 + _draw(plan, thing.gap) + item.size[1] / 2)
             turn = (0.0 if sign > 0 else 180.0) + plan.uniform(-thing.turn, thing.turn)
-            placed = plan.by(item, anchor, _draw(plan, thing.shift), y, turn, thing.air)
-            if placed:
+            if placed := plan.by(item, anchor, _draw(plan, thing.shift), y, turn, thing.air):
                 return placed
         return None
 
@@ -155,7 +152,7 @@ def _beside(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed
     side = 1 if plan.rng.random() < 0.5 else -1
     turn = plan.uniform(-thing.turn, thing.turn)
     places = (plan.by(item, anchor, s * x, y - back, turn) for s in (side, -side) for back in (0.0, 0.1))
-    return next(filter(None, places), None)
+    return first(places)
 
 
 def _centre(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed) -> Placed | None:
@@ -176,8 +173,7 @@ def _opposite(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Plac
         if abs((span.wall.yaw - anchor.yaw) % 360 - 180) < 1 and low < high and off < FARTHEST_M:
             for shift in (0.0, -0.4, 0.4, -0.8, 0.8):
                 at = span.wall.point(float(np.clip(along + shift, low, high)), item.size[1] / 2 + BACK_M)
-                placed = plan.put(item, at, span.wall.yaw)
-                if placed:
+                if placed := plan.put(item, at, span.wall.yaw):
                     return placed
     return None
 
@@ -191,7 +187,7 @@ def _above(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed)
             start = along + (item.size[0] - anchor.item.size[0]) / 2
             row = [start + k * (item.size[0] + GAP_M) for k in range(6)]
             places = row if thing.where == "row" else [along + _draw(plan, thing.shift)]
-            return next(filter(None, (plan.hang(item, span, at, z, gap=0.0) for at in places)), None)
+            return first(plan.hang(item, span, at, z, gap=0.0) for at in places)
     return None
 
 
@@ -209,8 +205,7 @@ def _around(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed
             angle = np.deg2rad(90.0 * side)
             cos, sin = np.cos(angle), np.sin(angle)
             turn = 180.0 + 90.0 * side + plan.uniform(-thing.turn, thing.turn)
-            placed = plan.by(item, anchor, cos * x + sin * away, sin * x - cos * away, turn)
-            if placed:
+            if placed := plan.by(item, anchor, cos * x + sin * away, sin * x - cos * away, turn):
                 return placed
     return None
 
@@ -222,8 +217,7 @@ def _spots(anchor: Placed, role: str) -> list[Spot]:
 def _on(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed) -> Placed | None:
     spots = _spots(anchor, thing.role)
     for k in plan.rng.permutation(len(spots)):
-        placed = plan.on_spot(item, anchor, spots[int(k)], thing.where, thing.turn, thing.air)
-        if placed:
+        if placed := plan.on_spot(item, anchor, spots[int(k)], thing.where, thing.turn, thing.air):
             return placed
     return None
 
@@ -238,8 +232,7 @@ def _before_it(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Pla
         local = rotation("z", -base.yaw) @ (at - base.position)
         if any(s.x0 < local[0] < s.x1 and s.y0 + item.size[1] / 2 < local[1] < s.y1 for s in _spots(base, "top")):
             turn = plan.uniform(-thing.turn, thing.turn)
-            placed = plan.put(item, at[:2], anchor.yaw + turn, float(anchor.position[2]), "object", base, relation)
-            if placed:
+            if placed := plan.put(item, at[:2], anchor.yaw + turn, float(anchor.position[2]), "object", base, relation):
                 return placed
     return None
 
@@ -248,7 +241,7 @@ def _near(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed) 
     """On the floor, on or around the anchor."""
     reach = anchor.item.size[:2] / 2 + 0.1
     places = (plan.rng.uniform(-reach, reach) for _ in range(5))
-    return next(filter(None, (plan.by(item, anchor, x, y, plan.uniform(-180, 180)) for x, y in places)), None)
+    return first(plan.by(item, anchor, x, y, plan.uniform(-180, 180)) for x, y in places)
 
 
 def _stack(plan: HomePlan, item: Item, thing: Thing, zone: Zone, anchor: Placed) -> Placed | None:

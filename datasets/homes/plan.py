@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,6 +70,11 @@ class HomePlan:
     def rooms(self) -> tuple[tuple[str, Float64Array], ...]:
         """Use and corners (N, 2) of each room."""
         return tuple((" and ".join(room.kinds), room.corners) for room in self.layout.rooms)
+
+    @property
+    def n_objects(self) -> int:
+        """Objects besides walls, floors and ceilings."""
+        return len(self.placed) - self.n_structure
 
     def uniform(self, low: float, high: float) -> float:
         return float(self.rng.uniform(low, high))
@@ -216,43 +221,34 @@ class HomePlan:
             span = spans[int(self.rng.integers(len(spans)))]
             low, high = span.a + half + BACK_M, span.b - half - BACK_M
             along = (low if self.rng.random() < 0.5 else high) if corner else self.uniform(low, max(low, high))
-            for more in (0.0, 0.12):  # in front of a radiator
-                at = span.wall.point(along, item.size[1] / 2 + BACK_M + more)
-                placed = self.put(item, at, span.wall.yaw, gap=gap)
-                if placed:
-                    return placed
+            off = item.size[1] / 2 + BACK_M
+            places = (span.wall.point(along, off + more) for more in (0.0, 0.12))  # or in front of a radiator
+            if placed := first(self.put(item, at, span.wall.yaw, gap=gap) for at in places):
+                return placed
         return None
 
     def hang(
-        self, item: Item, span: Span, along: float, z: float, off: float = 0.0, gap: float = 0.02
+        self, item: Item | None, span: Span, along: float, z: float, off: float = 0.0, gap: float = 0.0
     ) -> Placed | None:
         """Fixed to a wall with its lower edge at height ``z``."""
-        half = item.size[0] / 2
-        if not span.a + half < along < span.b - half:
+        if item is None or not span.a + item.size[0] / 2 < along < span.b - item.size[0] / 2:
             return None
         at = span.wall.point(along, item.size[1] / 2 + GAP_M + off)
         return self.put(item, at, span.wall.yaw, z, "wall", gap=gap)
 
-    def hang_new(self, item: Item | None, span: Span, along: float, z: float, off: float = 0.0) -> Placed | None:
-        return None if item is None else self.hang(item, span, along, z, off, 0.0)
-
     def hang_somewhere(self, item: Item, zone: Zone, z: float) -> Placed | None:
         half = item.size[0] / 2 + 0.02
         spans = [span for span in self.spans(zone) if span.b - span.a > 2 * half]
-        for _ in range(TRIES if spans else 0):
-            span = spans[int(self.rng.integers(len(spans)))]
-            placed = self.hang(item, span, self.uniform(span.a + half, span.b - half), z)
-            if placed:
-                return placed
-        return None
+        drawn = (spans[int(self.rng.integers(len(spans)))] for _ in range(TRIES if spans else 0))
+        return first(self.hang(item, s, self.uniform(s.a + half, s.b - half), z, gap=0.02) for s in drawn)
 
     def somewhere(
         self, item: Item, zone: Zone, is_middle: bool = False, yaw: float | None = None, gap: float = 0.0
     ) -> Placed | None:
         """On the floor of a zone: in its middle, or anywhere but mostly not far from a wall."""
         inset = 0.3 if is_middle else 0.04
-        first, last = np.array(zone.rect).reshape(2, 2).T
-        low, high = first + inset * (last - first), last - inset * (last - first)
+        one, other = np.array(zone.rect).reshape(2, 2).T
+        low, high = one + inset * (other - one), other - inset * (other - one)
         spans = self.spans(zone)
         for _ in range(TRIES):
             at, turn = self.rng.uniform(low, high), self.uniform(-180, 180)
@@ -260,8 +256,7 @@ class HomePlan:
                 span = spans[int(self.rng.integers(len(spans)))]
                 off = float(item.size[:2].max()) / 2 + BACK_M + self.uniform(0.0, 0.3)
                 at, turn = span.wall.point(self.uniform(span.a, span.b), off), span.wall.yaw + self.uniform(-25, 25)
-            placed = self.put(item, at, turn if yaw is None else yaw, gap=gap)
-            if placed:
+            if placed := self.put(item, at, turn if yaw is None else yaw, gap=gap):
                 return placed
         return None
 
@@ -284,8 +279,7 @@ class HomePlan:
             x, y, z = anchor.to_world(np.array([*local, spot.z]))
             relation = "in" if spot.role == "inside" else "on"
             at = np.array([x, y])
-            placed = self.put(item, at, anchor.yaw + yaw, z + GAP_M, "object", anchor, relation, gap)
-            if placed:
+            if placed := self.put(item, at, anchor.yaw + yaw, z + GAP_M, "object", anchor, relation, gap):
                 return placed
         return None
 
@@ -311,6 +305,11 @@ class HomePlan:
         if where in ("left", "right"):
             return low[0] if where == "left" else high[0], y
         return x, y
+
+
+def first(places: Iterable[Placed | None]) -> Placed | None:
+    """The first place that was free."""
+    return next(filter(None, places), None)
 
 
 def upright(rect: Sequence[float], z0: float = 0.0, z1: float = 10.0) -> Solids:

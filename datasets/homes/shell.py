@@ -69,7 +69,8 @@ def _add_floor(plan: HomePlan, room: Room, cover: str) -> None:
     colours = {"wooden": ["brown", "beige", "beige", "grey"], "tiles": ["beige", "grey", "white"],
                "carpet": ["grey", "beige", "blue", "green"]}[cover]  # fmt: skip
     colour = str(rng.choice(colours[:2] if plan.muted else colours))
-    base, seed = tone(colour, rng), int(rng.integers(1, 999))
+    base = mix(tone(colour, rng), tone("grey"), 0.55 if cover == "carpet" else 0.0)  # carpets are dull
+    seed = int(rng.integers(1, 999))
     material = {
         "wooden": Material(Texture.PLANKS, base, shade(base, 0.55), 0.035, 0.15, seed=seed),
         "tiles": Material(Texture.TILES, base, shade(base, 0.6), plan.uniform(0.28, 0.42), 0.25, seed=seed),
@@ -165,7 +166,7 @@ def _add_entrance(plan: HomePlan, new: New) -> bool:
         if plan.hang(door, Span(wall, 0.0, wall.length), along, GAP_M):
             plan.keep_free.append(_before(wall, along, half + 0.05, deep + 0.8))
             side = 1.0 if along < wall.length / 2 else -1.0
-            plan.hang_new(new("switch"), Span(wall, 0.0, wall.length), along + side * (half + 0.2), 1.05)
+            plan.hang(new("switch"), Span(wall, 0.0, wall.length), along + side * (half + 0.2), 1.05)
             return True
         plan.doors.pop()
     return False
@@ -221,15 +222,15 @@ def _add_window(plan: HomePlan, wall: Wall, new: New) -> bool:
     u = (float(wall.along[0] * width), float(wall.along[1] * width), 0.0)
     plan.windows.append(Window((x, y, sill + float(item.size[2]) / 2), u, (0.0, 0.0, float(height)), sky))
     plan.keep_free.append(_before(wall, along, item.size[0] / 2, 0.45, sill + 0.05, 2.3))
-    plan.hang_new(new("radiator"), span, along, 0.12)
+    plan.hang(new("radiator"), span, along, 0.12)
     top, cover = sill + float(item.size[2]), plan.rng.random()
     if cover < 0.6 and (curtain := new("curtain")) is not None:
         z = max(GAP_M, top + 0.1 - float(curtain.size[2]))
         for side in (-1, 1):  # the same panel on both sides
-            plan.hang_new(curtain, span, along + side * float(item.size[0] + curtain.size[0] + 0.02) / 2, z)
+            plan.hang(curtain, span, along + side * float(item.size[0] + curtain.size[0] + 0.02) / 2, z)
     elif cover < 0.8 and (blind := new("blinds")) is not None:
         blind = resized(blind, x=float(item.size[0] / blind.size[0]), z=min(1.0, float(item.size[2] / blind.size[2])))
-        plan.hang_new(blind, span, along, top - float(blind.size[2]), float(item.size[1]) + GAP_M)
+        plan.hang(blind, span, along, top - float(blind.size[2]), float(item.size[1]) + GAP_M)
     return True
 
 

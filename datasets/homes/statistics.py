@@ -6,6 +6,7 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.procedural.dataset import GeneratedScenes
+from su3d_bench.datasets.procedural.rendering.render import Renderer
 
 WIDTH = 160  # of the images in which instances are counted
 MIN_PIXEL_SHARE = 100 / (640 * 480)  # 100 pixels of a 640x480 image: an object that a detector can find
@@ -18,7 +19,8 @@ def view_statistics(dataset: GeneratedScenes, scene: str, stride: int) -> dict[s
     """
     built = dataset.built(scene)
     poses = built.trajectory[::stride]
-    renderer = built.coarser(min(WIDTH, dataset.options.width))
+    width = min(WIDTH, dataset.options.width)
+    renderer = Renderer(built.unlit, width, round(width * dataset.options.height / dataset.options.width))
     pixels = np.arange(renderer.width * renderer.height)
     instances = [placed.id for placed in built.placed if built.mount[placed.id] != "room"]
     shown = (renderer.depth_and_instance(pose, pixels)[1] for pose in poses)

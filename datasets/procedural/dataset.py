@@ -28,7 +28,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.datasets import openscan
 from su3d_bench.datasets.procedural.items import Placed
-from su3d_bench.datasets.procedural.rendering.mesh import Patches, SceneMesh, gather_patches
+from su3d_bench.datasets.procedural.rendering.mesh import Patches, SceneMesh, gather_patches, unlit_mesh
 from su3d_bench.datasets.procedural.rendering.render import RenderedFrame, Renderer, camera_intrinsics
 from su3d_bench.datasets.procedural.scan import SceneScan, kept_arrays, kept_scan, scan_scene
 from su3d_bench.datasets.procedural.truth import Described, SceneObject, SceneTruth, attribute_of_object, truth_of
@@ -95,6 +95,10 @@ class BuiltScene(ABC):
     @cached_property
     def patches(self) -> Patches:
         return gather_patches(self.placed)
+
+    @cached_property
+    def unlit(self) -> SceneMesh:
+        return unlit_mesh(self.patches)
 
     @cached_property
     def mesh(self) -> SceneMesh:

@@ -7,23 +7,27 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from su3d_bench.core.types import BoolArray, Float64Array
+from su3d_bench.core.types import BoolArray
 from su3d_bench.datasets.procedural.items import Light
 from su3d_bench.datasets.procedural.rendering import mesh as base
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
+Floats = NDArray[Any]  # float32 where a vector per point is enough
 Vector = tuple[float, float, float]
 SUNNY_SPACING_M = 0.014  # in sunlit cells: the edge of a patch of sunlight is one pixel wide at 5 m in 640 columns
 SUN_BLUR = 0.009  # tangent of the half-width of the penumbra: the sun has 0.0047, the rest hides the cells
 PANE_GAP_M = 0.03  # rays to a window end this far before its plane: the pane does not shade
 SEE_THROUGH = 0.3  # parts that let this much light pass, or emit this much, cast no shadow
 N_SKY = 10  # points on a window
+FAINT = 5e-3  # light per area below which no shadow is computed: a lamp 7 m away
 LAMP_M2 = 0.3  # squared distance added to that of a lamp, which is no point
 BOUNCE_SPACING_M = 0.1  # between points at which reflected light is gathered: it varies slowly
-N_BOUNCE, N_GATHERS, N_NEIGHBOURS = 24, 3, 8  # rays per point; bounces; points averaged (so 192 rays)
-SUN_PIECE_M = 0.4  # a patch of sunlight is replaced by lamps this far apart
+N_BOUNCE, N_GATHERS, N_NEIGHBOURS = 20, 3, 5  # rays per point; bounces; points averaged (so 100 rays)
+SUN_PIECE_M = 0.5  # a patch of sunlight is replaced by lamps this far apart
+SMALL_PIECE = 0.01  # of the sunlight that arrives: smaller pieces are left out
 AMBIENT = 0.03  # of the mean light, for what three bounces miss
 NARROW = 0.55  # of reflected light reaches a crevice, which is smaller than the spacing of the points
 GOLDEN = np.pi * (3 - np.sqrt(5))
@@ -47,7 +51,7 @@ class Window:
     sky: Vector
 
     @property
-    def points(self) -> Float64Array:
+    def points(self) -> Floats:
         """Points (N_SKY, 3) that stand for its area, at irregular heights so that no slat hides them all."""
         k = np.arange(1, N_SKY + 1)
         at = 2 * np.column_stack([0.7549 * k % 1, 0.5698 * k % 1]) - 1  # Roberts' quasi-random sequence
@@ -60,15 +64,17 @@ def lit_mesh(
 ) -> base.SceneMesh:  # fmt: skip
     """The render mesh of a home; light is scaled so that its 70th percentile is ``exposure``."""
     grid = base.cut(patches, spacing_m)
-    points, normals = base.at_rows(patches.corners, grid.rows), _unit(base.at_rows(patches.normals, grid.rows))
+    points: Floats = base.at_rows(patches.corners, grid.rows)
+    normals = _unit(base.at_rows(patches.normals, grid.rows))
     quad = grid.rows[:, 0].astype(np.int64)
-    keys = np.concatenate([np.round(points * 2000), np.round(normals * 20), patches.object_id[quad, None]], axis=1)
+    keys = np.concatenate([np.round(points * 250), np.round(normals * 5), patches.object_id[quad, None]], axis=1)
     first, group = base.merge_equal(keys.astype(np.int64))
     triangles, owner = base.triangles_of(grid, points)
     passes = np.maximum(patches.materials[:, 9], patches.materials[:, 17]) > SEE_THROUGH
     solid = ~passes[patches.material[owner]]
-    facing = normals[first]
-    start = base.off_surface(points[first], facing, patches.corners[quad[first]].mean(axis=1))
+    facing: Floats = normals[first].astype(np.float32)
+    start: Floats = base.off_surface(points[first], facing, patches.corners[quad[first]].mean(axis=1))
+    start = start.astype(np.float32)
     room = _Room(base.caster(points.astype(np.float32), triangles[solid]), points[triangles[solid]])
     sunlight, direct = room.sunlight(start, facing, sun, windows), np.zeros((len(start), 3))
     for light in lights:
@@ -106,49 +112,50 @@ def lit_mesh(
     baked = np.concatenate([(soft + sunlight)[group], sharp]) * scale
     sources = [[*lamp.position, min(1.5, max(lamp.colour) * scale)] for lamp in lights]
     sources += [[*point, min(1.5, max(window.sky) * scale) / 5] for window in windows for point in window.points]
+    texture = base.at_rows(patches.texture, merged.rows).astype(np.float32)
     return base.SceneMesh(
-        *(np.asarray(v, np.float32) for v in (points, normals, base.at_rows(patches.texture, merged.rows), baked)),
-        triangles, patches.object_id[owner], patches.material[owner], patches.materials,
+        points.astype(np.float32), normals.astype(np.float32), texture, baked.astype(np.float32), triangles,
+        patches.object_id[owner], patches.material[owner], patches.materials,
         np.array(sources, np.float32).reshape(-1, 4),
     )  # fmt: skip
 
 
-def _unit(vectors: Float64Array) -> Float64Array:
+def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9))
 
 
 class _Room:
     """What casts shadows: ``corners`` (T, 3, 3) of triangles, and their ray-casting ``scene``."""
 
-    def __init__(self, scene: Any, corners: Float64Array) -> None:
+    def __init__(self, scene: Any, corners: Floats) -> None:
         self.scene, self.corners = scene, corners
         self.crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
-    def is_free(self, start: Float64Array, along: Float64Array) -> BoolArray:
+    def is_free(self, start: Floats, along: Floats) -> BoolArray:
         return ~base.blocked(self.scene, np.concatenate([start, along], axis=1).astype(np.float32), 1.0)
 
-    def first_hits(self, start: Float64Array, along: Float64Array) -> Any:
+    def first_hits(self, start: Floats, along: Floats) -> Any:
         """The triangle that each ray hits, or -1."""
         rays = compiled_open3d().core.Tensor(np.concatenate([start, along], axis=1).astype(np.float32))
         return self.scene.cast_rays(rays)["primitive_ids"].numpy().astype(np.int32)
 
     def shine(
-        self, start: Float64Array, facing: Float64Array, point: Float64Array, plane: Float64Array | None, area: float,
+        self, start: Floats, facing: Floats, point: Floats, plane: Floats | None, area: float,
         gap_m: float,
-    ) -> Float64Array:  # fmt: skip
+    ) -> Floats:  # fmt: skip
         """Form factors of a piece of ``area`` m2 that lies in ``plane`` or, without one, faces everywhere."""
-        away = point - start
-        square = (away**2).sum(axis=1) + 1e-9
-        height = np.sqrt(square) if plane is None else np.abs(away @ _unit(plane))
-        form = area * (facing * away).sum(axis=1) * height / (square * (np.pi * square + area))
-        lit = np.flatnonzero(form > 3e-4)
-        before = np.maximum(1 - gap_m / np.maximum(height[lit], 1e-6), 0.0)
-        free = self.is_free(start[lit], away[lit] * before[:, None])
-        return np.bincount(lit[free], form[lit[free]], len(start))
+        cosine = facing @ np.asarray(point, start.dtype) - np.einsum("vk,vk->v", facing, start)
+        ahead = np.flatnonzero(cosine > 0)
+        away = np.asarray(point, start.dtype) - start[ahead]
+        square = np.einsum("vk,vk->v", away, away) + 1e-9
+        height = np.sqrt(square) if plane is None else np.abs(away @ _unit(plane).astype(start.dtype))
+        form = area * cosine[ahead] * height / (square * (np.pi * square + area))
+        bright = form > FAINT * area
+        lit, form, before = ahead[bright], form[bright], np.maximum(1 - gap_m / height[bright], 0.0)
+        free = self.is_free(start[lit], away[bright] * before[:, None])
+        return np.bincount(lit[free], form[free], len(start))
 
-    def sunlight(
-        self, start: Float64Array, facing: Float64Array, sun: Sun | None, windows: Sequence[Window]
-    ) -> Float64Array:
+    def sunlight(self, start: Floats, facing: Floats, sun: Sun | None, windows: Sequence[Window]) -> Floats:
         """Sunlight (V, 3): where rays towards the sun cross a window and nothing blocks them before it."""
         received = np.zeros((len(start), 3))
         if sun is None:
@@ -169,30 +176,30 @@ class _Room:
         return received
 
     def reflected(
-        self, start: Float64Array, facing: Float64Array, direct: Float64Array, sunlight: Float64Array,
-        buried: BoolArray, objects: Any, corners: Any, albedo: Float64Array,
-    ) -> Float64Array:  # fmt: skip
+        self, start: Floats, facing: Floats, direct: Floats, sunlight: Floats,
+        buried: BoolArray, objects: Any, corners: Any, albedo: Floats,
+    ) -> Floats:  # fmt: skip
         """Light (V, 3) that arrives from other surfaces, gathered at some of the points and averaged around each.
 
         ``corners`` are the rows of ``direct`` at the corners of the triangles, which have a mean ``albedo`` each.
         Patches of sunlight are too small and bright for so few rays: their light is that of lamps on them.
         """
-        keys = np.column_stack([np.round(start / BOUNCE_SPACING_M), np.round(facing * 1.5), objects]).astype(np.int64)
+        keys = np.column_stack([np.round(start / BOUNCE_SPACING_M), np.round(facing * 1.2), objects]).astype(np.int64)
         chosen = np.flatnonzero(~buried)
         chosen = chosen[base.merge_equal(keys[chosen])[0]]
         out, k = facing[chosen], np.arange(N_BOUNCE)
         side = _unit(np.cross(out, np.where(np.abs(out[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])))
-        turn = GOLDEN * (k + np.arange(len(chosen))[:, None] * 0.37)[..., None]  # the set of directions, turned
+        turn = np.float32(GOLDEN) * (k + np.arange(len(chosen))[:, None] * 0.37)[..., None]  # all have the set, turned
         sine = np.sqrt((k + 0.5) / N_BOUNCE)[None, :, None]
         around = side[:, None] * np.cos(turn) + np.cross(out, side)[:, None] * np.sin(turn)
-        along = (out[:, None] * np.sqrt(1 - sine**2) + sine * around).reshape(-1, 3)
+        along = (out[:, None] * np.sqrt(1 - sine**2) + sine * around).reshape(-1, 3).astype(np.float32)
         hit = self.first_hits(np.repeat(start[chosen], N_BOUNCE, axis=0), along)
         seen = (hit >= 0) & ((self.crossed[hit] * along).sum(axis=1) < 0)
         from_sun = np.zeros((len(chosen), 3))
         for at, plane, area, power in self.sunlit_pieces(albedo * sunlight[corners].mean(axis=1)):
             from_sun += self.shine(start[chosen], out, at, plane, area, 0.01)[:, None] * power / area
         tree = cKDTree(np.column_stack([start[chosen], 0.5 * out]))
-        far, near = tree.query(np.column_stack([start, 0.5 * facing]), range(1, N_NEIGHBOURS + 1), workers=-1)
+        far, near = tree.query(np.column_stack([start, 0.5 * facing]), range(1, N_NEIGHBOURS + 1), eps=0.3, workers=-1)
         weight = 1.0 / (far**2 + BOUNCE_SPACING_M**2)
         weight /= weight.sum(axis=1, keepdims=True)
         received = np.zeros_like(direct)
@@ -202,7 +209,7 @@ class _Room:
             received = np.einsum("vk,vkc->vc", weight, gathered[near]) + AMBIENT * direct[chosen].mean(axis=0)
         return received * (NARROW + (1 - NARROW) * base.open_sky(self.scene, start, facing)[:, None])
 
-    def sunlit_pieces(self, sent: Float64Array) -> list[tuple[Float64Array, Float64Array, float, Float64Array]]:
+    def sunlit_pieces(self, sent: Floats) -> list[tuple[Floats, Floats, float, Floats]]:
         """Centre, normal, area and power of the surface that sends sunlight on, in pieces of ``SUN_PIECE_M``."""
         lit = np.flatnonzero(sent.max(axis=1) > 0)
         area, centre = np.linalg.norm(self.crossed[lit], axis=1, keepdims=True) / 2, self.corners[lit].mean(axis=1)
@@ -212,4 +219,6 @@ class _Room:
         sums = np.column_stack([np.bincount(group, value, len(first)) for value in values.T])
         normals = _unit(sums[:, 4:7])
         centres = sums[:, 1:4] / sums[:, :1] + 0.01 * normals
-        return list(zip(centres, normals, sums[:, 0].tolist(), sums[:, 7:], strict=True))
+        power = sums[:, 7:].sum(axis=1)
+        kept = power > SMALL_PIECE * power.sum()
+        return list(zip(centres[kept], normals[kept], sums[kept, 0].tolist(), sums[kept, 7:], strict=True))

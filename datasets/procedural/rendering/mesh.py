@@ -149,6 +149,20 @@ def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> Sc
     )  # fmt: skip
 
 
+def unlit_mesh(patches: Patches) -> SceneMesh:
+    """The surface alone, in the dark: for depth, objects and trajectories, which need not wait for the light."""
+    grid = cut(patches, np.inf)
+    points = at_rows(patches.corners, grid.rows)
+    normals, texture = at_rows(patches.normals, grid.rows), at_rows(patches.texture, grid.rows)
+    triangles, quad = triangles_of(grid, points)
+    dark = np.zeros((len(points), 3), np.float32)
+    return SceneMesh(
+        points.astype(np.float32), normals.astype(np.float32), texture.astype(np.float32), dark,
+        triangles.astype(np.int32), patches.object_id[quad], patches.material[quad], patches.materials,
+        np.zeros((0, 4), np.float32),
+    )  # fmt: skip
+
+
 def triangles_of(grid: Grid, points: Float64Array) -> tuple[Int32Array, Int32Array]:
     """Two triangles (T, 3) of each face, unless they are empty, and their quads (T,)."""
     faces = grid.faces.astype(np.int32)

@@ -29,19 +29,21 @@ SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, material, is_edge):  # type: ignore[no-untyped-def]
     """Marks the pixels of rows ``start`` to ``stop`` with a neighbour on another object, material or plane."""
     for i in range(start * width, stop * width):
+        column, hit = i % width, t[i] < 1e9
+        f = triangle[i] if hit else 0
+        nx, ny, nz = face_normals[f, 0], face_normals[f, 1], face_normals[f, 2]
+        height = t[i] * (nx * rays[i, 3] + ny * rays[i, 4] + nz * rays[i, 5])
         is_edge[i] = False
         for k in range(4):
-            j = i + (1, -1, width, -width)[k]
-            if not 0 <= j < t.shape[0] or (k < 2 and j // width != i // width):
+            j = i + (k == 0) - (k == 1) + width * ((k == 2) - (k == 3))
+            if (k == 0 and column == width - 1) or (k == 1 and column == 0) or not 0 <= j < t.shape[0]:
                 continue
-            f, g, hit = triangle[i], triangle[j], t[i] < 1e9
+            g = triangle[j]
             if f == g or not (hit or t[j] < 1e9):
                 continue
             if hit and t[j] < 1e9 and instance[f] == instance[g] and material[f] == material[g]:
-                alike, off = 0.0, 0.0
-                for c in range(3):
-                    alike += face_normals[f, c] * face_normals[g, c]
-                    off += face_normals[f, c] * (t[j] * rays[j, 3 + c] - t[i] * rays[i, 3 + c])
+                alike = nx * face_normals[g, 0] + ny * face_normals[g, 1] + nz * face_normals[g, 2]
+                off = t[j] * (nx * rays[j, 3] + ny * rays[j, 4] + nz * rays[j, 5]) - height
                 if alike > SMOOTH_COSINE and abs(off) < 0.002 * t[i] + 0.001:
                     continue
             is_edge[i] = True

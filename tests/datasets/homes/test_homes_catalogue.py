@@ -96,7 +96,7 @@ def test_colour_and_mutedness_are_those_asked_for() -> None:
     assert spread[1] < 0.6 * spread[0]
 
 
-GOOD = {
+GOOD: dict[str, object] = {
     "name": "thing",
     "class": "box",
     "made_of": ["paper"],
