@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.errors import DataError, nearest
 from su3d_bench.core.types import Float64Array, Frame, LabelSet, UInt8Array
@@ -45,7 +46,11 @@ class HomeOptions(SceneOptions):
     ``carrier``: ``person``, ``robot``, or ``either``: a robot in every third home.
     """
 
+    seed_offset: int = Field(default=0, ge=0)
     carrier: Literal["either", "person", "robot"] = "either"
+
+    def of_trajectory(self) -> tuple[object, ...]:
+        return self.n_frames, self.seed_offset, self.carrier
 
 
 @cache
