@@ -46,7 +46,10 @@ class SceneOptions(BaseModel):
     height: int = Field(default=480, ge=16, le=4096)
     n_frames: int = Field(default=1600, ge=1, le=100_000)
     mesh_spacing_m: float = Field(default=0.015, ge=0.004, le=0.2)
-    seed_offset: int = Field(default=0, ge=0)
+
+    def of_trajectory(self) -> tuple[object, ...]:
+        """The options that mesh and trajectory depend on."""
+        return (self.n_frames,)
 
 
 def generator(*words: object) -> np.random.Generator:
@@ -130,7 +133,7 @@ class BuiltScene(ABC):
 
 
 class GeneratedScenes(ABC):
-    """Scenes generated from their names; ``root`` contains their cached data."""
+    """Rendered scenes; ``root`` contains their cached data."""
 
     name: str
     headline_protocol: str
@@ -235,8 +238,7 @@ class GeneratedScenes(ABC):
         from su3d_bench.core.digests import package_digest
 
         self.check_name(scene)
-        options = self.options
-        words = package_digest(*self.sources), options.n_frames, options.mesh_spacing_m, options.seed_offset
+        words = package_digest(*self.sources), *self.options.of_trajectory(), self.options.mesh_spacing_m
         return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
 
     def _cache_folder(self, scene: str) -> Path | None:
@@ -247,8 +249,7 @@ class GeneratedScenes(ABC):
         if self.is_for_training(scene) or not self.root.is_dir():
             return None
         packages = package_versions(NUMERIC_PACKAGES)  # another Open3D version may differ in the last bit
-        options = self.options.n_frames, self.options.seed_offset
-        words = package_digest(*self.sources), *options, sorted(packages.items())
+        words = package_digest(*self.sources), *self.options.of_trajectory(), sorted(packages.items())
         return self.root / self.cached_as / digest_json(words)[:16]
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:

@@ -15,7 +15,6 @@ from su3d_bench.core.types import Float32Array
 
 Rgb = tuple[float, float, float]  # linear light, 0..1
 _TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("looks.toml")))
-MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
 COLOURS = tuple(COLOUR_RGB)
 LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
@@ -126,8 +125,3 @@ def _fabric(kind: str, rgb: Rgb, rng: np.random.Generator) -> Material:
         return plain
     pattern = Texture(int(rng.choice([Texture.STRIPES, Texture.CHECKS, Texture.DOTS, Texture.ZIGZAG])))
     return replace(plain, texture=pattern, b=second, scale=size, axis=int(rng.integers(0, 2)))
-
-
-def light(rgb: tuple[float, float, float], glow: float = 1.0) -> Material:
-    """A material that emits light of a colour (sRGB 0..255)."""
-    return Material(Texture.PLAIN, linear(rgb), linear(rgb), glow=glow)

@@ -74,16 +74,6 @@ def block(width: float, depth: float, height: float, x: float = 0.0, y: float = 
     return box(x - width / 2, x + width / 2, y - depth / 2, y + depth / 2, z, z + height)
 
 
-def both(x: float) -> tuple[float, float]:
-    """Positions of a part that exists on either side."""
-    return -x, x
-
-
-def corners(x: float, y: float) -> list[tuple[float, float]]:
-    """Positions of a part that exists in every corner."""
-    return [(sx * x, sy * y) for sx in (-1, 1) for sy in (-1, 1)]
-
-
 def soft_block(
     width: float, depth: float, height: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, radius: float = 0.03
 ) -> Shape:
@@ -152,10 +142,6 @@ def _revolve(rings: Float64Array, turn: Float64Array) -> Float64Array:
     plane = rings[None, :, :1] * turn[:, None, :]
     height = np.broadcast_to(rings[None, :, 1:], (len(turn), len(rings), 1))
     return np.concatenate([plane, height], axis=2)
-
-
-def cylinder(radius: float, height: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Shape:
-    return lathe([(0, 0), (radius, 0), (radius, height), (0, height)]).moved(x, y, z)
 
 
 def ellipsoid(rx: float, ry: float, rz: float) -> Shape:

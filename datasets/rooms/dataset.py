@@ -1,8 +1,7 @@
-"""Built-in procedural rooms, frozen: generated on demand from a name, rendered by ray casting, fully annotated."""
+"""Nine built-in rooms, stored as they were generated once; rendered by ray casting, fully annotated."""
 
 from __future__ import annotations
 
-import re
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -23,12 +22,12 @@ from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh, build_mesh
 from su3d_bench.datasets.procedural.rendering.render import LEVELS, add_noise
 from su3d_bench.datasets.procedural.trajectory import walk
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, CLASS_ID
-from su3d_bench.datasets.rooms.plan import Plan
-from su3d_bench.datasets.rooms.recipes import KINDS, furnish
+from su3d_bench.datasets.rooms.frozen import FrozenRoom, read_room
 
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
-TRAINING_FROM = 10_000  # numbers from here on are reserved for training; no benchmark uses them
+SCENES = (*DEFAULT_SCENES, "bathroom7")
 N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
+FORMER_OFFSET = 0  # of the seeds; a word in the names of the random streams
 
 
 class RoomOptions(SceneOptions):
@@ -43,27 +42,18 @@ def label_set() -> LabelSet:
     return LabelSet("replica", tuple(CLASS_ID.values()), tuple(CLASS_ID))
 
 
-def scene_name_parts(scene: str) -> tuple[str, int]:
-    """Kind and number of a scene name; raises ``DataError`` if it is not a scene."""
-    match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
-    if match is None or match[1] not in KINDS:
-        hint = nearest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KINDS)}"
-        raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
-    return match[1], int(match[2])
-
-
 class BuiltRoom(BuiltScene):
     """A furnished room."""
 
     classes = CLASS_BY_NAME
 
-    def __init__(self, scene: str, options: RoomOptions, folder: Path | None) -> None:
-        super().__init__(scene, options, folder)
-        self.kind = scene_name_parts(scene)[0]
-
     @cached_property
-    def plan(self) -> Plan:
-        return furnish(self.kind, self._random("room"))
+    def plan(self) -> FrozenRoom:
+        return read_room(self.scene)
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        return self.plan.kind
 
     @property
     def placed(self) -> list[Placed]:
@@ -78,17 +68,14 @@ class BuiltRoom(BuiltScene):
 
     def make_trajectory(self) -> Float64Array:
         plan = self.plan
-        size = plan.width, plan.depth, plan.height
-        return walk(
-            self.mesh, list(plan.boxes.values()), size, N_STRUCTURE, self.options.n_frames, self._random("walk")
-        )
+        return walk(self.mesh, plan.boxes, plan.size, N_STRUCTURE, self.options.n_frames, self._random("walk"))
 
     def _random(self, what: str) -> np.random.Generator:
-        return generator(what, self.scene, self.options.seed_offset)
+        return generator(what, self.scene, FORMER_OFFSET)
 
 
 class Rooms(GeneratedScenes):
-    """Furnished rooms, generated from their names."""
+    """Nine furnished rooms."""
 
     name = cached_as = "rooms"
     headline_protocol = "rooms-semantic"  # the paper's mAcc and F-mIoU on Replica, whose classes the rooms have
@@ -101,16 +88,15 @@ class Rooms(GeneratedScenes):
     label_set = staticmethod(label_set)
 
     def check_name(self, scene: str) -> None:
-        scene_name_parts(scene)
-
-    def is_for_training(self, scene: str) -> bool:
-        return scene_name_parts(scene)[1] >= TRAINING_FROM
+        if scene not in SCENES:
+            hint = f"{nearest(scene, SCENES)}; the rooms are {', '.join(SCENES)}"
+            raise DataError(f"rooms: no scene '{scene}'{hint}; homes are generated from any seed, such as homes/seed0")
 
     def build(self, scene: str, folder: Path | None) -> BuiltRoom:
         return BuiltRoom(scene, self.options, folder)
 
     def frame(self, scene: str, index: int) -> Frame:
         image = self.render(scene, index)
-        rng = generator("noise", scene, self.options.seed_offset, index)
+        rng = generator("noise", scene, FORMER_OFFSET, index)
         rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
         return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self.trajectory(scene)[index], self.intrinsics)

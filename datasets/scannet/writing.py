@@ -65,7 +65,7 @@ def nyu40_colours() -> tuple[tuple[int, int, int], ...]:
 
 
 def scan_name(room: str) -> str:
-    """The scan name of a room: kitchen7 is scene9207_00; raises ``DataError`` for a room beyond 99."""
+    """The scan name of a room: bathroom7 is scene9407_00; raises ``DataError`` for a room beyond 99."""
     match = ROOM_NAME.fullmatch(room)
     if match is None or match[1] not in _facts()["kinds"]:
         raise DataError(f"{room}: has no scan name; choose a scene from 0 to 99 of its kind")

@@ -14,9 +14,10 @@ from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets.homes.dataset import DEFAULT_SCENES
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.rooms.dataset import SCENES, Rooms
 from su3d_bench.datasets.scannet.writing import categories, scan_name, segment_of_vertex
 
 ROOM, SCAN, N_FRAMES = "bathroom0", "scene9400_00", 6
@@ -101,12 +102,11 @@ def test_segments_split_objects_and_never_cross_them(made: dict[str, Path], room
     assert np.median([len(np.unique(segments[owner == one])) for one in np.unique(owner)]) >= 3
 
 
-def test_every_room_has_a_unique_scan_name_outside_scannets() -> None:
-    kinds = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
-    names = {scan_name(f"{kind}{number}") for kind in kinds for number in range(100)}
-    assert len(names) == 600 and min(names) > "scene0806_00"
-    with pytest.raises(DataError, match=r"^rooms/living100: "):
-        scan_name("living100")
+def test_every_room_and_home_has_a_unique_scan_name_outside_scannets() -> None:
+    names = [scan_name(scene) for scene in (*SCENES, *DEFAULT_SCENES)]
+    assert len(set(names)) == len(names) and min(names) > "scene0806_00"
+    with pytest.raises(DataError, match=r"^seed100: "):
+        scan_name("seed100")
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

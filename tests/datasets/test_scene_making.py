@@ -92,8 +92,8 @@ def files_below(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
-ROOM = "living7"
-ADDRESS = {"replica": ROOM, "scannet": "scene9007_00"}
+ROOM = "living0"
+ADDRESS = {"replica": ROOM, "scannet": "scene9000_00"}
 TRUTH = {"replica": "mesh-vertices", "scannet": "nyu40-vertices"}
 
 
@@ -219,7 +219,7 @@ def test_conflicting_shared_file_is_rejected(tmp_path: Path) -> None:
         write_scene(LAYOUTS["scannet"], Stage(), ROOM, tmp_path)
     write_scene(LAYOUTS["replica"], Stage(), ROOM, tmp_path)
     with pytest.raises(StoreError, match=r"cam_params\.json: differs from the camera .*20x12"):
-        write_scene(LAYOUTS["replica"], Stage(width=20), "living8", tmp_path)
+        write_scene(LAYOUTS["replica"], Stage(width=20), "living1", tmp_path)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -98,7 +98,7 @@ def test_scannet200_groups_have_64_68_and_66_classes() -> None:
     assert [groups.count(name) for name in ("head", "common", "tail")] == [64, 68, 66]
 
 
-def test_rooms_classes_are_the_generated_ones() -> None:
+def test_classes_of_the_protocol_are_those_of_the_rooms() -> None:
     ours = {(entry.id, entry.name) for entry in load_protocol("rooms-instance").classes}
     assert ours == {(known.id, known.name) for known in CLASSES}
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.datasets.procedural.materials import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
@@ -127,15 +126,11 @@ def test_words_missing_from_training_captions_are_listed() -> None:
     assert encoder.unseen_words("the") == ("the",)  # contains nothing that the encoder uses
 
 
-def test_material_words_match_those_of_the_rooms() -> None:
-    assert lexicon.MATERIALS == MATERIALS
-
-
 @pytest.mark.slow
-def test_training_runs_from_rooms_to_model_card(tmp_path: Path) -> None:
+def test_training_runs_from_homes_to_model_card(tmp_path: Path) -> None:
     import train_encoder
 
-    options = "--rooms 1 --held-out-rooms 1 --frames-per-room 1 --minutes 2 --max-steps 2 --jobs 1"
+    options = "--homes 1 --measured-homes 1 --frames-per-home 1 --minutes 2 --max-steps 2 --jobs 1"
     assert train_encoder.main(["--out", str(tmp_path), *options.split()]) == 0
     card = json.loads((tmp_path / "model_card.json").read_text())
     assert card["training"]["steps"] == 2
