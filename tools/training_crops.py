@@ -16,6 +16,7 @@ from training_captions import CropTruth, Neighbour
 from su3d_bench.core import registry
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
+from su3d_bench.datasets.homes.furnish import KINDS
 from su3d_bench.perception.cache import crop_window, mask_boxes
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig
@@ -126,12 +127,19 @@ def _render_home(task: tuple[str, int, int, Path]) -> None:
         view = built.renderer.render(pose)
         frame = Frame(count, 0.0, view.rgb, view.depth_m, pose, homes.intrinsics)
         regions = segmenters[count % len(segmenters)].segment(frame)
-        for crop, row in _view_crops(view.rgb, _View(view.instance, truth), regions, rng):
+        shown = _View(view.instance, truth, _room_at(built.plan, pose[:2, 3]))
+        for crop, row in _view_crops(view.rgb, shown, regions, rng):
             pixels.append(crop)
             facts.append(row)
     np.save(_pixels_path(folder, scene), np.stack(pixels))
     # The facts come last: their presence marks the home as complete.
     _facts_path(folder, scene).write_text(json.dumps(facts))
+
+
+def _room_at(plan: Any, place: Float64Array) -> str:
+    """The kind of room at a place (2,), or of the first zone in the doorway between two."""
+    zones = plan.layout.zones
+    return str(KINDS[next((zone for zone in zones if zone.contains(place)), zones[0]).kind].suits[0])
 
 
 def _best_view(built: Any, truth: Any, rng: np.random.Generator) -> Float64Array:
@@ -229,9 +237,9 @@ def _part_box(mask: np.ndarray[Any, Any], box: Float32Array, rng: np.random.Gene
 class _View:
     """Content of one image: visible pixels and relations by object."""
 
-    def __init__(self, instance: Int32Array, truth: Any) -> None:
+    def __init__(self, instance: Int32Array, truth: Any, room: str) -> None:
         self.instance = instance
-        self._truth = truth
+        self._room = room
         self._objects = {item.id: item for item in truth.objects}
         n_ids = 1 + max(self._objects)
         self.counts = np.bincount(instance.ravel(), minlength=n_ids)
@@ -260,7 +268,7 @@ class _View:
             item.material,
             item.size_word,
             tuple(neighbours),
-            self._truth.kind if shows_room else "",
+            self._room if shows_room else "",
             item.model,
         )
 
@@ -269,4 +277,4 @@ class _View:
         large = np.flatnonzero(self.counts >= 0.01 * self.instance.size)
         seen = [self._objects[int(object_id)] for object_id in large if object_id]
         shown = {Neighbour("with", item.class_name, item.colour): None for item in seen if item.support != "room"}
-        return CropTruth("", "", "", "", tuple(shown), self._truth.kind)
+        return CropTruth("", "", "", "", tuple(shown), self._room)

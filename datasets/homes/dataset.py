@@ -66,10 +66,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     match = re.fullmatch(rf"({'|'.join(SERIES)})(0|[1-9]\d{{0,5}})", scene)
     if match is None or (match[1] in SERIES[:2] and int(match[2]) >= N_NAMED):
         hint = nearest(scene, DEFAULT_SCENES) or ""
-        raise DataError(
-            f"homes: no scene '{scene}'; expected tuning0 to tuning{N_NAMED - 1}, test0 to test{N_NAMED - 1}, or a seed "
-            f"such as seed7{hint}"
-        )
+        named = " or ".join(f"{series}0 to {series}{N_NAMED - 1}" for series in SERIES[:2])
+        raise DataError(f"homes: no scene '{scene}'; expected {named}, or a seed such as seed7{hint}")
     return match[1], int(match[2])
 
 
@@ -194,5 +192,6 @@ class HomesSensor(Homes):
 
 def _materials(renderer: Renderer, pose: Float64Array) -> Materials:
     rows = renderer.material_rows(pose)
-    albedo = (rows[..., 1] + rows[..., 4]) / 2  # red: nearest to the projector's 830 nm, where most dyes are bright
+    # Red is nearest to the projector's 830 nm, where most dyes are bright.
+    albedo = np.float32(0.5) * (rows[..., 1] + rows[..., 4])
     return Materials(albedo, rows[..., 8], clear=rows[..., 17], mirror=rows[..., 16])

@@ -111,10 +111,11 @@ class BuiltScene(ABC):
 
     def coarser(self, width: int) -> Renderer:
         """A renderer sharing the same tree, cached until another width is requested."""
-        if self._coarser is None or self._coarser.width != width:
+        renderer = self._coarser  # threads may request different widths
+        if renderer is None or renderer.width != width:
             height = max(1, round(self.options.height * width / self.options.width))
-            self._coarser = self.make_renderer(width, height, self.renderer)
-        return self._coarser
+            renderer = self._coarser = self.make_renderer(width, height, self.renderer)
+        return renderer
 
     @cached_property
     def trajectory(self) -> Float64Array:

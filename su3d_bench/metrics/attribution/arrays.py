@@ -28,7 +28,7 @@ from su3d_bench.metrics.attribution.overlaps import (
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.instance.score import InstanceMetric, masks_on_truth
+from su3d_bench.metrics.instance.score import CurveMetric, InstanceMetric, masks_on_truth
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.matching.nearest import Points, nearest
 from su3d_bench.metrics.metric import C, Metric, Values
@@ -151,7 +151,8 @@ class _CorrectedClasses:
 
 def _values_after(pool: Pool[InstanceCounts], corrected: Sequence[Mapping[int, InstanceCounts]]) -> Iterator[Values]:
     """The metrics after each correction: only the curves of the affected classes are computed again."""
-    thresholds = pool.metric.rules.thresholds
+    metric, thresholds = pool.metric, pool.metric.rules.thresholds
+    assert isinstance(metric, CurveMetric)
     before = instance_ap.combine([pool.mine, *pool.others], thresholds).table
     others: dict[int, list[InstanceCounts]] = {}
     changed = []
@@ -166,8 +167,7 @@ def _values_after(pool: Pool[InstanceCounts], corrected: Sequence[Mapping[int, I
         table = before.copy()
         for index in of_classes:
             table[index] = next(curves).table[0]
-        after = instance_ap.of_table(table, thresholds)
-        named = {"AP": after.ap, "AP50": after.ap50, "AP25": after.ap25}
+        named = metric.values_of(instance_ap.of_table(table, thresholds))
         yield {name: named[name] for name in pool.before}
 
 

@@ -51,12 +51,14 @@ class CurveMetric(Metric[InstanceCounts]):
         return self.combine_each([InstanceCounts.joined(counts)])[0]
 
     def combine_each(self, counts: Sequence[InstanceCounts]) -> list[Values]:
-        rows = [_ap_values(curve) for curve in instance_ap.combine_each(counts, self.rules.thresholds)]
+        return [self.values_of(curve) for curve in instance_ap.combine_each(counts, self.rules.thresholds)]
+
+    def values_of(self, curve: InstanceAP) -> Values:
+        """AP, AP50 and AP25, and the headline values of groups: means over their classes with ground truth."""
+        values = _ap_values(curve)
         for name, (value, of_group) in self.rules.group_headline.items():
-            own = [instance_ap.only(of_scene, of_group) for of_scene in counts]
-            for row, curve in zip(rows, instance_ap.combine_each(own, self.rules.thresholds), strict=True):
-                row[name] = _ap_values(curve)[value]
-        return rows
+            values[name] = _ap_values(instance_ap.of_table(curve.table[of_group], curve.thresholds))[value]
+        return values
 
     def resampled(self, counts: Sequence[InstanceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         values = dict(resampled_ap(counts, weights, self.rules.thresholds))
@@ -72,7 +74,8 @@ class CurveMetric(Metric[InstanceCounts]):
         answer = {}
         for index, name in enumerate(self.rules.curve_names):
             if any(of_scene.n_truth[index] for of_scene in counts):
-                values = self.resampled([instance_ap.only(of_scene, [index]) for of_scene in counts], weights)
+                own = [instance_ap.only(of_scene, [index]) for of_scene in counts]
+                values = resampled_ap(own, weights, self.rules.thresholds)
                 answer[name] = {column: values[column] for column in columns}
         return answer
 
