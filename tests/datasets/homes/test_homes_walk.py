@@ -106,7 +106,7 @@ def test_camera_passes_the_door_and_comes_back(carrier: Carrier, n_frames: int) 
 
 @pytest.mark.parametrize("name", ["two rooms", "L"])
 def test_all_parts_of_the_home_are_reached(name: Name) -> None:
-    home, poses = _home(name, carrier), _walk(name, "person")
+    home, poses = _home(name, "person"), _walk(name, "person")
     points = (np.argwhere(home.free) + 0.5) * CELL_M + ORIGIN
     distance = np.linalg.norm(points[:, None] - poses[None, ::20, :2, 3], axis=2).min(axis=1)
     assert distance.max() < 2.5
