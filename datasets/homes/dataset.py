@@ -43,7 +43,8 @@ DEFAULT_SCENES = tuple(f"{series}{k}" for series in ("test", "tuning") for k in 
 class HomeOptions(SceneOptions):
     """Image size, length of the trajectory, density of the scan; who carries the camera.
 
-    ``carrier``: ``person``, ``robot``, or ``either``: a robot in every third home.
+    ``seed_offset``: other homes under the same names. ``carrier``: ``person``, ``robot``, or ``either``: a robot in
+    every third home.
     """
 
     seed_offset: int = Field(default=0, ge=0)
@@ -113,7 +114,7 @@ class BuiltHome(BuiltScene):
         if carrier == "either":
             carrier = "robot" if self.number % 3 == 2 else "person"
         return walk_home(
-            self.unlit, free, cell_m, origin, (), plan.n_structure, self.options.n_frames,
+            self.unlit, free, cell_m, origin, plan.n_structure, self.options.n_frames,
             self._random("walk"), carrier,
         )  # fmt: skip
 
