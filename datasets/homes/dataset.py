@@ -114,7 +114,7 @@ class BuiltHome(BuiltScene):
         if carrier == "either":
             carrier = "robot" if self.number % 3 == 2 else "person"
         return walk_home(
-            self.unlit, free, cell_m, origin, (), plan.n_structure, self.options.n_frames,
+            self.unlit, free, cell_m, origin, plan.n_structure, self.options.n_frames,
             self._random("walk"), carrier,
         )  # fmt: skip
 

@@ -14,7 +14,6 @@ github.com/lzw-super/concept_graph_mine at a80d09d, ``groundtruth.txt`` of the T
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -24,7 +23,6 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.datasets.procedural import trajectory
-from su3d_bench.datasets.procedural.items import Box
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 
 Pair = tuple[Float64Array, Float64Array]
@@ -35,7 +33,6 @@ REACH_M = 2.5  # from the path to every free place: half of the 5 m to which dep
 OPEN_M = 0.25  # stops are at least this far from the edge of the free cells, not in corners
 MAX_STOPS, ROUNDED = 14, 0.85  # ROUNDED: length of a path with rounded corners over that of the path on the grid
 KNOT_M = 0.35  # path between two chosen views: at a walking speed, about the 0.7 s of a head turn and a look
-CLEAR_M = 0.28  # from anything at the camera's height to the middle of its cell: 0.2 m and half the diagonal of 0.1 m
 REVISIT_DEG = 60.0  # least turn between the first and the last view, which are at one place
 
 
@@ -76,8 +73,8 @@ class _Knots(NamedTuple):
 
 
 def walk_home(
-    mesh: SceneMesh, free: BoolArray, cell_m: float, origin: Float64Array, boxes: Sequence[Box], n_structure: int,
-    n_frames: int, rng: np.random.Generator, carrier: Literal["person", "robot"],
+    mesh: SceneMesh, free: BoolArray, cell_m: float, origin: Float64Array, n_structure: int, n_frames: int,
+    rng: np.random.Generator, carrier: Literal["person", "robot"],
 ) -> Float64Array:  # fmt: skip
     """Camera-to-world poses (n_frames, 4, 4) with OpenCV axes, z up: a round through all parts of the home.
 
@@ -86,9 +83,9 @@ def walk_home(
     """
     kind = CARRIERS[carrier]
     level = kind.height if not kind.faces_path else (float(rng.uniform(*kind.height)),) * 2
-    field = _Field(free, cell_m, origin, boxes, level)
+    field = _Field(free, cell_m, origin)
     duration = max(n_frames / FRAMES_PER_SECOND, SHORTEST_S)
-    path, stops = _round_trip(field, boxes, kind, duration)
+    path, stops = _round_trip(field, kind, duration)
     knots = _place_knots(path, stops, kind, level, rng)
     yaw, pitch = _choose_views(mesh, path, knots, kind, n_structure)
 
@@ -129,21 +126,12 @@ def _shake(rng: np.random.Generator, time: Float64Array, speed: Float64Array) ->
 
 
 class _Field:
-    """The largest part of the free cells that keeps away from boxes at the camera's height, and distances in it."""
+    """The free cells, and distances in them."""
 
-    def __init__(
-        self, free: BoolArray, cell_m: float, origin: Float64Array, boxes: Sequence[Box], level: Range
-    ) -> None:
+    def __init__(self, free: BoolArray, cell_m: float, origin: Float64Array) -> None:
         from scipy.ndimage import distance_transform_edt
 
         points = (np.moveaxis(np.indices(free.shape), 0, -1) + 0.5) * cell_m + origin
-        clear = free
-        for box in boxes:
-            if box.high[2] > level[0] - CLEAR_M and box.low[2] < level[1] + CLEAR_M:
-                near = (points > box.low[:2] - CLEAR_M) & (points < box.high[:2] + CLEAR_M)
-                clear = clear & ~near.all(axis=-1)
-        clear = trajectory.largest_part(clear)
-        free = clear if 2 * clear.sum() >= free.sum() else free  # the box of a slanted object may close a door
         self.free, self.cell_m, self.origin = free, cell_m, origin
         self.cells, self.points = np.argwhere(free), points[free]
         self._fine_m = cell_m / 4
@@ -158,14 +146,15 @@ class _Field:
         return np.asarray(map_coordinates(self._distance, at, order=1)) - 0.75 * self._fine_m
 
 
-def _round_trip(field: _Field, boxes: Sequence[Box], kind: Carrier, duration: float) -> Pair:
+def _round_trip(field: _Field, kind: Carrier, duration: float) -> Pair:
     """A closed path (N, 2) through all parts of the home, and its stops in metres from its start."""
     from scipy.sparse.csgraph import dijkstra
 
     points, clear = field.points, field.clearance(field.points)
-    cost = trajectory.low_furniture_cost(points, boxes) ** (2 if kind.faces_path else 1) + (clear < 0.15)
-    graph, plain = (trajectory.grid_graph(field.free, field.cells, weight) for weight in (cost, np.ones(len(points))))
-    open_floor = np.where((clear > min(OPEN_M, 0.9 * clear.max())) & (cost <= 1), 1.0, 1e-3)
+    cost = 1.0 + (clear < 0.15)
+    weights = np.asarray(cost, np.float64), np.ones(len(points))
+    graph, plain = (trajectory.grid_graph(field.free, field.cells, weight) for weight in weights)
+    open_floor = np.where(clear > min(OPEN_M, 0.9 * clear.max()), 1.0, 1e-3)
     chosen = [int((((points - points.mean(axis=0)) ** 2).sum(axis=1) * open_floor).argmax())]
     found: list[tuple[Float64Array, NDArray[np.int32]]] = []  # from each chosen stop: distances, predecessors
     best, loop, first = np.inf, points[:1], [0]

@@ -257,7 +257,8 @@ def _details(
         if scored is not None and scored[key] is not None:
             details[label] = {name: scored[key].get(name.lower()) for name in names}
     groups: dict[str, Mapping[str, Any]] = result.get("groups", {})
-    return details | groups
+    shown = {label for label in groups if any(name.endswith(f" {label}") for name in names)}  # as columns
+    return details | {label: values for label, values in groups.items() if label not in shown}
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:

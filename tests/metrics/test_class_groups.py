@@ -15,8 +15,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.attribution.arrays import Pool, single_mask_errors, single_point_errors
-from su3d_bench.metrics.attribution.masks import LabelledMasks, LabelledPoints, count_masks
-from su3d_bench.metrics.attribution.overlaps import ScoringRules, measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.masks import LabelledPoints, count_masks
+from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -155,7 +155,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_comparison_has_the_values_of_both_groups(runs: Path) -> None:
-    found = compare(runs / "whole", runs / "worse", method="collector")
+    found = compare(str(runs / "whole"), str(runs / "worse"), method="collector")
     instance, semantic = (one.metrics for one in found.protocols)
     assert instance["AP base"].difference == pytest.approx(-0.5)  # one of two base classes
     assert instance["AP novel"].difference == 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,7 +103,7 @@ def test_truth_scores_1_in_both_groups(truth: GroundTruth) -> None:
 @pytest.mark.parametrize("name", ["test24", "tuning24", "seed01", "seed1000000", "living0", "test", ""])
 def test_unknown_home_is_refused_in_one_line(homes: Homes, name: str) -> None:
     for read in (homes.digest, homes.scan, lambda scene: homes.frames(scene, 1)):
-        with pytest.raises(DataError, match="^homes: no scene '.*'; expected tuning0 to tuning23, test0 .*$") as error:
+        with pytest.raises(DataError, match=r"^homes: no scene '.*'; expected tuning0 to tuning23, test0 .*$") as error:
             read(name)
         assert "\n" not in str(error.value)
 
@@ -125,7 +126,13 @@ def test_homes_of_different_series_have_different_random_numbers() -> None:
 
 
 def test_digest_and_trajectory_depend_on_the_options(homes: Homes, rooms_data: Path) -> None:
-    changes = [{"width": 80}, {"n_frames": 23}, {"mesh_spacing_m": 0.02}, {"seed_offset": 1}, {"carrier": "robot"}]
+    changes: list[dict[str, Any]] = [
+        {"width": 80},
+        {"n_frames": 23},
+        {"mesh_spacing_m": 0.02},
+        {"seed_offset": 1},
+        {"carrier": "robot"},
+    ]
     others = [Homes(rooms_data, SMALL.model_copy(update=change)) for change in changes]
     digests = {one.digest(SCENE) for one in (homes, *others, HomesSensor(rooms_data, SMALL))}
     assert len(digests) == len(changes) + 2

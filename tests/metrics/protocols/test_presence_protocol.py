@@ -15,6 +15,7 @@ from scored_room import ENCODER, LABELS, instances, nothing, room, truth_as_pred
 from su3d_bench.core import registry
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
+from su3d_bench.datasets.homes.dataset import Homes
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
@@ -191,3 +192,11 @@ def test_co_occurrence_is_counted_over_the_rooms(scene: str, tmp_path: Path) -> 
     rooms = counted_scenes("rooms")
     assert tuple(dict.fromkeys(name for name in names if not is_room_surface(name))) in rooms
     assert len(rooms) == 48
+
+
+@pytest.mark.parametrize("scene", ["seed900003", "seed900031"])
+def test_co_occurrence_in_homes_is_counted_over_homes_of_the_generator(scene: str, tmp_path: Path) -> None:
+    names = dict.fromkeys(plain_name(thing.class_name) for thing in Homes(tmp_path).objects(scene))
+    homes = counted_scenes("homes")
+    assert tuple(name for name in names if not is_room_surface(name)) == homes[int(scene[-2:])]
+    assert len(homes) == 48
