@@ -17,6 +17,7 @@ from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
 TILE, COLUMNS = 180, 10
 VIEW = (0.55, -1.0, 0.55)  # from the middle of the object to the camera
 PAPER = 225
+FOCAL = 2 * FOCAL_PER_WIDTH  # per side of a tile, which is the middle half of the rendered picture
 
 
 def draw_item(item: Item, side: int = TILE) -> UInt8Array:
@@ -29,9 +30,10 @@ def draw_item(item: Item, side: int = TILE) -> UInt8Array:
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = np.array([0.0, 0.0, float(item.size[2]) / 2]) - forward * reach * 2.1 * FOCAL_PER_WIDTH
-    frame = SampledRenderer(mesh, side, side).render(pose)
-    return np.where((frame.instance > 0)[..., None], frame.rgb, np.uint8(PAPER))
+    pose[:3, 3] = np.array([0.0, 0.0, float(item.size[2]) / 2]) - forward * reach * np.hypot(1.0, 2 * FOCAL)
+    frame = SampledRenderer(mesh, 2 * side, side).render(pose)
+    middle = slice(side // 2, side // 2 + side)
+    return np.where((frame.instance > 0)[..., None], frame.rgb, np.uint8(PAPER))[:, middle]
 
 
 def model_sheet(names: Sequence[str] = ()) -> tuple[UInt8Array, int, int]:
@@ -54,9 +56,9 @@ def _tile(class_name: str, model: Model, seed: int) -> UInt8Array:
     import cv2
 
     item = model.build(np.random.default_rng(seed))
-    tile = draw_item(item)
+    tile = np.ascontiguousarray(draw_item(item))
     size = " x ".join(f"{100 * side:.0f}" for side in item.size)
-    for line, text in enumerate((class_name, f"{model.name}, {size} cm")):
+    for line, text in enumerate((class_name, model.name.replace("_", " "), f"{size} cm")):
         cv2.putText(tile, text[:34], (5, 13 + 13 * line), cv2.FONT_HERSHEY_SIMPLEX, 0.34, (0, 0, 0), 1, cv2.LINE_AA)
     if model.is_held_out:
         cv2.rectangle(tile, (1, 1), (TILE - 2, TILE - 2), (200, 40, 40), 2)

@@ -188,7 +188,7 @@ def _show_models(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"datasets show {printable(name)} --models: this dataset has no models; known: homes")
     path = arguments.out or Path(f"{name}-models.png")
     sheet, n_models, n_classes = draw(arguments.models)
-    write_bytes(path, png_bytes(sheet[..., ::-1]))
+    write_bytes(path, png_bytes(sheet))
     table = {"dataset": name, "picture": str(path), "n_models": n_models, "n_classes": n_classes}
     answer_either(
         arguments, table, f"{name}: {n_models} models of {n_classes} classes", f"picture: {printable(str(path))}"

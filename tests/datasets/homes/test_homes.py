@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,19 @@ import numpy as np
 import pytest
 from scored_room import truth_as_prediction
 
+from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project
 from su3d_bench.core.registry import load
 from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.datasets.homes.dataset import DEFAULT_SCENES, SERIES, BuiltHome, Homes, HomesSensor, label_set
+from su3d_bench.datasets.homes.model_sheet import PAPER, draw_item
+from su3d_bench.datasets.procedural.items import Item, Part
+from su3d_bench.datasets.procedural.materials import Material, Texture
+from su3d_bench.datasets.procedural.shapes import box
 from su3d_bench.datasets.procedural.truth import attribute_of_object
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.formats.images import decode_colour
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import combine, score_scene
 
 SMALL = Homes.Options(width=160, height=120, n_frames=24, mesh_spacing_m=0.03)
@@ -103,7 +110,7 @@ def test_truth_scores_1_in_both_groups(truth: GroundTruth) -> None:
 @pytest.mark.parametrize("name", ["test24", "tuning24", "seed01", "seed1000000", "living0", "test", ""])
 def test_unknown_home_is_refused_in_one_line(homes: Homes, name: str) -> None:
     for read in (homes.digest, homes.scan, lambda scene: homes.frames(scene, 1)):
-        with pytest.raises(DataError, match=r"^homes: no scene '.*'; expected tuning0 to tuning23, test0 .*$") as error:
+        with pytest.raises(DataError, match=r"^homes: no scene '.*'; expected tuning0 to ") as error:
             read(name)
         assert "\n" not in str(error.value)
 
@@ -162,3 +169,55 @@ def test_sensor_track_differs_in_frames_and_has_the_same_truth(
     same = sensor.ground_truth(SCENE, "mesh-vertices")
     assert same.points.tobytes() == truth.points.tobytes()
     assert same.semantic.tobytes() == truth.semantic.tobytes() and same.instance.tobytes() == truth.instance.tobytes()
+
+
+OF_HOMES = [name for name in protocol_names() if name.startswith("homes-")]
+SETTINGS = ["--set", *(f"homes.{name}={value}" for name, value in SMALL.model_dump(exclude_unset=True).items())]
+
+
+@pytest.fixture
+def _in_data(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("_in_data")
+def test_home_is_checked_shown_and_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["datasets", "check", f"homes/{SCENE}", "--quick", "--json", *SETTINGS]) == 0
+    (checked,) = json.loads(capsys.readouterr().out)["scenes"]
+    assert checked["n_frames"] == 24 and checked["n_errors"] == 0
+    assert main(["datasets", "show", f"homes/{SCENE}", "--out", "home.png", "--stride", "12", *SETTINGS]) == 0
+    assert Path("home.png").stat().st_size > 10_000
+    capsys.readouterr()
+    assert main(["datasets", "show", f"homes/{SCENE}", "--statistics", "--stride", "6", "--json", *SETTINGS]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["scenes"]
+    assert (row["scene"], row["frames"], row["updates"]) == (f"homes/{SCENE}", 24, 4)
+    assert 5 < row["instances_per_view"] < row["instances"] < 150
+
+
+@pytest.mark.usefixtures("_in_data")
+def test_ground_truth_of_a_home_is_scored_under_all_its_protocols(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--profile", "oracle", "--stride", "12", "--jobs", "1", "--no-pictures", "--out", "run", *SETTINGS]
+    assert main(["run", f"homes/{SCENE}", "--methods", "oracle", "opensu3d", "--protocols", *OF_HOMES, *words]) == 0
+    assert "mAcc novel" in capsys.readouterr().out
+    results = json.loads(Path("run/metrics.json").read_text())["results"]
+    found = {(one["protocol"], one["method"]): one["result"] for one in results}
+    assert len(OF_HOMES) == 9 and {name for name, _ in found} == {*OF_HOMES}
+    assert all(found[name, "opensu3d"] is not None for name in OF_HOMES)
+    for name in ("homes-semantic", "homes-instance", "homes-panoptic"):
+        assert {found[name, "oracle"]["metrics"][value] for value in load_protocol(name).headline} == {1.0}
+
+
+@pytest.mark.usefixtures("_in_data")
+def test_models_are_drawn_whole_in_their_own_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    red = Material(Texture.PLAIN, (0.6, 0.05, 0.05), (0.6, 0.05, 0.05), gloss=0.0)
+    part = Part(box(-0.5, 0.5, -0.2, 0.2, 0.0, 2.0), red)
+    tile = draw_item(Item("thing", "red", "wood", "medium", (part,), (), np.array([1.0, 0.4, 2.0])))
+    is_paper = (tile == PAPER).all(axis=-1)
+    assert is_paper[[0, -1]].all() and is_paper[:, [0, -1]].all() and 0.2 < 1 - is_paper.mean() < 0.8
+    monkeypatch.setattr(Homes, "model_sheet", staticmethod(lambda: (tile, 1, 1)))
+    assert main(["datasets", "show", "homes", "--models", "--out", "models.png"]) == 0
+    stored = decode_colour(Path("models.png").read_bytes(), "models.png")
+    assert np.array_equal(stored, tile) and (tile[~is_paper, 0] > tile[~is_paper, 2]).all()
+    assert main(["datasets", "show", "rooms", "--models"]) == 2
