@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -137,11 +137,11 @@ class Homes(GeneratedScenes):
     label_set = staticmethod(label_set)
 
     @staticmethod
-    def model_sheet() -> tuple[UInt8Array, int, int]:
-        """A picture of every model, the number of models and of classes."""
+    def model_sheet(names: Sequence[str]) -> tuple[UInt8Array, int, int]:
+        """A picture of the models with these names or classes, by default all; the numbers of models and of classes."""
         from su3d_bench.datasets.homes.model_sheet import model_sheet
 
-        return model_sheet()
+        return model_sheet(names)
 
     def check_name(self, scene: str) -> None:
         scene_name_parts(scene)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.datasets.homes.catalogue import Model, catalogue
 from su3d_bench.datasets.procedural.items import Item, Light, Placed
@@ -33,9 +36,16 @@ def draw_item(item: Item, side: int = TILE) -> UInt8Array:
     return np.where((frame.instance > 0)[..., None], frame.rgb, np.uint8(PAPER))[:, middle]
 
 
-def model_sheet() -> tuple[UInt8Array, int, int]:
-    """The picture (H, W, 3), the number of models and of their classes; held-out models have a red frame."""
-    models = [(known.name, model) for known in catalogue().classes.values() for model in known.models]
+def model_sheet(names: Sequence[str] = ()) -> tuple[UInt8Array, int, int]:
+    """The picture (H, W, 3), the number of models and of their classes; held-out models have a red frame.
+
+    ``names``: of models or classes, by default all. Raises ``ConfigError`` for one that does not exist.
+    """
+    every = [(known.name, model) for known in catalogue().classes.values() for model in known.models]
+    known_names = {name for class_name, model in every for name in (class_name, model.name)}
+    if unknown := [name for name in names if name not in known_names]:
+        raise ConfigError(f"homes has no model or class '{unknown[0]}'{suggest(unknown[0], sorted(known_names))}")
+    models = [(name, model) for name, model in every if not names or {name, model.name} & set(names)]
     tiles = [_tile(name, model, k) for k, (name, model) in enumerate(models)]
     tiles += [np.full((TILE, TILE, 3), 255, np.uint8)] * (-len(tiles) % COLUMNS)
     rows = [np.concatenate(tiles[k : k + COLUMNS], axis=1) for k in range(0, len(tiles), COLUMNS)]

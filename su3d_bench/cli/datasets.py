@@ -32,8 +32,8 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--jobs", "--set")
     parser = add_verb(actions, "show", call_show, data=True)
     parser.option("scene SCENE", "scene, such as homes/test0; a pattern with --statistics")
-    parser.option("--statistics", "print instances, views and motion of scenes instead: --stride 40 is the default")
-    parser.option("--models", "draw every model of generated scenes instead: datasets show homes --models")
+    parser.option("--statistics", "print instances, views and motion instead")
+    parser.option("--models [NAME...]", "models or classes of homes to draw instead (default: all)")
     parser.option("--out FIGURE", "picture to write: .pdf, .png or .svg (default: DATASET-SCENE.png)")
     parser.shared("--width")
     parser.option("--stride N", "use every Nth frame (default: 48 frames in total)", type=count)
@@ -67,10 +67,8 @@ def call_check(arguments: argparse.Namespace) -> int:
 def call_show(arguments: argparse.Namespace) -> None:
     """Draw a scene: camera path from above, sample frames, and the ground truth by class and instance.
 
-    su3d-bench datasets show rooms/living0 --set rooms.n_frames=40
     su3d-bench datasets show replica/room0 --out room0.png --stride 50
-    su3d-bench datasets show 'homes/test*' --statistics
-    su3d-bench datasets show homes --models
+    su3d-bench datasets show homes --models chair lamp
     """
     from su3d_bench.cli import scenes
 

@@ -141,7 +141,7 @@ def _truth_text(variant: TruthVariant) -> str:
 
 def show(arguments: argparse.Namespace) -> None:
     """Draw the scene and print its counts and the path of the picture; or the models or statistics of a dataset."""
-    if arguments.models:
+    if arguments.models is not None:
         _show_models(arguments)
     elif arguments.statistics:
         _show_statistics(arguments)
@@ -187,7 +187,7 @@ def _show_models(arguments: argparse.Namespace) -> None:
     if draw is None:
         raise ConfigError(f"datasets show {printable(name)} --models: this dataset has no models; known: homes")
     path = arguments.out or Path(f"{name}-models.png")
-    sheet, n_models, n_classes = draw()
+    sheet, n_models, n_classes = draw(arguments.models)
     write_bytes(path, png_bytes(sheet))
     table = {"dataset": name, "picture": str(path), "n_models": n_models, "n_classes": n_classes}
     answer_either(

@@ -20,7 +20,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Arr
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics import relations as geometry
 from su3d_bench.numerics.relations import RELATIONS, SURFACES, Relation, Relations
-from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
+from su3d_bench.perception.embedded.lexicon import GROUPS, KIND_OF, SYNONYMS, vocabulary
 from su3d_bench.questions.appearance import WITHOUT_COLOUR, Appearance, Sight, appearance_of, instance_rows
 from su3d_bench.questions.model import word_table
 
@@ -263,8 +263,8 @@ def _means(name: Words, noun_words: Words, kind: str | None) -> bool:
         return True
     own = _class_of_words().get(name)
     if own is not None:
-        # A name with its own class: a paper towel is not a towel.
-        return own == kind
+        # A name with its own class: a paper towel is not a towel, but a coffee table is a table.
+        return kind is not None and kind in (own, KIND_OF.get(own))
     is_kind_of = len(name) > len(noun_words) and name[len(name) - len(noun_words) :] == noun_words
     return is_kind_of or (kind is not None and _class_of_words().get(name[-1:]) == kind)
 

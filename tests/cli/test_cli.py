@@ -155,7 +155,7 @@ def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
         ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
         ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
         ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
-        ("run --scenes nothing", "no scene matches 'nothing'; known datasets: rooms, replica"),
+        ("run --scenes nothing", "no scene matches 'nothing'; known datasets: homes, homes-sensor, rooms"),
         (f"{TYPED} --methods opensu3", "unknown method 'opensu3'; did you mean 'opensu3d'?"),
         (f"{TYPED} --methods {SCENES}/none.py:X", f"method '{SCENES}/none.py:X': no file {SCENES}/none.py"),
         (f"{TYPED} --profile orcale", "unknown profile 'orcale'; did you mean 'oracle'?"),

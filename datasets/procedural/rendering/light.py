@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.datasets.procedural.items import Light
@@ -198,6 +197,8 @@ class _Room:
         from_sun = np.zeros((len(chosen), 3))
         for at, plane, area, power in self.sunlit_pieces(albedo * sunlight[corners].mean(axis=1)):
             from_sun += self.shine(start[chosen], out, at, plane, area, 0.01)[:, None] * power / area
+        from scipy.spatial import cKDTree
+
         tree = cKDTree(np.column_stack([start[chosen], 0.5 * out]))
         far, near = tree.query(np.column_stack([start, 0.5 * facing]), range(1, N_NEIGHBOURS + 1), eps=0.3, workers=-1)
         weight = 1.0 / (far**2 + BOUNCE_SPACING_M**2)

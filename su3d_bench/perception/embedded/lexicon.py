@@ -223,6 +223,7 @@ def _words(section: str) -> Words:
 
 
 SYNONYMS = _words("synonyms")  # other names that mean this class and no other
+KIND_OF = {kind: name for name, kinds in _words("kinds").items() for kind in kinds}  # a coffee table is a table
 GROUPS = _words("groups")  # words that cover several classes
 AFFORDANCES = _words("uses")  # a phrase and every class of which it is true
 ROOM_NAMES = _words("rooms")

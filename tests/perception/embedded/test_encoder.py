@@ -130,7 +130,7 @@ def test_words_missing_from_training_captions_are_listed() -> None:
 def test_training_runs_from_homes_to_model_card(tmp_path: Path) -> None:
     import train_encoder
 
-    options = "--homes 1 --measured-homes 1 --frames-per-home 1 --minutes 2 --max-steps 2 --jobs 1"
+    options = "--homes 1 --measured-homes 1 --frames-per-home 8 --minutes 2 --max-steps 2 --jobs 1"
     assert train_encoder.main(["--out", str(tmp_path), *options.split()]) == 0
     card = json.loads((tmp_path / "model_card.json").read_text())
     assert card["training"]["steps"] == 2
