@@ -398,9 +398,6 @@ def is_called(label: str, class_name: str) -> bool:
         return True
     if " ".join(label_words) in GROUPS:
         return False
-    classes = [str(_class_of_words().get(one)) for one in (label_words, class_words)]
-    if any(one in word_table("kinds").get(other, ()) for one, other in (classes, classes[::-1])):
-        return True
     return bool(noun_objects(class_name, _only(label)).objects) or bool(noun_objects(label, _only(class_name)).objects)
 
 
