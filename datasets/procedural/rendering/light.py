@@ -62,6 +62,8 @@ def lit_mesh(
     spacing_m: float = 0.06,
 ) -> base.SceneMesh:  # fmt: skip
     """The render mesh of a home; light is scaled so that its 70th percentile is ``exposure``."""
+    from su3d_bench.datasets.procedural.rendering.sampled_kernels import wear_off
+
     grid = base.cut(patches, spacing_m)
     points: Floats = base.at_rows(patches.corners, grid.rows)
     normals = _unit(base.at_rows(patches.normals, grid.rows))
@@ -110,10 +112,12 @@ def lit_mesh(
     triangles, owner = base.triangles_of(merged, points)
     baked = np.concatenate([(soft + sunlight)[group], sharp]) * scale
     sources = [[*lamp.position, min(1.5, max(lamp.colour) * scale)] for lamp in lights]
-    sources += [[*point, min(1.5, max(window.sky) * scale) / 5] for window in windows for point in window.points]
+    sources += [[*point, min(1.5, max(window.sky) * scale) / 2] for window in windows for point in window.points[::4]]
     texture = base.at_rows(patches.texture, merged.rows).astype(np.float32)
+    baked = baked.astype(np.float32)
+    wear_off(texture, patches.material[merged.rows[:, 0].astype(np.int64)], patches.materials, baked)
     return base.SceneMesh(
-        points.astype(np.float32), normals.astype(np.float32), texture, baked.astype(np.float32), triangles,
+        points.astype(np.float32), normals.astype(np.float32), texture, baked, triangles,
         patches.object_id[owner], patches.material[owner], patches.materials,
         np.array(sources, np.float32).reshape(-1, 4),
     )  # fmt: skip

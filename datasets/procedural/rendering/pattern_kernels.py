@@ -11,21 +11,32 @@ from typing import Any
 
 from su3d_bench.core.compiled import njit
 from su3d_bench.datasets.procedural.rendering.home_patterns import home_colour
-from su3d_bench.datasets.procedural.rendering.noise_kernels import hash01, noise
+from su3d_bench.datasets.procedural.rendering.noise_kernels import hash01, noise, noise3
 
 inlined: Any = njit(cache=True, inline="never")
 
 
+FIBRE_M = 1 / 170  # width of a fibre of wood
+
+
 @inlined
-def _wood(x, y, z, scale, axis, seed):  # type: ignore[no-untyped-def]
+def _wood(x, y, z, scale, axis, seed, foot):  # type: ignore[no-untyped-def]
+    """``foot`` above 0, the width of a pixel in m: with faster noise, and fibres fade where they are thinner."""
     if axis == 1:
         x, y = y, x
     elif axis == 2:
         x, z = z, x
-    wander = 3.6 * noise(x * 1.9 + seed, y * 7.0, z * 7.0)
+    if foot > 0:
+        wander = 3.6 * noise3(x * 1.9 + seed, y * 7.0, z * 7.0, 1)
+    else:
+        wander = 3.6 * noise(x * 1.9 + seed, y * 7.0, z * 7.0)
     rings = (y + z * 1.3) / (2.2 * scale) + wander
     grain = 0.5 + 0.5 * math.sin(6.2832 * rings)
-    fibre = noise(x * 9.0 + seed, y * 170.0, z * 170.0)
+    fibre = 0.5
+    if foot == 0:
+        fibre = noise(x * 9.0 + seed, y * 170.0, z * 170.0)
+    elif foot < FIBRE_M:
+        fibre += (noise3(x * 9.0 + seed, y * 170.0, z * 170.0, 2) - 0.5) * (1.0 - foot / FIBRE_M)
     return 0.42 * grain * grain + 0.5 * fibre
 
 
@@ -61,7 +72,7 @@ def _tiles(u, v, scale, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _planks(u, v, scale, seed, x, y, z):  # type: ignore[no-untyped-def]
+def _planks(u, v, scale, seed, x, y, z, foot):  # type: ignore[no-untyped-def]
     row = math.floor(v / 0.13)
     offset = hash01(int(row), 3, int(seed))
     piece = math.floor(u / 1.1 + offset)
@@ -69,7 +80,7 @@ def _planks(u, v, scale, seed, x, y, z):  # type: ignore[no-untyped-def]
     if b < 0.022 or a < 0.003:
         return 1.15
     tint = hash01(int(row), int(piece), int(seed))
-    return 0.55 * tint + 0.45 * _wood(x, y, z, scale, 0, seed + 17.0 * tint)
+    return 0.55 * tint + 0.45 * _wood(x, y, z, scale, 0, seed + 17.0 * tint, foot)
 
 
 @inlined
@@ -247,7 +258,7 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
     if kind == 0:
         share = 0.5 * noise(x * 25.0 + seed, y * 25.0, z * 25.0)
     elif kind == 1:
-        share = _wood(x, y, z, scale, axis, seed)
+        share = _wood(x, y, z, scale, axis, seed, foot)
     elif kind == 2 or (5 <= kind <= 7) or kind == 22:
         share = 0.0 if kind == 2 else _pattern(kind, u, v, scale, axis, seed)
         thread = 0.5 + 0.25 * (math.sin(u * 1300.0) + math.sin(v * 1300.0))
@@ -275,7 +286,7 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
     elif kind == 10:
         share = _keys(u, v, scale)
     elif kind == 12:
-        share = _planks(u, v, scale, seed, x, y, z)
+        share = _planks(u, v, scale, seed, x, y, z, foot)
     elif kind == 13:
         a, b = math.floor(u / scale), math.floor(v / scale)
         over = (int(a) + int(b)) % 2 == 0

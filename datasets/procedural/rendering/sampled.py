@@ -74,9 +74,10 @@ class SampledRenderer(Renderer):
         from su3d_bench.datasets.procedural.rendering.sampled_kernels import shade_rays
 
         mesh, n = self._mesh, len(skip)
+        pixel = (1.0 if step.any() else 0.5) / (FOCAL_PER_WIDTH * self.width)
         colour, tint = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         onward = np.empty((n, 6), np.float32)
-        self._in_threads(shade_rays, n, *hits, skip, step[0], step[1], level == MAX_CONTINUATIONS, mesh.vertices,
+        self._in_threads(shade_rays, n, *hits, skip, step[0], step[1], pixel, level == MAX_CONTINUATIONS, mesh.vertices,
                          mesh.triangles, mesh.normals, mesh.texture, mesh.light, self._face_normals,
                          mesh.material_of_triangle, mesh.materials, mesh.lights, colour, tint, onward)  # fmt: skip
         going_on = np.flatnonzero(tint.any(axis=1))

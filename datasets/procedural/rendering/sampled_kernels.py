@@ -16,7 +16,7 @@ from su3d_bench.datasets.procedural.rendering.noise_kernels import noise3
 from su3d_bench.datasets.procedural.rendering.pattern_kernels import surface_colour
 from su3d_bench.datasets.procedural.rendering.shade_kernels import _between, _difference, _highlight
 
-compiled: Any = njit(cache=True, nogil=True)
+compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 inlined: Any = njit(cache=True, inline="never")
 
 SAMPLES = np.array([[-0.375, -0.125], [0.375, 0.125], [0.125, -0.375], [-0.125, 0.375]])  # rotated grid, in pixels
@@ -51,14 +51,15 @@ def mark_edges(start, stop, width, t, triangle, rays, face_normals, instance, ma
 
 
 @compiled
-def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, vertices, triangles, normals, texture,  # type: ignore[no-untyped-def]
-               light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
+def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is_last, vertices, triangles, normals,  # type: ignore[no-untyped-def]
+               texture, light, face_normals, material, materials, lights, colour, tint, onward):  # fmt: skip
     """Fills ``colour`` (N, 3) of rays ``start`` to ``stop``, and how they go on: ``tint`` (N, 3) and ray ``onward``.
 
-    ``across`` and ``down`` are the steps of a ray's direction to the next pixels; zero for one sample of the texture.
+    ``across`` and ``down`` are the steps of a ray's direction to the next pixels, zero for one sample of the texture;
+    ``pixel`` is the width of a sample at a distance of 1.
     ``is_last`` makes glass and mirrors opaque.
     """
-    pixel = math.sqrt(across[0] ** 2 + across[1] ** 2 + across[2] ** 2)
+    is_filtered = across[0] != 0 or across[1] != 0 or across[2] != 0
     for i in range(start, stop):
         tint[i] = 0.0
         colour[i] = 0.0
@@ -82,7 +83,7 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
         kind, n = int(row[0]), 1
         foot = far * length * pixel * length / max(abs(facing), 0.1 * length)
         gux, guy, guz, gvx, gvy, gvz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        if pixel > 0 and kind != PLAIN and not (kind == STAINS and z > 0.1 + foot):
+        if is_filtered and kind != PLAIN and not (kind == STAINS and z > 0.1 + foot):
             n = 4
             gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
             gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)
@@ -98,13 +99,9 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
             if k + 1 == n:
                 break
         r, g, b = r / n, g / n, b / n
-        if row[18] > 0:
-            large = noise3(x * 1.7, y * 1.7, z * 1.7, row[15])
-            middle = noise3(x * 8.3, y * 8.3, z * 8.3, row[15])
-            small = noise3(x * 40.0, y * 40.0, z * 40.0, row[15]) if foot < 0.02 else 0.5
-            worn = 1 + row[18] * ((0.78 + 0.44 * large) * (0.84 + 0.32 * middle) * (0.88 + 0.24 * small) - 1)
-            hue = 0.07 * row[18] * (middle + large - 1)
-            r, g, b = r * worn * (1 + hue), g * worn, b * worn * (1 - hue)
+        if row[18] > 0 and foot < 0.02:
+            worn = 1 + row[18] * (0.24 * noise3(x * 40.0, y * 40.0, z * 40.0, row[15]) - 0.12)
+            r, g, b = r * worn, g * worn, b * worn
         lr, lg, lb = _between(light, i0, i1, i2, b0, b1, b2)
         mean = (lr + lg + lb) / 3
         gloss, glow, mirror, clear = row[8], row[9], row[16], row[17]
@@ -129,6 +126,22 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, is_last, 
         colour[i, 0] = own * r * (lr + glow) + shine + spark
         colour[i, 1] = own * g * (lg + glow) + shine + spark
         colour[i, 2] = own * b * (lb + glow) + shine + spark
+
+
+@compiled
+def wear_off(texture, material, materials, light):  # type: ignore[no-untyped-def]
+    """Multiplies ``light`` (V, 3) by the wear at 0.6 m and 0.12 m, which varies slowly enough for vertices."""
+    for i in range(len(light)):
+        row = materials[material[i]]
+        if row[18] > 0:
+            x, y, z = texture[i, 0], texture[i, 1], texture[i, 2]
+            large = noise3(x * 1.7, y * 1.7, z * 1.7, row[15])
+            middle = noise3(x * 8.3, y * 8.3, z * 8.3, row[15])
+            worn = 1 + row[18] * ((0.78 + 0.44 * large) * (0.84 + 0.32 * middle) - 1)
+            hue = 0.07 * row[18] * (middle + large - 1)
+            light[i, 0] *= worn * (1 + hue)
+            light[i, 1] *= worn
+            light[i, 2] *= worn * (1 - hue)
 
 
 @inlined
