@@ -77,6 +77,7 @@ class BuiltHome(BuiltScene):
     def __init__(self, scene: str, options: HomeOptions, folder: Path | None) -> None:
         super().__init__(scene, options, folder)
         self.series, self.number = scene_name_parts(scene)
+        self.merged_m = 0.8 * options.mesh_spacing_m  # a grid of that spacing keeps its vertices, finer parts do not
 
     @property
     def classes(self) -> Mapping[str, HomeClass]:  # type: ignore[override]

@@ -63,6 +63,7 @@ class BuiltScene(ABC):
 
     kind: str
     classes: Mapping[str, Described]
+    merged_m: float = 1e-4  # size of the cells in which vertices of the scan are merged
 
     def __init__(self, scene: str, options: Any, folder: Path | None) -> None:
         self.scene, self.options, self.folder = scene, options, folder
@@ -126,7 +127,7 @@ class BuiltScene(ABC):
     @property
     def scan(self) -> SceneScan:
         """The surface seen on the trajectory, recomputed."""
-        return scan_scene(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m)
+        return scan_scene(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m, self.merged_m)
 
     def _kept_in(self, what: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"

@@ -40,14 +40,19 @@ class SceneScan:
         return owner
 
 
-def scan_scene(patches: Patches, mesh: SceneMesh, poses: Float64Array, spacing_m: float) -> SceneScan:
-    """The faces of about ``spacing_m`` that at least one of the poses sees."""
+def scan_scene(
+    patches: Patches, mesh: SceneMesh, poses: Float64Array, spacing_m: float, merged_m: float = 1e-4
+) -> SceneScan:
+    """The faces of about ``spacing_m`` that at least one of the poses sees.
+
+    Vertices of an object in one cell of ``merged_m`` are merged: parts with finer faces do not have more vertices.
+    """
     grid = cut(patches, spacing_m)
     points = at_rows(patches.corners, grid.rows)
     owner = patches.object_id[grid.quad_of_face]
     seen = _visible(points, grid, owner, mesh, poses)
     faces = grid.faces[seen]
-    return _welded(points, at_rows(patches.normals, grid.rows), faces, owner[seen], mesh)
+    return _welded(points, at_rows(patches.normals, grid.rows), faces, owner[seen], mesh, merged_m)
 
 
 def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: SceneMesh, poses: Float64Array) -> BoolArray:
@@ -76,25 +81,29 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: SceneMes
 
 
 def _welded(
-    points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: SceneMesh
+    points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: SceneMesh, merged_m: float
 ) -> SceneScan:
-    """Merges the corners of an object at the same position, and drops unused vertices."""
+    """Merges the corners of an object at the same position, and drops unused vertices and what has lost its area."""
     used = np.zeros(len(points), bool)
     used[faces] = True
     object_of_point = np.zeros(len(points), np.int64)
     object_of_point[faces] = owner[:, None]
     kept = np.flatnonzero(used)
-    keys = np.column_stack([np.round(points[kept] * 10_000).astype(np.int64), object_of_point[kept]])
+    keys = np.column_stack([np.round(points[kept] * round(1 / merged_m)).astype(np.int64), object_of_point[kept]])
     first, group = merge_equal(keys)
     vertex_of_point = np.zeros(len(points), np.int32)
     vertex_of_point[kept] = group
-    vertices = points[kept][first].astype(np.float32)
     summed = np.column_stack([np.bincount(group, normals[kept, k], len(first)) for k in range(3)])
     lengths = np.linalg.norm(summed, axis=1, keepdims=True)
     smooth = np.where(lengths > 1e-6, summed / np.maximum(lengths, 1e-6), normals[kept][first])
+    faces = vertex_of_point[faces]
+    has_area = (np.diff(np.sort(faces, axis=1), axis=1) > 0).sum(axis=1) >= 2
+    in_use, corners = np.unique(faces[has_area], return_inverse=True)
+    vertices = points[kept][first][in_use].astype(np.float32)
     return SceneScan(
-        vertices, smooth.astype(np.float32), surface_colours(mesh, vertices), vertex_of_point[faces], owner
-    )
+        vertices, smooth[in_use].astype(np.float32), surface_colours(mesh, vertices),
+        corners.reshape(-1, 4).astype(np.int32), owner[has_area],
+    )  # fmt: skip
 
 
 def surface_colours(mesh: SceneMesh, points: Float32Array) -> UInt8Array:
