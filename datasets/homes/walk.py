@@ -28,7 +28,7 @@ from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 Pair = tuple[Float64Array, Float64Array]
 Range = tuple[float, float]
 FRAMES_PER_SECOND = 30.0
-SHORTEST_S = 40.0  # a walk with fewer frames passes through the whole home all the same, with longer steps
+SHORTEST_S = 40.0  # a walk with fewer frames passes through the whole home anyway, with longer steps
 REACH_M = 2.5  # from the path to every free place: half of the 5 m to which depth cameras are accurate
 OPEN_M = 0.25  # stops are at least this far from the edge of the free cells, not in corners
 MAX_STOPS, ROUNDED = 14, 0.85  # ROUNDED: length of a path with rounded corners over that of the path on the grid
