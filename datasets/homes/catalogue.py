@@ -56,7 +56,10 @@ class Model:
 
 @dataclass(frozen=True)
 class HomeClass:
-    """A class with its models. ``called``: the everyday name of each model that differs from the class name."""
+    """A class with its models. ``called``: the names of models that are kinds of the class by their last word.
+
+    A "dining chair" is asked for as such; a "cactus" as an indoor plant, which is all that a map with classes knows.
+    """
 
     name: str
     row: ClassRow
@@ -98,7 +101,9 @@ def catalogue() -> Catalogue:
             raise DataError(f"homes: class '{name}' has no model")
         held_out = {model.name for model in own} if row.group == "novel" else held_out_of([m.name for m in own])
         models = tuple(Model(model, model.name in held_out) for model in own)
-        classes[name] = HomeClass(name, row, models, {model.name: model.called for model in own if model.called})
+        kind = name.rpartition("-")[2]
+        called = {model.name: model.called for model in own if model.called.rpartition(" ")[2] == kind}
+        classes[name] = HomeClass(name, row, models, called)
     if stray := next((model for model in rows if model.of_class not in classes), None):
         raise DataError(f"homes: model '{stray.name}': unknown class '{stray.of_class}'")
     return Catalogue(dict(sorted(classes.items(), key=lambda item: item[1].id)))
