@@ -1,8 +1,8 @@
 """Image statistics of generated scenes beside those of real recordings, as a Markdown table.
 
 ``python benchmarks realism SCENE ... [NAME=COLOURS,DEPTHS,UNITS_PER_METRE ...] [--frames N] [--sheet FILE.png]``; a
-scene is an address such as homes/test0, a recording two patterns of image files. Frames are evenly spaced and scaled
-to 640 columns. ``--sheet`` draws up to twelve frames of each source in a row.
+scene is an address such as homes/test0, or homes/test0+test1 for several together, a recording two patterns of image
+files. Frames are evenly spaced and scaled to 640 columns. ``--sheet`` draws up to twelve frames of each in a row.
 """
 
 from __future__ import annotations
@@ -52,11 +52,14 @@ def measured(rgb: UInt8Array, depth_m: Float32Array) -> list[float]:
 
 
 def scene_source(address: str, n: int) -> Source:
-    name, _, scene = address.partition("/")
+    name, _, scenes = address.partition("/")
     dataset = registry.load("dataset", name)(data_root())
-    frames: Sequence[Frame] = dataset.frames(scene, 1)
-    chosen = [frames[int(k)] for k in np.linspace(0, len(frames) - 1, n)]
-    return Source(address, [(frame.rgb, frame.depth_m) for frame in chosen])
+    images = []
+    for scene in scenes.split("+"):
+        frames: Sequence[Frame] = dataset.frames(scene, 1)
+        chosen = np.linspace(0, len(frames) - 1, n // (scenes.count("+") + 1)).astype(int)
+        images += [(frame.rgb, frame.depth_m) for frame in map(frames.__getitem__, chosen)]
+    return Source(address, images)
 
 
 def recording_source(text: str, n: int) -> Source:
@@ -79,14 +82,13 @@ def table(sources: Sequence[Source]) -> Iterator[str]:
 
 def motion(addresses: Sequence[str], stride: int) -> Iterator[str]:
     """Objects per view and motion per update of generated scenes."""
-    yield f"\n| per update, stride {stride} | objects | objects per view | translation | rotation |"
+    yield f"\n| per update, stride {stride} | objects | in view | translation | rotation |"
     yield "|---|---|---|---|---|"
-    for address in addresses:
-        name, _, scene = address.partition("/")
+    for name, scene in ((a.partition("/")[0], b) for a in addresses for b in a.partition("/")[2].split("+")):
         row = view_statistics(registry.load("dataset", name)(data_root()), scene, stride)
         yield (
-            f"| {address} | {row['instances']} | {row['instances_per_view']:.0f} | {row['translation_cm']:.0f} cm | "
-            f"{row['rotation_deg']:.0f} degrees |"
+            f"| {name}/{scene} | {row['instances']} | {row['instances_per_view']:.0f} | "
+            f"{row['translation_cm']:.0f} cm | {row['rotation_deg']:.0f} degrees |"
         )
 
 
