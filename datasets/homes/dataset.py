@@ -109,7 +109,7 @@ class BuiltHome(BuiltScene):
         return SampledRenderer(self.mesh, width, height, like)
 
     def make_trajectory(self) -> Float64Array:
-        plan, cell_m = self.plan, 0.1
+        plan, cell_m = self.plan, 0.05
         free, origin = plan.free(cell_m, PERSON_M)  # where people fit; all of it is connected
         carrier = self.options.carrier
         if carrier == "either":
