@@ -33,5 +33,5 @@ def test_rendering(kind: str, benchmark: BenchmarkFixture, tmp_path: Path) -> No
             built.renderer.render(pose)
 
     benchmark.pedantic(render, rounds=3)
-    assert benchmark.stats is not None
-    benchmark.extra_info["ms per frame"] = round(1000 * benchmark.stats.stats.median / len(poses), 1)
+    if benchmark.stats is not None:
+        benchmark.extra_info["ms per frame"] = round(1000 * benchmark.stats.stats.median / len(poses), 1)
