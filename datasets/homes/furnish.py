@@ -20,7 +20,7 @@ from su3d_bench.datasets.procedural.shapes import rotation
 
 N_OBJECTS = (95, 145)  # of a home without its shell: the fewest and the most
 PER_M2 = (2.4, 3.6)  # objects: small homes hold the fewest, large ones would look empty with them
-FEWEST = 90  # a home that has space for fewer is drawn again
+FEWEST = 90  # a home with space for fewer, or with a blocked way, is drawn again
 SMALLEST_M = 0.06  # longest side of what the filler adds: smaller things have too few pixels to be annotated
 MAX_FAILURES = 160  # of the filler before a home counts as full
 HIGH_M = 1.5  # tops above hold what is put on shelves
@@ -62,7 +62,7 @@ def furnish(
     layout = layout or str(rng.choice(list(LAYOUTS)))  # before homes are drawn again, so that all are equally frequent
     while True:
         home = _Furnisher(HomePlan(rng, draw_layout(rng, layout), muted, is_evening), catalogue, training)
-        if home.is_begun() and home.finished().n_objects >= FEWEST:
+        if home.is_begun() and home.finished().n_objects >= FEWEST and home.plan.is_passable():
             return home.plan
 
 
