@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -25,7 +25,6 @@ from su3d_bench.datasets.procedural.dataset import (
     SceneOptions,
     generator,
 )
-from su3d_bench.datasets.procedural.items import Placed
 from su3d_bench.datasets.procedural.rendering.light import lit_mesh
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import Renderer
@@ -87,18 +86,6 @@ class BuiltHome(BuiltScene):
     def plan(self) -> HomePlan:
         return furnish(self._random("home"), catalogue(), training=self.series == "training")
 
-    @property
-    def kind(self) -> str:  # type: ignore[override]
-        return self.plan.kind
-
-    @property
-    def placed(self) -> list[Placed]:
-        return self.plan.placed
-
-    @property
-    def mount(self) -> dict[int, str]:
-        return self.plan.mount
-
     def make_mesh(self) -> SceneMesh:
         plan = self.plan
         exposure = float(self._random("exposure").uniform(0.58, 0.72))
@@ -133,7 +120,7 @@ class Homes(GeneratedScenes):
     Options = HomeOptions
     version = 1
     options: HomeOptions
-    sources: ClassVar[tuple[str, ...]] = ("datasets/homes", "datasets/procedural", "numerics")
+    sources = ("datasets/homes", "datasets/procedural", "numerics")
     default_scenes = DEFAULT_SCENES
     label_set = staticmethod(label_set)
 
@@ -167,7 +154,6 @@ class HomesSensor(Homes):
 
     name = "homes-sensor"
     settings = SensorSettings()
-    sources = (*Homes.sources, "sensors")
 
     def __init__(self, root: Path, options: HomeOptions | None = None) -> None:
         super().__init__(root, options)
@@ -175,8 +161,10 @@ class HomesSensor(Homes):
 
     def frame(self, scene: str, index: int) -> Frame:
         built, poses = self.built(scene), self.trajectory(scene)
-        if scene not in self._drifted:
-            self._drifted = {scene: drifted(poses, self.settings, self._random("drift", scene))}
+        as_estimated = self._drifted.get(scene)
+        if as_estimated is None:
+            as_estimated = drifted(poses, self.settings, self._random("drift", scene))
+            self._drifted = {scene: as_estimated}  # other threads may read another scene
         small = built.coarser(METERED_WIDTH)
         context = CameraContext(
             self.intrinsics, poses[index], *shutter(poses, index, self.settings.exposure_s, FRAMES_PER_SECOND),
@@ -185,7 +173,7 @@ class HomesSensor(Homes):
         )  # fmt: skip
         rng = self._random("sensor", scene, index)
         rgb, depth_m = record(built.renderer.render(poses[index]), context, self.settings, rng)
-        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._drifted[scene][index], self.intrinsics)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, as_estimated[index], self.intrinsics)
 
     def _random(self, *words: object) -> np.random.Generator:
         return generator(self.name, self.options.seed_offset, *words)

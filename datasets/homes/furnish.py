@@ -103,7 +103,7 @@ class _Furnisher:
         return None
 
     def do(self, name: str, zone: Zone, anchor: Placed | None = None) -> Placed | None:
-        """Places a thing with what belongs to it; the last object of it, ``None`` if there is none."""
+        """Place a thing and what belongs to it; return its last object, ``None`` if nothing fits."""
         thing = THINGS[name]
         if self.rng.random() >= thing.chance:
             return None

@@ -67,11 +67,6 @@ class HomePlan:
         return self.layout.name
 
     @property
-    def rooms(self) -> tuple[tuple[str, Float64Array], ...]:
-        """Use and corners (N, 2) of each room."""
-        return tuple((" and ".join(room.kinds), room.corners) for room in self.layout.rooms)
-
-    @property
     def n_objects(self) -> int:
         """Objects besides walls, floors and ceilings."""
         return len(self.placed) - self.n_structure

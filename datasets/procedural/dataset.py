@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -58,10 +58,25 @@ def generator(*words: object) -> np.random.Generator:
     return np.random.default_rng(int.from_bytes(digest[:8], "little"))
 
 
+class Plan(Protocol):
+    """A furnished scene: its kind, every object with ids from 1, and how each is held.
+
+    ``mount``: floor, wall, ceiling, object, or room for parts of the room itself, by id.
+    """
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def placed(self) -> Sequence[Placed]: ...
+
+    @property
+    def mount(self) -> Mapping[int, str]: ...
+
+
 class BuiltScene(ABC):
     """A furnished scene; expensive parts are computed on first use and cached in ``folder`` if there is one."""
 
-    kind: str
     classes: Mapping[str, Described]
     merged_m: float = 1e-4  # size of the cells in which vertices of the scan are merged
 
@@ -71,13 +86,19 @@ class BuiltScene(ABC):
 
     @property
     @abstractmethod
-    def placed(self) -> Sequence[Placed]:
-        """Every object, ids from 1."""
+    def plan(self) -> Plan: ...
 
     @property
-    @abstractmethod
+    def kind(self) -> str:
+        return self.plan.kind
+
+    @property
+    def placed(self) -> Sequence[Placed]:
+        return self.plan.placed
+
+    @property
     def mount(self) -> Mapping[int, str]:
-        """How each object is held, by id: floor, wall, ceiling, object, or room for parts of the room itself."""
+        return self.plan.mount
 
     @abstractmethod
     def make_mesh(self) -> SceneMesh: ...

@@ -17,7 +17,6 @@ from su3d_bench.datasets.procedural.dataset import (
     SceneOptions,
     generator,
 )
-from su3d_bench.datasets.procedural.items import Placed
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh, build_mesh
 from su3d_bench.datasets.procedural.rendering.render import LEVELS, add_noise
 from su3d_bench.datasets.procedural.trajectory import walk
@@ -50,18 +49,6 @@ class BuiltRoom(BuiltScene):
     @cached_property
     def plan(self) -> FrozenRoom:
         return read_room(self.scene)
-
-    @property
-    def kind(self) -> str:  # type: ignore[override]
-        return self.plan.kind
-
-    @property
-    def placed(self) -> list[Placed]:
-        return self.plan.placed
-
-    @property
-    def mount(self) -> dict[int, str]:
-        return self.plan.mount
 
     def make_mesh(self) -> SceneMesh:
         return build_mesh(self.patches, self.plan.lights, float(self._random("exposure").uniform(0.58, 0.72)))
