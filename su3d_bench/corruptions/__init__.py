@@ -1,0 +1,1 @@
+"""Corruptions of an evaluation's inputs: recordings, detections and class names, each with five severities."""

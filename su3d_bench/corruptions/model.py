@@ -1,0 +1,83 @@
+"""What a corruption is: a function of one input, and five severities in its unit.
+
+A corruption changes one stage and nothing else, so that the cause of a change in score is known:
+
+- ``order``: which frames are fed, in which order;
+- ``poses``: the trajectory;
+- ``frame``: colour, depth or intrinsics of one frame;
+- ``detections``: what perception found in a frame, before the method sees it;
+- ``names``: the class names that a map is searched with.
+
+Its random draws depend on the run's seed, the scene, the corruption and the frame, not on the severity: a higher
+severity is the same error made larger. At severity 0 nothing is called and the input itself is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.random import Generator
+
+from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array
+
+Stage = Literal["order", "poses", "frame", "detections", "names"]
+MAX_SEVERITY = 5
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The clean recording around a frame.
+
+    ``frames``: every frame, read at each access; ``poses`` (N, 4, 4): their camera-to-world poses;
+    ``index``: which of them is being changed.
+    """
+
+    frames: Sequence[Frame]
+    poses: Float64Array
+    index: int
+
+
+# Each takes the value of the severity in the corruption's unit, and a generator of its own.
+OrderFunction = Callable[[Int64Array, float, Generator], Int64Array]  # places (U,) of the updates' frames
+PosesFunction = Callable[[Float64Array, float, Generator], Float64Array]  # (N, 4, 4)
+FrameFunction = Callable[[Frame, float, Generator, Recording], Frame]
+DetectionsFunction = Callable[[Detections, float, Generator], Detections]
+NamesFunction = Callable[[tuple[str, ...], float, Generator], tuple[str, ...]]  # names after the given ones: distractors
+
+
+@dataclass(frozen=True)
+class Corruption:
+    """One row of the table of corruptions.
+
+    ``values``: severities 1 to 5 in ``unit``, getting worse; ``neutral``: the value that changes nothing;
+    ``source``: where the values come from, or "ours" with the reason; ``is_whole``: values are whole numbers.
+    """
+
+    family: str
+    name: str
+    stage: Stage
+    function: Callable[..., object]
+    unit: str
+    values: tuple[float, float, float, float, float]
+    source: str
+    neutral: float = 0.0
+    is_whole: bool = False
+
+    @property
+    def address(self) -> str:
+        return f"{self.family}/{self.name}"
+
+    def value_at(self, severity: float) -> float:
+        """The value at a severity 0..5, linear between whole severities."""
+        value = float(np.interp(severity, range(MAX_SEVERITY + 1), (self.neutral, *self.values)))
+        return float(round(value)) if self.is_whole else value
+
+
+def generator(corruption: Corruption, seed: int, scene: str, index: int = 0) -> Generator:
+    """The random numbers of a corruption for one frame of a scene, the same for every severity."""
+    words = "\n".join((str(seed), scene, corruption.address, str(index)))
+    return np.random.default_rng(np.frombuffer(hashlib.sha256(words.encode()).digest(), np.uint32))
