@@ -159,12 +159,15 @@ class HomesSensor(Homes):
         super().__init__(root, options)
         self._drifted: dict[str, Float64Array] = {}
 
+    def poses(self, scene: str) -> Float64Array:
+        found = self._drifted.get(scene)
+        if found is None:
+            found = drifted(self.trajectory(scene), self.settings, self._random("drift", scene))
+            self._drifted = {scene: found}  # other threads may read another scene
+        return found
+
     def frame(self, scene: str, index: int) -> Frame:
-        built, poses = self.built(scene), self.trajectory(scene)
-        as_estimated = self._drifted.get(scene)
-        if as_estimated is None:
-            as_estimated = drifted(poses, self.settings, self._random("drift", scene))
-            self._drifted = {scene: as_estimated}  # other threads may read another scene
+        built, poses, as_estimated = self.built(scene), self.trajectory(scene), self.poses(scene)
         small = built.coarser(METERED_WIDTH)
         context = CameraContext(
             self.intrinsics, poses[index], *shutter(poses, index, self.settings.exposure_s, FRAMES_PER_SECOND),

@@ -225,6 +225,10 @@ class GeneratedScenes(ABC):
         """Camera-to-world poses (n_frames, 4, 4), OpenCV axes, z up, metres."""
         return self.built(scene).trajectory
 
+    def poses(self, scene: str) -> Float64Array:
+        """The poses (N, 4, 4) of the frames."""
+        return self.trajectory(scene)
+
     def render(self, scene: str, view: int | Float64Array) -> RenderedFrame:
         """The noise-free images at a frame of the trajectory or at any camera-to-world pose."""
         built = self.built(scene)

@@ -122,6 +122,13 @@ class HasStatus(DatasetAbility, Protocol):
 
 
 @runtime_checkable
+class ProvidesPoses(DatasetAbility, Protocol):
+    """The camera-to-world poses (N, 4, 4) of all frames of a scene, read faster than the frames."""
+
+    def poses(self, scene: str) -> types.Float64Array: ...
+
+
+@runtime_checkable
 class HasGroups(DatasetAbility, Protocol):
     """Named sets of scenes, such as official splits."""
 

@@ -31,11 +31,15 @@ from su3d_bench.store.run_folder import JobFolder
 
 @dataclass(frozen=True)
 class Part:
-    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
+    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON.
+
+    ``corruption``: the conditions under which a method runs, for ``corruptions.apply.parse_conditions``.
+    """
 
     target: str
     name: str
     options: str
+    corruption: str = ""
 
 
 def options_model(kind: str, target: str) -> Any:

@@ -31,6 +31,7 @@ from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, 
 from su3d_bench.core.registry import CEILING_METHOD, GENERATED
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.types import ImageDomain
+from su3d_bench.corruptions.apply import MARK, parse_conditions
 from su3d_bench.metrics.compatibility import TruthFacts, truth_incompatibility
 from su3d_bench.metrics.protocols.loading import (
     ALL_PROTOCOLS,
@@ -92,23 +93,31 @@ class NamedMethod:
     """``target`` locates the class, ``base`` is its name, ``name`` the name with the variant.
 
     A variant is ``METHOD@PRESET`` if the method's class has ``presets`` (``opensu3d@scheme4``), or
-    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a separate method.
+    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a separate method, and so
+    does a method with a ``corruption`` of its inputs (``opensu3d~depth/holes/4``).
     """
 
     target: str
     base: str
     name: str
     settings: tuple[Setting, ...]
+    corruption: str = ""
 
     @property
     def essence(self) -> tuple[Any, ...]:
         """Its identity, independent of how it was written."""
-        return self.target, [(entry.path, entry.value) for entry in self.settings]
+        return self.target, [(entry.path, entry.value) for entry in self.settings], self.corruption
 
 
 def named_method(text: str) -> NamedMethod:
     """The method named by ``text``; ``ConfigError`` for an unknown method or preset, or an unreadable variant."""
     start = text.rfind(".py:") + 1
+    mark = text.find(MARK, start)
+    if mark >= 0:
+        clean, corruption = named_method(text[:mark]), text[mark + 1 :]
+        name = MARK.join((clean.name, "+".join(one.address for one in parse_conditions(corruption)).replace("/", "-")))
+        entries = tuple(replace(one, path=("method", name, *one.path[2:])) for one in clean.settings)
+        return NamedMethod(clean.target, clean.base, name, entries, corruption)
     at = text.find("@", start)
     target, variant = (text, "") if at < 0 else (text[:at], text[at + 1 :])
     method = registry.load("method", target)
@@ -344,7 +353,7 @@ def method_part(method: NamedMethod, settings: Settings) -> Part:
     )
     layered = Settings((*base, *method.settings, *(own if method.name != method.base else ())))
     options = resolve(layered, path, options_model("method", method.target))
-    return Part(method.target, method.name, options.model_dump_json())
+    return Part(method.target, method.name, options.model_dump_json(), method.corruption)
 
 
 def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], variants: Sequence[str] = ()) -> None:

@@ -15,6 +15,8 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
+import numpy as np
+
 from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable, user_code_line
 from su3d_bench.core.files.atomic import write_bytes, write_text
@@ -22,7 +24,8 @@ from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.signals import is_interrupt
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
+from su3d_bench.corruptions.apply import CorruptedFrames, CorruptedPerception, SceneCorruption, parse_conditions
 from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -128,6 +131,13 @@ def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any]
     )
 
 
+def _poses(dataset: Any, scene: str) -> Float64Array:
+    """The poses (N, 4, 4) of all frames."""
+    if isinstance(dataset, interfaces.ProvidesPoses):
+        return dataset.poses(scene)
+    return np.stack([frame.camera_to_world for frame in dataset.frames(scene, 1)])
+
+
 class _Scene:
     """One scene with everything its methods share: the dataset, the ground truth."""
 
@@ -197,6 +207,16 @@ class _Scene:
         """The solver that answers questions about maps; None: the built-in solver."""
         return None if self.job.config.question_solver == "built-in" else by_language_model(*self.language)
 
+    def corruption(self, part: jobs.Part) -> SceneCorruption | None:
+        """The corruption of the inputs of ``part``, if there is one."""
+        if not part.corruption:
+            return None
+        name = self.job.scene_name
+        return SceneCorruption(
+            parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
+            partial(self.dataset.frames, name, 1), partial(_poses, self.dataset, name),
+        )  # fmt: skip
+
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only if its completion record is missing or does not match."""
         self.report_activity(part, self.opening)
@@ -204,6 +224,8 @@ class _Scene:
         info = self.dataset.info(self.job.scene_name, jobs.stride_of(self.job, part))
         info = replace(info, seed=self.job.config.seed)
         perception = perception_of(self.job, info, lambda: self.marked)
+        if corruption := self.corruption(part):
+            perception = CorruptedPerception(perception, corruption)
         config = jobs.config_key(self.job, part, method)
         inputs = jobs.JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
         key = inputs.predict_key()
@@ -237,6 +259,9 @@ class _Scene:
             shares, doubts = self.job.config.shares, self.job.doubts or ()
             frames = self.dataset.frames(self.job.scene_name, inputs.info.stride)
             n = min(len(frames), self.job.config.limit or len(frames))
+            if corruption := self.corruption(part):
+                frames = CorruptedFrames(frame_loop.FirstFrames(frames, n), corruption)
+                n = len(frames)
         for line in doubts:
             logger.warning("%s", line)
         if isinstance(method, interfaces.UsesSceneTools):
@@ -322,6 +347,7 @@ class _Scene:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
         unscored: dict[str, str] = {}
+        corruption = self.corruption(part)
         for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
             if rules.ground_truth not in self._truths:
                 self.report_activity(part, "computing ground truth" if self.is_rendered else "reading ground truth")
@@ -336,7 +362,8 @@ class _Scene:
             self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
             configured = jobs.with_visible_truth(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
-            scores[rules.name] = score_located(rules, known, configured, encoder)
+            asked = corruption.rules(rules) if corruption and corruption.at("names") else rules
+            scores[rules.name] = score_located(asked, known, configured, encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:

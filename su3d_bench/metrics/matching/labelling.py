@@ -87,9 +87,8 @@ def ranked_classes(
     if prediction.features is not None and encoder is not None and len(ranked) and len(candidates):
         is_open = np.array([labels is None or labels[row] == "" for row in range(len(ranked))], bool)
         if is_open.any():
-            names = [rules.classes[index].name for index in candidates]
-            text = text_features(rules, names, prediction.features, encoder)
-            best = candidates[most_similar_each(prediction.features, text, k)]
+            text = text_features(rules, _names(rules, candidates), prediction.features, encoder)
+            best = _with_distractors(rules, candidates)[most_similar_each(prediction.features, text, k)]
             ranked[is_open, : best.shape[1]] = best[is_open]
     return ranked
 
@@ -108,8 +107,17 @@ def _classes_of_features(
     features, encoder = needed_features(rules, prediction, encoder)
     if not len(candidates) or not len(features):
         return np.full(len(features), -1, np.int64)
-    text = text_features(rules, [rules.classes[index].name for index in candidates], features, encoder)
-    return np.asarray(candidates[most_similar(features, text, device_of(encoder))])
+    text = text_features(rules, _names(rules, candidates), features, encoder)
+    return _with_distractors(rules, candidates)[most_similar(features, text, device_of(encoder))]
+
+
+def _names(rules: ProtocolRules, candidates: Int64Array) -> list[str]:
+    return [*(rules.classes[index].name for index in candidates), *rules.distractors]
+
+
+def _with_distractors(rules: ProtocolRules, candidates: Int64Array) -> Int64Array:
+    """The class of each of ``_names``, -1 for a distractor."""
+    return np.append(candidates, np.full(len(rules.distractors), -1, np.int64))
 
 
 def text_features(

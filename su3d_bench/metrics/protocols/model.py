@@ -121,7 +121,8 @@ class ProtocolRules(_Strict):
     (``class_numbers``); ``ignore`` names classes that are known but not scored, and for ``categories`` labels whose
     objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or the scored
     ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which ``prompt_names``
-    may replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every mask, the
+    may replace; of several ``prompts`` the mean feature counts. ``distractors``: names that no object has; what is most
+    similar to one of them has no class. ``confidence``: ``ones`` for every mask, the
     ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or the cosine rescaled to 0..1
     over the scene's masks for each query. ``top_k``: the number of labels of a point, or masks of a query, that count;
     all if absent. ``class_agnostic`` drops the labels: the true instances are those of the ``scored`` classes (the rest
@@ -159,6 +160,7 @@ class ProtocolRules(_Strict):
     prompt: str | None = None
     prompts: tuple[str, ...] = ()
     prompt_names: dict[str, str] = {}
+    distractors: tuple[str, ...] = ()
     encoder: str | None = None
     transfer: TransferRules
     min_region_size: Annotated[int, Field(ge=1)] | None = None

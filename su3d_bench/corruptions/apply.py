@@ -1,0 +1,181 @@
+"""Apply corruptions to the inputs of one scene: its frames, its detections and the class names of a protocol.
+
+A corrupted method is written ``METHOD~FAMILY/NAME/SEVERITY``, with ``+`` between two corruptions:
+``opensu3d~depth/holes/4+pose/jitter-rotation/2``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.interfaces import StageTimer
+from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, PerceptionNeeds
+from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, Stage, generator
+from su3d_bench.corruptions.table import CORRUPTIONS
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+MARK = "~"  # between a method and its corruptions
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A corruption at a severity in 0..5, whole or between two whole ones."""
+
+    corruption: Corruption
+    severity: float
+
+    @property
+    def value(self) -> float:
+        return self.corruption.value_at(self.severity)
+
+    @property
+    def address(self) -> str:
+        return f"{self.corruption.address}/{self.severity:g}"
+
+
+def parse_conditions(text: str) -> tuple[Condition, ...]:
+    """The conditions of ``depth/holes/4`` or ``depth/holes/4+pose/drift/2``; raises ``ConfigError``."""
+    conditions = tuple(_condition(part) for part in text.split("+")) if text else ()
+    names = [condition.corruption.address for condition in conditions]
+    if len(set(names)) < len(names) or len(names) > 2:
+        raise ConfigError(f"corruption '{text}': expected one corruption, or two different ones joined by '+'")
+    return conditions
+
+
+def _condition(text: str) -> Condition:
+    address, _, severity = text.rpartition("/")
+    if address not in CORRUPTIONS:
+        raise ConfigError(f"unknown corruption '{address or text}'{suggest(address or text, CORRUPTIONS)}")
+    if not re.fullmatch(r"\d(\.\d{1,6})?", severity) or float(severity) > MAX_SEVERITY:
+        raise ConfigError(f"corruption '{text}': expected {address}/SEVERITY with a severity from 0 to {MAX_SEVERITY}")
+    return Condition(CORRUPTIONS[address], float(severity))
+
+
+@dataclass(frozen=True)
+class SceneCorruption:
+    """The ``conditions`` of one scene. ``read_poses`` returns the clean poses (N, 4, 4) of all its frames."""
+
+    conditions: tuple[Condition, ...]
+    scene: str
+    seed: int
+    read_frames: Callable[[], Sequence[Frame]]
+    read_poses: Callable[[], Float64Array]
+
+    @cached_property
+    def recording(self) -> tuple[Sequence[Frame], Float64Array]:
+        """Every frame and its clean pose."""
+        return self.read_frames(), self.read_poses()
+
+    @cached_property
+    def poses(self) -> Float64Array:
+        """The poses that the method gets."""
+        poses = self.recording[1]
+        for condition in self.at("poses"):
+            poses = self.call(condition, 0, poses)
+        return poses
+
+    def at(self, stage: Stage) -> list[Condition]:
+        """The conditions of a stage that change something."""
+        return [one for one in self.conditions if one.corruption.stage == stage and one.severity > 0]
+
+    def call(self, condition: Condition, index: int, value: Any, *more: Any) -> Any:
+        """What a corruption makes of ``value``; its random numbers are those of frame ``index``."""
+        corruption = condition.corruption
+        rng = generator(corruption, self.seed, self.scene, 0 if corruption.per_scene else index)
+        return corruption.function(value, condition.value, rng, *more)
+
+    def frame(self, frame: Frame) -> Frame:
+        """The frame as the method gets it; poses change only what the method sees, not perception."""
+        for condition in self.at("frame"):
+            frame = self.call(condition, frame.index, frame, Recording(*self.recording, frame.index))
+        if self.at("poses"):
+            frame = replace(frame, camera_to_world=self.poses[frame.index])
+        return frame
+
+    def order(self, n: int) -> Int64Array:
+        """Which of ``n`` frames are fed, in order."""
+        places = np.arange(n)
+        for condition in self.at("order"):
+            places = self.call(condition, 0, places)
+        return places
+
+    def rules(self, rules: ProtocolRules) -> ProtocolRules:
+        """The protocol with other names in its prompts, and with distractors."""
+        clean = tuple(entry.name for entry in rules.classes)
+        names = tuple(rules.prompt_names.get(name, name) for name in clean)
+        for condition in self.at("names"):
+            names = self.call(condition, 0, names)
+        return rules.model_copy(
+            update={
+                "prompt_names": dict(zip(clean, names, strict=False)),
+                "distractors": (*rules.distractors, *names[len(clean) :]),
+            }
+        )
+
+
+class CorruptedFrames(Sequence[Frame]):
+    """``frames`` in the order and form in which the method gets them."""
+
+    def __init__(self, frames: Sequence[Frame], corruption: SceneCorruption) -> None:
+        self._frames, self._corruption = frames, corruption
+        self._places = corruption.order(len(frames))
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        return self._corruption.frame(self._frames[int(self._places[index])])
+
+
+class CorruptedPerception:
+    """Perception of corrupted frames at their true poses, whose detections are then corrupted."""
+
+    def __init__(self, perception: Any, corruption: SceneCorruption) -> None:
+        self._perception, self._corruption = perception, corruption
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._perception, name)
+
+    def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
+        """The detections of a frame."""
+        found = self._perception.detect(self._seen(frame), needs, timer)
+        for condition in self._corruption.at("detections"):
+            found = self._corruption.call(condition, frame.index, found)
+        return found
+
+    def regions(self) -> Any:
+        """Perception on demand, for methods that choose their own image regions."""
+        return CorruptedRegions(self._perception.regions(), self._seen)
+
+    def _seen(self, frame: Frame) -> Frame:
+        if not self._corruption.at("poses"):
+            return frame
+        return replace(frame, camera_to_world=self._corruption.recording[1][frame.index])
+
+
+@dataclass(frozen=True)
+class CorruptedRegions:
+    """Perception on demand of frames at their true poses."""
+
+    inner: Any
+    seen: Callable[[Frame], Frame]
+
+    @property
+    def dim(self) -> int:
+        return int(self.inner.dim)
+
+    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+        found: tuple[BoolArray, float] = self.inner.mask_at(self.seen(frame), points)
+        return found
+
+    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+        return np.asarray(self.inner.encode_regions(self.seen(frame), mask, boxes))
