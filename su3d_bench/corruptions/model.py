@@ -47,7 +47,7 @@ OrderFunction = Callable[[Int64Array, float, Generator], Int64Array]  # places (
 PosesFunction = Callable[[Float64Array, float, Generator], Float64Array]  # (N, 4, 4)
 FrameFunction = Callable[[Frame, float, Generator, Recording], Frame]
 DetectionsFunction = Callable[[Detections, float, Generator], Detections]
-NamesFunction = Callable[[tuple[str, ...], float, Generator], tuple[str, ...]]  # names after the given ones: distractors
+NamesFunction = Callable[[tuple[str, ...], float, Generator], tuple[str, ...]]  # adds names after the given ones
 
 
 @dataclass(frozen=True)

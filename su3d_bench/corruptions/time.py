@@ -19,8 +19,8 @@ BURST_UPDATES = 2.0  # smoothing of the field whose lowest places are lost: burs
 
 def lost_bursts(places: Int64Array, share: float, rng: Generator) -> Int64Array:
     """Places without bursts that are a part ``share`` of them; at least one remains."""
-    kept = places[~blobs(places.shape, share, BURST_UPDATES, rng)]
-    return kept if len(kept) else places[:1]
+    remaining: Int64Array = places[~blobs(places.shape, min(share, 1 - 1 / len(places)), BURST_UPDATES, rng)]
+    return remaining
 
 
 def duplicates(places: Int64Array, share: float, rng: Generator) -> Int64Array:

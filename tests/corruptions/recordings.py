@@ -76,11 +76,13 @@ def _frame(scene: str, index: int) -> Frame:
     return frame
 
 
-@cache
 def recording(scene: str = SCENES[0], index: int = 0) -> Recording:
     """The clean recording around a frame."""
-    if index:
-        return replace(recording(scene), index=index)
+    return replace(_recording(scene), index=index)
+
+
+@cache
+def _recording(scene: str) -> Recording:
     frames = tuple(_frame(scene, k) for k in range(N_FRAMES))
     poses = np.stack([frame.camera_to_world for frame in frames])
     poses.setflags(write=False)
