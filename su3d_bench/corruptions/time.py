@@ -19,14 +19,14 @@ BURST_UPDATES = 2.0  # smoothing of the field whose lowest places are lost: burs
 
 def lost_bursts(places: Int64Array, share: float, rng: Generator) -> Int64Array:
     """Places without bursts that are a part ``share`` of them; at least one remains."""
-    remaining: Int64Array = places[~blobs(places.shape, min(share, 1 - 1 / len(places)), BURST_UPDATES, rng)]
-    return remaining
+    lost = blobs(places.shape, min(share, 1 - 1 / len(places)), BURST_UPDATES, rng)
+    return places[~lost]
 
 
 def duplicates(places: Int64Array, share: float, rng: Generator) -> Int64Array:
     """Places of which a part ``share`` is fed twice in a row."""
     twice = rng.permutation(len(places))[: round(share * len(places))]
-    return places[np.sort(np.concatenate([np.arange(len(places)), twice]))]
+    return np.insert(places, twice, places[twice])
 
 
 def reordered(places: Int64Array, window: float, rng: Generator) -> Int64Array:

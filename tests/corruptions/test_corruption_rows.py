@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_a_frame_with_almost_no_depth_is_no_special_case(row: Corruption, n_vali
     depth_m.flat[:n_valid] = 2.0
     frame = replace(recording().frames[0], depth_m=depth_m)
     found = apply_to_frame(row, row.values[-1], clean=Recording((frame,), recording().poses[:1], 0))
-    assert np.isfinite(found.depth_m).all() and np.count_nonzero(found.depth_m) <= 2 * n_valid
+    assert np.isfinite(found.depth_m).all() and np.count_nonzero(found.depth_m) <= 4 * n_valid
 
 
 @pytest.mark.parametrize("row", NESTED, ids=by_address)
@@ -107,7 +108,7 @@ def test_what_a_severity_loses_is_lost_at_the_next_too(row: Corruption) -> None:
         losses = [~np.isin(PLACES, apply_to_order(row, value)) for value in row.values]
     else:
         losses = [apply_to_frame(row, value).depth_m == 0 for value in row.values]
-    for less, more in zip(losses, losses[1:], strict=False):
+    for less, more in pairwise(losses):
         assert less.sum() < more.sum() and not (less & ~more).any()
 
 
@@ -116,9 +117,8 @@ def test_poses_stay_rigid(row: Corruption) -> None:
     found = apply_to_poses(row, row.values[-1])
     rotation = found[:, :3, :3]
     assert found.shape == (N_FRAMES, 4, 4) and found.dtype == np.float64 and (found[:, 3] == [0, 0, 0, 1]).all()
-    assert (
-        np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max() < 1e-12 and np.linalg.det(rotation).min() > 0
-    )
+    assert np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max() < 1e-12
+    assert np.linalg.det(rotation).min() > 0
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.stage == "order"], ids=by_address)

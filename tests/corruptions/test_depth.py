@@ -17,9 +17,10 @@ NOISE, QUANTISATION, EDGE_LOSS, FLYING_PIXELS, HOLES, DARK_HOLES, RANGE, SCALE =
 STEP = np.tile(np.repeat([1.0, 2.0], 10), (20, 1)).astype(np.float32)  # columns 0..9 are at 1 m, 10..19 at 2 m
 
 
-def one_frame(depth_m: Float32Array, rgb: UInt8Array | None = None) -> Recording:
+def one_frame(depth_m: Float32Array, rgb: UInt8Array | None = None, focal_px: float = 140.0) -> Recording:
     black = np.zeros((*depth_m.shape, 3), np.uint8)
-    frame = replace(recording().frames[0], depth_m=depth_m, rgb=black if rgb is None else rgb)
+    camera = np.array([[focal_px, 0, depth_m.shape[1] / 2], [0, focal_px, depth_m.shape[0] / 2], [0, 0, 1]])
+    frame = replace(recording().frames[0], depth_m=depth_m, rgb=black if rgb is None else rgb, intrinsics=camera)
     return Recording((frame,), recording().poses[:1], 0)
 
 
@@ -28,7 +29,7 @@ def row_of(*depths_m: float) -> Recording:
 
 
 def test_noise_on_a_wall_has_the_published_deviation_and_grows_in_place() -> None:
-    wall = one_frame(np.full((480, 640), 2.0, np.float32))
+    wall = one_frame(np.full((480, 640), 2.0, np.float32), focal_px=560.0)
     once = apply_to_frame(NOISE, 1.0, clean=wall).depth_m - 2
     assert once.std() == pytest.approx(0.0012 + 0.0019 * (2 - 0.4) ** 2, rel=0.05)
     assert apply_to_frame(NOISE, 4.0, clean=wall).depth_m - 2 == pytest.approx(4 * once, abs=1e-5)
@@ -89,4 +90,4 @@ def test_depth_beyond_the_range_is_lost() -> None:
 
 def test_depth_is_too_far_or_too_near_for_a_whole_scene() -> None:
     found = [apply_to_frame(SCALE, 3.5, f"scene{k}", clean=row_of(2.0, 4.0)).depth_m[0] for k in range(8)]
-    assert {tuple(np.round(one, 4).tolist()) for one in found} == {(2.07, 4.14), (1.93, 3.86)}
+    assert {tuple(round(float(depth_m), 4) for depth_m in one) for one in found} == {(2.07, 4.14), (1.93, 3.86)}
