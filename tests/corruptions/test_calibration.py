@@ -49,7 +49,10 @@ def test_a_nearer_point_moves_farther_and_hides_the_one_behind_it() -> None:
 
 def test_points_outside_the_image_or_behind_the_camera_are_not_seen() -> None:
     assert not seen_from(row_of({10: 1.0}), CAMERA, moved(x=0.04)).any()
-    assert not seen_from(row_of({5: 1.0}), CAMERA, moved(z=-1.5)).any()
+    centre = np.zeros((11, 11), np.float32)
+    centre[5, 5] = 1.0
+    assert seen_from(centre, CAMERA, moved(z=-0.5))[5, 5] == 0.5
+    assert not seen_from(centre, CAMERA, moved(z=-1.5)).any()
 
 
 def test_a_quarter_turn_about_the_optical_axis_turns_the_image() -> None:
@@ -68,6 +71,26 @@ def test_an_enlarged_surface_has_no_gaps_and_keeps_its_hole() -> None:
     assert found[found > 0] == pytest.approx(1.0)
     assert missing.min() == 50 - 13 and missing.max() == 50 + 13  # 10 px from the centre are 13, of which half a pixel
     assert len(missing) == 27**2
+
+
+def test_the_background_is_not_seen_through_an_enlarged_surface() -> None:
+    image = np.full((101, 101), 3.9, np.float32)
+    image[40:61, 40:61] = 1.3  # from 1.3 to 1 m: 27 px wide, and 10 px to the right, over pixels of the background
+    camera = np.array([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
+    found = seen_from(image, camera, moved(x=0.1, z=-0.3))
+    assert found[37:64, 47:74] == pytest.approx(1.0) and found[:, 74:][found[:, 74:] > 0] == pytest.approx(3.6)
+
+
+def test_a_slanted_surface_is_not_moved_towards_the_camera() -> None:
+    rows = (np.arange(101) - 50) / 100
+    plane = np.array([0, 0.8, 0.5])  # its product with a point of the surface is 1: from 10 m to 1.1 m
+    image = np.tile(1 / (plane[1] * rows + plane[2])[:, None], 101).astype(np.float32)
+    turn, angle = np.eye(4), np.deg2rad(4)
+    turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    found = seen_from(image, np.array([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]]), turn)[10:90, 50]
+    expected = 1 / ([0, *turn[1:3, 1:3] @ plane[1:]] @ np.stack([rows, rows, np.ones(101)]))[10:90]
+    slope = np.abs(np.gradient(expected))  # per pixel
+    assert np.abs((found - expected) / slope).max() < 0.6 and abs(((found - expected) / slope).mean()) < 0.05
 
 
 def test_depth_is_rotated_by_the_given_angle_about_an_axis_of_the_scene() -> None:

@@ -32,6 +32,8 @@ def test_noise_on_a_wall_has_the_published_deviation_and_grows_in_place() -> Non
     wall = one_frame(np.full((480, 640), 2.0, np.float32), focal_px=560.0)
     once = apply_to_frame(NOISE, 1.0, clean=wall).depth_m - 2
     assert once.std() == pytest.approx(0.0012 + 0.0019 * (2 - 0.4) ** 2, rel=0.05)
+    # neighbouring windows of 9 pixels share 8 columns
+    assert np.corrcoef(once[:, 1:].ravel(), once[:, :-1].ravel())[0, 1] == pytest.approx(8 / 9, abs=0.03)
     assert apply_to_frame(NOISE, 4.0, clean=wall).depth_m - 2 == pytest.approx(4 * once, abs=1e-5)
 
 
