@@ -103,7 +103,7 @@ ROWS: tuple[Corruption, ...] = (
     ),
     Corruption(
         "calibration", "extrinsics-translation", "frame", extrinsics_translation, "cm", (0.5, 1.0, 2.5, 5.0, 10.0),
-        "ours: doubled around 2.5 cm, the distance of the Kinect's infrared camera from its colour camera (Konolige "
+        "ours: around 2.5 cm, the distance of the Kinect's infrared camera from its colour camera (Konolige "
         "and Mihelich, ROS wiki): the error of depth that is not registered to colour.", per_scene=True,
     ),
 )  # fmt: skip

@@ -1,8 +1,8 @@
 """Corruptions of depth images; a missing pixel never gains depth.
 
 The families are those of Xu et al. 2025 (arXiv 2501.14319) and of the Kinect's error models. In the public code of Xu
-et al., noise turns holes into points and is unseeded, every edge is lost at every severity, and the severity of random
-masks is computed but not used; here each severity extends the error of the one below it.
+et al., noise turns holes into points, every edge is lost at every severity, one mode draws without a seed, and the
+severity of random masks is computed but not used; here each severity extends the error of the one below it.
 """
 
 from __future__ import annotations
