@@ -9,7 +9,8 @@ A corruption changes one stage and nothing else, so that the cause of a change i
 - ``names``: the class names that a map is searched with.
 
 Its random draws depend on the run's seed, the scene, the corruption and the frame, not on the severity: a higher
-severity is the same error made larger. At severity 0 nothing is called and the input itself is used.
+severity is the same error made larger. A corruption that is ``per_scene`` draws once per scene: all frames share the
+generator of frame 0. At severity 0 nothing is called and the input itself is used.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ OrderFunction = Callable[[Int64Array, float, Generator], Int64Array]  # places (
 PosesFunction = Callable[[Float64Array, float, Generator], Float64Array]  # (N, 4, 4)
 FrameFunction = Callable[[Frame, float, Generator, Recording], Frame]
 DetectionsFunction = Callable[[Detections, float, Generator], Detections]
-NamesFunction = Callable[[tuple[str, ...], float, Generator], tuple[str, ...]]  # names after the given ones: distractors
+NamesFunction = Callable[[tuple[str, ...], float, Generator], tuple[str, ...]]  # adds names after the given ones
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Corruption:
     """One row of the table of corruptions.
 
     ``values``: severities 1 to 5 in ``unit``, getting worse; ``neutral``: the value that changes nothing;
-    ``source``: where the values come from, or "ours" with the reason; ``is_whole``: values are whole numbers.
+    ``source``: where the values come from, or "ours" with the reason; ``is_whole``: values are whole numbers;
+    ``per_scene``: every frame of a scene receives the same random numbers.
     """
 
     family: str
@@ -66,6 +68,7 @@ class Corruption:
     source: str
     neutral: float = 0.0
     is_whole: bool = False
+    per_scene: bool = False
 
     @property
     def address(self) -> str:
@@ -78,6 +81,9 @@ class Corruption:
 
 
 def generator(corruption: Corruption, seed: int, scene: str, index: int = 0) -> Generator:
-    """The random numbers of a corruption for one frame of a scene, the same for every severity."""
-    words = "\n".join((str(seed), scene, corruption.address, str(index)))
+    """The random numbers of a corruption for one frame of a scene, the same for every severity.
+
+    ``index`` makes no difference if the corruption is ``per_scene``.
+    """
+    words = "\n".join((str(seed), scene, corruption.address, str(0 if corruption.per_scene else index)))
     return np.random.default_rng(np.frombuffer(hashlib.sha256(words.encode()).digest(), np.uint32))
