@@ -21,7 +21,7 @@ from su3d_bench.core.version import __version__
 
 # The commands in the order of the help; each is in the module of its name, or in that of MODULE_OF.
 GROUPS = {
-    "run and score": ("run", "ablate", "evaluate", "reproduce"),
+    "run and score": ("run", "ablate", "robustness", "evaluate", "reproduce"),
     "compare and report": ("compare", "check", "report", "runs"),
     "questions and human evaluation": ("query", "sheets"),
     "data, models and methods": ("datasets", "models", "methods", "protocols"),

@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "run", call_run, resumes=True, data=True)
     parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
-    _add_run_options(parser)
+    add_run_options(parser)
     parser = add_verb(verbs, "ablate", call_ablate, resumes=True, data=True)
     parser.option("--vary KEY=V1,V2...", "settings to vary and their values", required=True)
     parser.option("--method METHOD", "method to use (or file.py:Class; default: opensu3d)", default="opensu3d")
     parser.option("--also-methods METHOD...", "additional methods to run without variation", default=[])
     parser.option("--grid", "run every combination instead of one setting at a time")
-    _add_run_options(parser)
+    add_run_options(parser)
 
 
-def _add_run_options(parser: Parser) -> None:
+def add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
     parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")

@@ -6,8 +6,9 @@ scenes of the difference, tests are exact sign-flip tests with Holm's correction
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -100,7 +101,8 @@ def _method_result(
             mean_of([numbers[cell.name] for cell in group]) for _, group in _grouped(own, lambda cell: cell.corruption)
         ]
         of_family[family] = of_corruptions
-        corrected = holm([of_cells[cell].test.p if of_cells[cell].test else None for cell in own])  # type: ignore[union-attr]
+        tests = [of_cells[cell].test for cell in own]
+        corrected = holm([None if test is None else test.p for test in tests])
         for cell, p in zip(own, corrected, strict=True):
             of_cells[cell] = replace(of_cells[cell], p_of_all=p)
     means = {family: mean_of(own) for family, own in of_family.items()}
@@ -137,8 +139,12 @@ def mean_of(numbers: Sequence[Numbers]) -> Numbers:
     )
 
 
-def _grouped(items: Iterable[object], key: object) -> list[tuple[str, list]]:  # type: ignore[type-arg]
-    groups: dict[str, list[object]] = {}
+Item = TypeVar("Item")
+
+
+def _grouped(items: Iterable[Item], key: Callable[[Item], str]) -> list[tuple[str, list[Item]]]:
+    """The items by key, in the order of the first of each."""
+    groups: dict[str, list[Item]] = {}
     for item in items:
-        groups.setdefault(key(item), []).append(item)  # type: ignore[operator]
+        groups.setdefault(key(item), []).append(item)
     return list(groups.items())

@@ -20,20 +20,20 @@ MAX_METHODS = 2000
 
 @dataclass(frozen=True)
 class Cell:
-    """A ``method`` under ``conditions``, none if clean; ``name`` is its name in the run."""
+    """A ``method`` under ``conditions``, none if clean."""
 
     method: str
     conditions: tuple[Condition, ...]
 
     @property
-    def name(self) -> str:
-        """Its name in the run."""
-        return f"{self.method}{MARK}{'+'.join(one.address for one in self.conditions).replace('/', '-')}"
+    def suffix(self) -> str:
+        """What follows the method where it is requested."""
+        return f"{MARK}{'+'.join(one.address for one in self.conditions)}" if self.conditions else ""
 
     @property
-    def target(self) -> str:
-        """How it is written for ``--methods``."""
-        return f"{self.method}{MARK}{'+'.join(one.address for one in self.conditions)}"
+    def name(self) -> str:
+        """Its name in a run, if ``method`` is the method's."""
+        return self.method + self.suffix.replace("/", "-")
 
     @property
     def corruption(self) -> str:
@@ -90,7 +90,7 @@ def _families() -> list[str]:
 
 def methods_of(methods: Sequence[str], conditions: Sequence[tuple[Condition, ...]]) -> list[str]:
     """What to run: each of ``methods`` clean and under each of ``conditions``; ``ConfigError`` if they are too many."""
-    targets = [*methods, *(Cell(method, one).target for method in methods for one in conditions)]
+    targets = [*methods, *(method + Cell(method, one).suffix for method in methods for one in conditions)]
     if len(targets) > MAX_METHODS:
         raise ConfigError(f"{counted(len(targets), 'cell')}: one sweep can have at most {MAX_METHODS}")
     return targets

@@ -1,0 +1,168 @@
+"""``su3d-bench robustness``: methods under corruptions of their inputs, and the errors that they tolerate."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from su3d_bench.cli import output
+from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, output_path
+from su3d_bench.cli.run import add_run_options, execute, plan_of
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from su3d_bench.analysis.sides import Numbers
+    from su3d_bench.robustness.sweep import Cell
+    from su3d_bench.runs.finished import FinishedRun
+
+
+def add_parser(verbs: Verbs) -> None:
+    """Run methods under corruptions of their inputs, and measure the errors that they tolerate.
+
+    su3d-bench robustness run --scenes 'homes/test*' --methods opensu3d conceptgraphs --out runs/robust
+    su3d-bench robustness report runs/robust --format latex --out robust.tex
+    """
+    group = add_group(verbs, "robustness", add_parser)
+    parser = add_verb(group, "list", call_list)
+    parser.shared("--format")
+    parser = add_verb(group, "run", call_run, resumes=True, data=True)
+    _add_methods(parser)
+    parser.option("--severities N...", "severities to use (default: 1 3 5)", type=int, default=[1, 3, 5])
+    parser.option("--only CONDITION...", "conditions to run, such as depth/holes/4", default=[])
+    add_run_options(parser)
+    parser = add_verb(group, "tolerance", call_tolerance, resumes=True, data=True)
+    _add_methods(parser)
+    parser.option("--share SHARE", "share of the clean score to keep (default: 0.95)", type=float, default=0.95)
+    _add_metric(parser)
+    add_run_options(parser)
+    parser = add_verb(group, "report", call_report)
+    parser.shared("run")
+    _add_metric(parser)
+    parser.option("--baseline METHOD", "method that mCE is relative to (default: the first)")
+    parser.option("--figure FILE", "figure to write (.png or .pdf)", type=output_path)
+    parser.option("--out FILE", "file to write", type=output_path)
+    parser.shared("--format")
+
+
+def _add_methods(parser: Parser) -> None:
+    parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
+    parser.option(
+        "--corruptions NAME...", "families, corruptions or pairs to use, such as depth pose/drift (default: all)",
+        default=[],
+    )  # fmt: skip
+
+
+def _add_metric(parser: Parser) -> None:
+    parser.option("--protocol PROTOCOL", "protocol of the score (default: the first of the run)")
+    parser.option("--metric METRIC", "metric of the score (default: the first of the protocol)")
+
+
+def call_list(arguments: argparse.Namespace) -> None:
+    """List the corruptions, their severities and sources.
+
+    su3d-bench robustness list
+    su3d-bench robustness list --format markdown
+    """
+    from su3d_bench.corruptions.table import CORRUPTIONS
+    from su3d_bench.formats.tables.table import text_table
+
+    rows = [["corruption", "unit", "severities 1 to 5", "source"]]
+    for name, row in CORRUPTIONS.items():
+        rows.append([name, row.unit, ", ".join(f"{value:.3g}" for value in row.values), row.source])
+    value = [
+        {"name": name, "unit": row.unit, "values": list(row.values), "source": row.source}
+        for name, row in CORRUPTIONS.items()
+    ]
+    output.answer_tables(arguments, value, [text_table("corruptions", rows)])
+
+
+def call_run(arguments: argparse.Namespace) -> int:
+    """Run methods clean and under corruptions, in one run; the same command resumes an interrupted sweep.
+
+    su3d-bench robustness run --methods opensu3d conceptgraphs --corruptions depth pose/drift --out runs/robust
+    su3d-bench robustness run homes/tuning0 --only depth/holes/4 --out runs/one
+    """
+    from su3d_bench.robustness.sweep import conditions_of, methods_of
+
+    conditions = conditions_of(arguments.corruptions, arguments.severities, arguments.only)
+    arguments.methods = methods_of(arguments.methods or ["opensu3d"], conditions)
+    arguments.pictures = bool(arguments.pictures)
+    return execute(plan_of(arguments), arguments)
+
+
+def call_report(arguments: argparse.Namespace) -> None:
+    """Report a sweep: drops with intervals, means over families, mCE and resilience.
+
+    su3d-bench robustness report runs/robust --format markdown --figure robust.png
+    su3d-bench robustness report runs/robust --protocol homes-instance --metric AP50 --baseline conceptgraphs --json
+    """
+    from su3d_bench.robustness.figure import draw_sweep
+    from su3d_bench.robustness.measures import sweep_result
+    from su3d_bench.robustness.tables import sweep_tables
+    from su3d_bench.runs.verify import read_checked
+
+    run = read_checked(arguments.run)
+    result = sweep_result(run, *_score_of(run, arguments), arguments.baseline)
+    if arguments.figure is not None:
+        draw_sweep(result, arguments.figure)
+    of_embedded = run.record.profile in ("embedded", "auto")
+    output.answer_or_write(arguments, asdict(result), sweep_tables(result, of_embedded=of_embedded))
+
+
+def call_tolerance(arguments: argparse.Namespace) -> int:
+    """Find the largest error of each kind at which a method keeps 95 % of its clean score.
+
+    su3d-bench robustness tolerance --methods opensu3d --corruptions pose depth/scale --out runs/tolerance
+    su3d-bench robustness tolerance --corruptions calibration --protocol homes-instance --metric AP50 --dry-run
+    """
+    from su3d_bench.corruptions.table import CORRUPTIONS
+    from su3d_bench.robustness.sweep import conditions_of
+    from su3d_bench.robustness.tables import tolerance_table
+    from su3d_bench.robustness.tolerance import find_tolerances, numbers_of
+    from su3d_bench.runs.plan import named_method
+    from su3d_bench.runs.verify import read_checked
+
+    if not 0 < arguments.share < 1:
+        raise ConfigError(f"--share {arguments.share:g}: must be above 0 and below 1")
+    if arguments.out is None:
+        raise ConfigError("robustness tolerance: name the run folder with --out, such as --out runs/tolerance")
+    conditions = conditions_of(arguments.corruptions, [1], [])
+    corruptions = [CORRUPTIONS[one[0].corruption.address] for one in conditions if len(one) == 1]
+    target_of = {named_method(text).name: text for text in arguments.methods or ["opensu3d"]}
+    arguments.pictures = bool(arguments.pictures)
+    requested: dict[str, None] = {}
+    score: list[tuple[str, str]] = []
+    n_scenes = 0
+
+    def evaluate(cells: Sequence[Cell]) -> Mapping[Cell, Numbers]:
+        nonlocal n_scenes
+        requested.update(dict.fromkeys(target_of[cell.method] + cell.suffix for cell in cells))
+        arguments.methods, arguments.extend = list(requested), Path(arguments.out, "run.json").is_file()
+        plan = plan_of(arguments)
+        if (code := execute(plan, arguments)) != EXIT_DONE:
+            raise ConfigError(f"{arguments.out}: the run is incomplete (exit code {code}); fix the failures and repeat")
+        run = read_checked(plan.folder.path)
+        score[:] = [_score_of(run, arguments)]
+        n_scenes = len(run.scenes)
+        return numbers_of(run, *score[0], cells)
+
+    found = find_tolerances(evaluate, list(target_of), corruptions, arguments.share)
+    table = tolerance_table(found, *score[0], arguments.share, n_scenes)
+    output.answer_tables(arguments, [asdict(one) for one in found], [table])
+    return EXIT_DONE
+
+
+def _score_of(run: FinishedRun, arguments: argparse.Namespace) -> tuple[str, str]:
+    """The protocol and metric of the score; ``ConfigError`` if the run does not have them."""
+    protocol = arguments.protocol or next(iter(run.protocols), None)
+    if protocol not in run.protocols:
+        raise ConfigError(f"{run.name}: not scored under {protocol}; it has {', '.join(run.protocols) or 'no scores'}")
+    headline = run.rules(protocol).headline
+    metric = arguments.metric or headline[0]
+    if metric not in headline:
+        raise ConfigError(f"--metric {metric}: {protocol} has {', '.join(headline)}")
+    return protocol, metric

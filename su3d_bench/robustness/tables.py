@@ -1,0 +1,92 @@
+"""Tables of sweeps and tolerances, for every format of ``reports.tables.formats``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from su3d_bench.analysis.comparison import Difference
+from su3d_bench.core.errors import counted
+from su3d_bench.corruptions.model import Corruption
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
+from su3d_bench.robustness.measures import CellResult, MethodResult, SweepResult
+from su3d_bench.robustness.tolerance import Tolerance
+
+EMBEDDED = "Colour corruptions are those of the embedded models: no model of this run was trained on photographs."
+
+
+def sweep_tables(result: SweepResult, *, of_embedded: bool) -> list[Table | Prose]:
+    """A summary of all methods, and a table of the cells of each."""
+    families = list(dict.fromkeys(family for method in result.methods for family in method.families))
+    head = ["method", f"clean {result.metric}", *families, "mean", "mCE", "resilience"]
+    rows = [head, *(_summary(method, families) for method in result.methods)]
+    notes = [
+        "families: mean change over severities, then over corruptions, in points, with the 95 % interval over "
+        f"{counted(len(result.scenes), 'scene')}; mean: over families",
+        f"mCE: error relative to that of {result.baseline}; resilience: share of the clean value that is kept "
+        "(Robo3D, Kong et al. 2023). A weak method loses little: read both beside the clean value",
+        *([EMBEDDED] if of_embedded else []),
+    ]
+    parts: list[Table | Prose] = [
+        text_table("robustness", rows, heading=f"{result.protocol}: {result.metric} under corruptions", notes=notes)
+    ]
+    return [*parts, *(_cells_table(method, result.metric) for method in result.methods)]
+
+
+def _summary(method: MethodResult, families: Sequence[str]) -> list[str]:
+    changes = [_change(method.families[family]) if family in method.families else NOT_MEASURED for family in families]
+    return [
+        method.method, percent(method.clean), *changes, _change(method.mean), percent(method.mce),
+        percent(method.resilience),
+    ]  # fmt: skip
+
+
+def _change(difference: Difference) -> str:
+    return f"{signed(difference.difference)} {bracketed(difference.interval, signed)}".rstrip()
+
+
+def _cells_table(method: MethodResult, metric: str) -> Table:
+    severities = sorted({_severity(one) for one in method.cells})
+    of_corruption: dict[str, dict[str, CellResult]] = {}
+    for one in method.cells:
+        of_corruption.setdefault(one.cell.corruption, {})[_severity(one)] = one
+    rows = [["corruption", "unit", *(f"severity {severity}" for severity in severities)]]
+    for name, cells in of_corruption.items():
+        unit = " + ".join(one.corruption.unit for one in next(iter(cells.values())).cell.conditions)
+        rows.append([name, unit, *(_cell(cells.get(severity)) for severity in severities)])
+    notes = ["value in the unit: change in points; * p < 0.05, sign-flip test with Holm's correction over the family"]
+    return text_table(f"robustness-{method.method}", rows, heading=method.method, caption=f": {metric}", notes=notes)
+
+
+def _severity(one: CellResult) -> str:
+    return "+".join(f"{condition.severity:g}" for condition in one.cell.conditions)
+
+
+def _cell(one: CellResult | None) -> str:
+    if one is None:
+        return NOT_MEASURED
+    p = one.difference.p_of_all
+    value = " + ".join(f"{condition.value:.3g}" for condition in one.cell.conditions)
+    return f"{value}: {signed(one.difference.difference)}{'*' if p is not None and p < 0.05 else ''}"
+
+
+def tolerance_table(found: Sequence[Tolerance], protocol: str, metric: str, share: float, n_scenes: int) -> Table:
+    """The data sheet: one row per method, one column per corruption."""
+    corruptions = list({one.corruption.address: one.corruption for one in found}.values())
+    of_pair = {(one.method, one.corruption.address): one for one in found}
+    rows = [["method", *map(_title, corruptions)]]
+    for method in dict.fromkeys(one.method for one in found):
+        rows.append([method, *(_tolerated(of_pair[method, corruption.address]) for corruption in corruptions)])
+    notes = [
+        f"the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept, with the 95 % "
+        f"interval over {counted(n_scenes, 'scene')}; '>': kept at the highest severity"
+    ]
+    return text_table("tolerance", rows, heading="Tolerated errors", notes=notes)
+
+
+def _title(corruption: Corruption) -> str:
+    return f"{corruption.address}, {corruption.unit}"
+
+
+def _tolerated(one: Tolerance) -> str:
+    low_high = "" if one.interval is None else f" [{one.interval[0]:.3g}, {one.interval[1]:.3g}]"
+    return f"{'> ' if one.is_beyond else ''}{one.value:.3g}{low_high}"
