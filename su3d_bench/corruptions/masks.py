@@ -1,16 +1,16 @@
 """Corruptions of the regions that perception found in a frame: masks, boxes and scores.
 
 Names, captions and features stay with their region, so that the error is the mask's alone. A changed mask has the box
-around its pixels; a region without a pixel left is dropped. Pixels are those of an image 640 wide. The kinds of error
-are those with which Cheng et al. tried measures of masks (2021, "Boundary IoU", CVPR, section 4: scale and location of
-a mask), and the over- and under-segmentation of a segmenter.
+around its pixels; a region without a pixel left is dropped. Pixels are those of an image 640 wide.
+
+The kinds of error are those with which Cheng et al. compare measures of masks ("Boundary IoU", CVPR 2021: errors of
+scale and of location), and those of a segmenter about which pixels belong together.
 
 A share is each region's chance, so that frames with few regions change as often as those with many.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,19 +22,22 @@ from su3d_bench.corruptions.model import Corruption
 WIDTH_PX = 640
 
 
-def _distance(masks: BoolArray) -> Float32Array:
-    """The distance (K, H, W) of each pixel outside a mask from its nearest pixel, 0 inside; all masks have pixels."""
+def _distance(mask: BoolArray) -> Float32Array:
+    """The distance (H, W) of each pixel from the nearest one of a mask, which must have a pixel; 0 inside."""
     import cv2
 
-    outside = (~masks).astype(np.uint8)
-    return np.array([cv2.distanceTransform(one, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for one in outside], np.float32)
+    outside = np.asarray(~mask, np.uint8)
+    return np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
 def _boxes(masks: BoolArray) -> Float32Array:
     """Boxes (K, 4) around the pixels, right and bottom exclusive."""
-    columns, rows = masks.any(axis=1), masks.any(axis=2)
-    ends = [(has.argmax(axis=1), has.shape[1] - has[:, ::-1].argmax(axis=1)) for has in (columns, rows)]
-    return np.stack([ends[0][0], ends[1][0], ends[0][1], ends[1][1]], axis=1).astype(np.float32)
+    ends = []
+    for axis in (1, 2):
+        has: BoolArray = np.any(masks, axis=axis)
+        ends.append((has.argmax(axis=1), has.shape[1] - has[:, ::-1].argmax(axis=1)))
+    (left, right), (top, bottom) = ends
+    return np.stack([left, top, right, bottom], axis=1).astype(np.float32)
 
 
 def _regions(found: Detections, of: Int64Array, masks: BoolArray) -> Detections:
@@ -57,32 +60,22 @@ def _regions(found: Detections, of: Int64Array, masks: BoolArray) -> Detections:
     )
 
 
-def _each(found: Detections, change: Callable[[BoolArray], BoolArray]) -> Detections:
-    """Every mask with pixels changed alike."""
-    of = np.flatnonzero(found.masks.any(axis=(1, 2)))
-    return _regions(found, of, change(found.masks[of])) if len(of) else found
-
-
 def _pixels(found: Detections, px: float) -> float:
-    return px * found.masks.shape[2] / WIDTH_PX
+    return float(px * found.masks.shape[2] / WIDTH_PX)
 
 
 def eroded(found: Detections, px: float, rng: Generator) -> Detections:
-    """Masks without pixels within ``px`` of a pixel outside; the image's border is no outside."""
+    """Masks without pixels within ``px`` of a pixel outside; beyond the image's border is no outside."""
     radius = _pixels(found, px)
-
-    def change(masks: BoolArray) -> BoolArray:
-        full = masks.all(axis=(1, 2), keepdims=True)  # has no outside to be measured from
-        inner = np.array([np.ones_like(m) if m.all() else _distance(~m[None])[0] > radius for m in masks])
-        return inner | full
-
-    return _each(found, change)
+    masks = [mask if mask.all() else _distance(~mask) > radius for mask in found.masks]
+    return _regions(found, np.arange(len(found)), np.array(masks, bool).reshape(found.masks.shape))
 
 
 def dilated(found: Detections, px: float, rng: Generator) -> Detections:
     """Masks with all pixels within ``px`` of them."""
     radius = _pixels(found, px)
-    return _each(found, lambda masks: _distance(masks) <= radius)
+    masks = [_distance(mask) <= radius if mask.any() else mask for mask in found.masks]
+    return _regions(found, np.arange(len(found)), np.array(masks, bool).reshape(found.masks.shape))
 
 
 def shifted(found: Detections, px: float, rng: Generator) -> Detections:
@@ -112,7 +105,7 @@ def merged(found: Detections, share: float, rng: Generator) -> Detections:
     there, starts = np.unique(region, return_index=True)
     group = np.arange(len(found))
     for k in chosen:
-        distance = np.minimum.reduceat(_distance(found.masks[k : k + 1]).ravel()[pixel], starts)
+        distance = np.minimum.reduceat(_distance(found.masks[k]).ravel()[pixel], starts)
         nearest = there[np.where(there == k, np.inf, distance).argmin()]
         group[group == group[k]] = group[nearest]
     masks = np.stack([found.masks[group == one].any(axis=0) for one in np.unique(group)])
@@ -127,7 +120,7 @@ def split(found: Detections, share: float, rng: Generator) -> Detections:
     for k, mask in enumerate(found.masks):
         of.append(k)
         masks.append(mask)
-        if is_cut[k]:
+        if is_cut[k] and mask.any():
             v, u = np.nonzero(mask)
             side = (u - u.mean()) * np.cos(angles[k]) + (v - v.mean()) * np.sin(angles[k]) >= 0
             masks[-1], other = np.zeros_like(mask), np.zeros_like(mask)
