@@ -81,8 +81,7 @@ def sweep_result(run: FinishedRun, protocol: str, metric: str, baseline: str | N
     }
     scenes = tuple(found[0].result.scenes)
     results = tuple(
-        _method_result(method, [cell for cell in cells if cell.method == method], numbers, scenes)
-        for method in methods
+        _method_result(method, [cell for cell in cells if cell.method == method], numbers, scenes) for method in methods
     )
     return SweepResult(
         protocol, metric, scenes, baseline,

@@ -74,8 +74,10 @@ def tolerance_table(found: Sequence[Tolerance], protocol: str, metric: str, shar
     corruptions = list({one.corruption.address: one.corruption for one in found}.values())
     of_pair = {(one.method, one.corruption.address): one for one in found}
     rows = [["method", *map(_title, corruptions)]]
-    for method in dict.fromkeys(one.method for one in found):
-        rows.append([method, *(_tolerated(of_pair[method, corruption.address]) for corruption in corruptions)])
+    rows += [
+        [method, *(_tolerated(of_pair[method, corruption.address]) for corruption in corruptions)]
+        for method in dict.fromkeys(one.method for one in found)
+    ]
     notes = [
         f"the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept, with the 95 % "
         f"interval over {counted(n_scenes, 'scene')}; '>': kept at the highest severity"

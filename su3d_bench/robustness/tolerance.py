@@ -45,7 +45,7 @@ Evaluate = Callable[[Sequence[Cell]], Mapping[Cell, Numbers]]
 def find_tolerances(
     evaluate: Evaluate, methods: Sequence[str], corruptions: Sequence[Corruption], share: float = SHARE_KEPT
 ) -> list[Tolerance]:
-    """The tolerance of each method to each corruption; ``evaluate`` returns the numbers of cells over the same scenes."""
+    """The tolerance of each method to each corruption; ``evaluate`` returns numbers of cells over the same scenes."""
     pairs = [(method, corruption) for method in methods for corruption in corruptions]
     clean = evaluate([Cell(method, ()) for method in methods])
     curves: dict[tuple[str, str], dict[float, Numbers]] = {
@@ -85,7 +85,7 @@ def _tolerance(method: str, corruption: Corruption, curve: Mapping[float, Number
 
 
 def crossing(severities: Float64Array, values: Float64Array, share: float) -> float:
-    """The first severity at which ``values``, linear between ``severities`` from 0 on, fall below ``share`` of the first.
+    """The first severity at which ``values``, linear between ``severities`` from 0, fall below ``share`` of the first.
 
     >>> crossing(np.array([0.0, 2.0, 5.0]), np.array([0.8, 0.8, 0.5]), 0.75)
     4.0
