@@ -77,7 +77,7 @@ def draw_timing(
     return list(paths)
 
 
-def panels(width: Width, *panels_in: float) -> tuple[Figure, list[Axes]]:
+def figure_with_panels(width: Width, *panels_in: float) -> tuple[Figure, list[Axes]]:
     """Return a figure with panels of at least these heights."""
     from matplotlib.figure import Figure
 
@@ -124,7 +124,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
 
     Each update is a dot; a method's line connects the medians of updates of similar size.
     """
-    figure, (axes,) = panels(width, 2.2 + (2 if width == "8cm" else 1) * LINE_IN * len(times))
+    figure, (axes,) = figure_with_panels(width, 2.2 + (2 if width == "8cm" else 1) * LINE_IN * len(times))
     for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
         sized = [(scene, size) for scene in of_method if (size := _sizes(scene, against, warm_up)) is not None]
         sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
@@ -180,7 +180,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int, width: Width) 
     labels = _labels(times)
     stages = list(dict.fromkeys(stage for of_method in times for scene in of_method for stage in scene.stages))
     columns = _legend_columns(WIDTHS_IN[width], stages)
-    figure, (axes,) = panels(width, 0.7 + 2.2 * LINE_IN * len(times) + LINE_IN * -(-len(stages) // columns))
+    figure, (axes,) = figure_with_panels(width, 0.7 + 2.2 * LINE_IN * len(times) + LINE_IN * -(-len(stages) // columns))
     left = np.zeros(len(times))
     rows = np.arange(len(times))
     for index, stage in enumerate(stages):
@@ -204,7 +204,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Figure:
     """
     timed = {column for of_method in times for scene in of_method for column in scene.columns}
     drawn = [("map_bytes", POINTS)] * ("map_bytes" in timed) + [("rss_bytes", UPDATES)]
-    figure, panels = panels(width, *[2.2 + LINE_IN * len(times) / len(drawn)] * len(drawn))
+    figure, panels = figure_with_panels(width, *[2.2 + LINE_IN * len(times) / len(drawn)] * len(drawn))
     for axes, (column, against) in zip(panels, drawn, strict=True):
         for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
             counted = [scene for scene in of_method if column in scene.columns]
@@ -254,7 +254,7 @@ def _curves(points: Sequence[AnytimePoint]) -> list[tuple[str, str]]:
 def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
     """Plot each headline metric of each protocol over the seconds until the map was available."""
     panels = _curves(points)
-    figure, all_axes = panels(width, *[2.2] * len(panels))
+    figure, all_axes = figure_with_panels(width, *[2.2] * len(panels))
     several = len({point.run for point in points}) > 1
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
         curves = dict.fromkeys((point.run, point.method) for point in points)
@@ -282,7 +282,7 @@ Bar = tuple[str, float, str, str]  # name, length, style, label
 def draw_attribution(attribution: Mapping[str, Any], path: Path, width: Width = "17cm") -> None:
     """Write the plot as PDF, PNG or SVG: one panel per protocol and metric, the most costly error first."""
     panels = [(protocol, metric) for protocol in attribution["protocols"] for metric in protocol["values"]]
-    figure, all_axes = panels(width, *(0.7 + 2.2 * LINE_IN * len(_bars(*panel)) for panel in panels))
+    figure, all_axes = figure_with_panels(width, *(0.7 + 2.2 * LINE_IN * len(_bars(*panel)) for panel in panels))
     for axes, (protocol, metric) in zip(all_axes, panels, strict=True):
         _draw_errors(axes, protocol, metric)
     caption = (

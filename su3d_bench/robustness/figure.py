@@ -8,7 +8,7 @@ import numpy as np
 
 from su3d_bench.corruptions.model import MAX_SEVERITY
 from su3d_bench.reports.pictures.canvas import figure_style, write_figure
-from su3d_bench.reports.pictures.plots import panels, style_of_line
+from su3d_bench.reports.pictures.plots import figure_with_panels, style_of_line
 from su3d_bench.robustness.measures import MethodResult, SweepResult
 
 PANEL_HEIGHT_IN = 2.2
@@ -18,7 +18,7 @@ PANEL_HEIGHT_IN = 2.2
 def draw_sweep(result: SweepResult, path: Path) -> None:
     """Write the figure as the format of ``path``, ``.png`` or ``.pdf``."""
     families = list(dict.fromkeys(family for method in result.methods for family in method.families))
-    figure, axes = panels("17cm", *[PANEL_HEIGHT_IN] * len(families))
+    figure, axes = figure_with_panels("17cm", *[PANEL_HEIGHT_IN] * len(families))
     for family, panel in zip(families, axes, strict=True):
         for index, method in enumerate(result.methods):
             severities, values = _curve(method, family)

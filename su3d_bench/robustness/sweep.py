@@ -1,7 +1,7 @@
 """Which conditions a sweep has, and the names of the methods under them.
 
-A sweep is one run whose methods include each method clean and under every condition, so that it is resumed, extended and
-distributed as any other, and perception of unchanged images is computed once.
+A sweep is one run whose methods include each method clean and under every condition, so that it is resumed, extended
+and distributed as any other, and perception of unchanged images is computed once.
 """
 
 from __future__ import annotations
