@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -60,13 +60,17 @@ def _condition(text: str) -> Condition:
 
 @dataclass(frozen=True)
 class SceneCorruption:
-    """The ``conditions`` of one scene. ``read_poses`` returns the clean poses (N, 4, 4) of all its frames."""
+    """The ``conditions`` of one scene. ``read_poses`` returns the clean poses (N, 4, 4) of all its frames.
+
+    ``clean_cameras``: pose and intrinsics of the frames so far, before they were changed.
+    """
 
     conditions: tuple[Condition, ...]
     scene: str
     seed: int
     read_frames: Callable[[], Sequence[Frame]]
     read_poses: Callable[[], Float64Array]
+    clean_cameras: dict[int, tuple[Float64Array, Float64Array]] = field(default_factory=dict)
 
     @cached_property
     def recording(self) -> tuple[Sequence[Frame], Float64Array]:
@@ -92,7 +96,8 @@ class SceneCorruption:
         return corruption.function(value, condition.value, rng, *more)
 
     def frame(self, frame: Frame) -> Frame:
-        """The frame as the method gets it; poses change only what the method sees, not perception."""
+        """The frame as the method gets it."""
+        self.clean_cameras[frame.index] = frame.camera_to_world, frame.intrinsics
         for condition in self.at("frame"):
             frame = self.call(condition, frame.index, frame, Recording(*self.recording, frame.index))
         if self.at("poses"):
@@ -137,7 +142,10 @@ class CorruptedFrames(Sequence[Frame]):
 
 
 class CorruptedPerception:
-    """Perception of corrupted frames at their true poses, whose detections are then corrupted."""
+    """Perception of corrupted frames at their true poses, whose detections are then corrupted.
+
+    Perfect masks are those of the true camera.
+    """
 
     def __init__(self, perception: Any, corruption: SceneCorruption) -> None:
         self._perception, self._corruption = perception, corruption
@@ -157,9 +165,10 @@ class CorruptedPerception:
         return CorruptedRegions(self._perception.regions(), self._seen)
 
     def _seen(self, frame: Frame) -> Frame:
-        if not self._corruption.at("poses"):
-            return frame
-        return replace(frame, camera_to_world=self._corruption.recording[1][frame.index])
+        pose, intrinsics = self._corruption.clean_cameras[frame.index]
+        if self._perception.profile != "oracle":
+            intrinsics = frame.intrinsics
+        return replace(frame, camera_to_world=pose, intrinsics=intrinsics)
 
 
 @dataclass(frozen=True)
