@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,7 +71,7 @@ def call_list(arguments: argparse.Namespace) -> None:
 
     rows = [["corruption", "unit", "severities 1 to 5", "source"]]
     for name, row in CORRUPTIONS.items():
-        rows.append([name, row.unit, ", ".join(f"{value:.3g}" for value in row.values), row.source])
+        rows.append([name, row.unit, ", ".join(f"{value:.4g}" for value in row.values), row.source])
     value = [
         {"name": name, "unit": row.unit, "values": list(row.values), "source": row.source}
         for name, row in CORRUPTIONS.items()
@@ -110,7 +109,7 @@ def call_report(arguments: argparse.Namespace) -> None:
     if arguments.figure is not None:
         draw_sweep(result, arguments.figure)
     of_embedded = run.record.profile in ("embedded", "auto")
-    output.answer_or_write(arguments, asdict(result), sweep_tables(result, of_embedded=of_embedded))
+    output.answer_or_write(arguments, result.to_json(), sweep_tables(result, of_embedded=of_embedded))
 
 
 def call_tolerance(arguments: argparse.Namespace) -> int:
@@ -152,7 +151,8 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
 
     found = find_tolerances(evaluate, list(target_of), corruptions, arguments.share)
     table = tolerance_table(found, *score[0], arguments.share, n_scenes)
-    output.answer_tables(arguments, [asdict(one) for one in found], [table])
+    value = [{**vars(one), "corruption": one.corruption.address} for one in found]
+    output.answer_tables(arguments, value, [table])
     return EXIT_DONE
 
 

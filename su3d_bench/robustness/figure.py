@@ -25,7 +25,7 @@ def draw_sweep(result: SweepResult, path: Path) -> None:
             panel.plot(severities, values, label=method.method, markersize=4, **style_of_line(index))
         panel.set_title(family)
         panel.set_xlim(0, MAX_SEVERITY)
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, 1.05 * 100 * max(method.clean for method in result.methods) or 1)
         panel.set_xlabel("severity")
         panel.set_ylabel(f"{result.metric}, %")
     axes[0].legend(fontsize=7)

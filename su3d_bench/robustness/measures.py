@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from su3d_bench.analysis.comparison import Difference, difference_of
 from su3d_bench.analysis.sides import Numbers, Side, SideNumbers, headline_numbers
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics.statistics import holm
 from su3d_bench.robustness.sweep import Cell, cell_of
 from su3d_bench.runs.finished import FinishedRun
@@ -59,6 +60,26 @@ class SweepResult:
     scenes: tuple[str, ...]
     baseline: str
     methods: tuple[MethodResult, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON values in full precision, null if undefined."""
+        return {
+            **plain_json({name: value for name, value in vars(self).items() if name != "methods"}),
+            "methods": [_method_json(method) for method in self.methods],
+        }
+
+
+def _method_json(method: MethodResult) -> dict[str, Any]:
+    cells = {one.cell.suffix[1:]: _difference_json(one.difference) for one in method.cells}
+    families = {family: _difference_json(difference) for family, difference in method.families.items()}
+    own: dict[str, Any] = plain_json({**vars(method), "cells": None, "families": None, "mean": None})
+    return own | {"cells": cells, "families": families, "mean": _difference_json(method.mean)}
+
+
+def _difference_json(difference: Difference) -> dict[str, Any]:
+    names = ("right", "difference", "interval", "p_of_all")
+    found: dict[str, Any] = plain_json({name: getattr(difference, name) for name in names})
+    return {"value": found.pop("right"), **found}
 
 
 def sweep_result(run: FinishedRun, protocol: str, metric: str, baseline: str | None = None) -> SweepResult:

@@ -65,7 +65,7 @@ def _cell(one: CellResult | None) -> str:
     if one is None:
         return NOT_MEASURED
     p = one.difference.p_of_all
-    value = " + ".join(f"{condition.value:.3g}" for condition in one.cell.conditions)
+    value = " + ".join(f"{condition.value:.4g}" for condition in one.cell.conditions)
     return f"{value}: {signed(one.difference.difference)}{'*' if p is not None and p < 0.05 else ''}"
 
 

@@ -145,6 +145,7 @@ class _Scene:
         self.job = job
         self.report = report
         self._truths: dict[str, GroundTruth] = {}
+        self._corruptions: dict[str, SceneCorruption] = {}
 
     @cached_property
     def dataset(self) -> Any:
@@ -209,13 +210,13 @@ class _Scene:
 
     def corruption(self, part: jobs.Part) -> SceneCorruption | None:
         """The corruption of the inputs of ``part``, if there is one."""
-        if not part.corruption:
-            return None
-        name = self.job.scene_name
-        return SceneCorruption(
-            parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
-            partial(self.dataset.frames, name, 1), partial(_poses, self.dataset, name),
-        )  # fmt: skip
+        if part.corruption and part.name not in self._corruptions:
+            name = self.job.scene_name
+            self._corruptions[part.name] = SceneCorruption(
+                parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
+                partial(self.dataset.frames, name, 1), partial(_poses, self.dataset, name),
+            )  # fmt: skip
+        return self._corruptions.get(part.name)
 
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only if its completion record is missing or does not match."""
