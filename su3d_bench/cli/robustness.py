@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from su3d_bench.cli import output
 from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, output_path
 from su3d_bench.cli.run import add_run_options, execute, plan_of
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -118,11 +118,14 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
     su3d-bench robustness tolerance --methods opensu3d --corruptions pose depth/scale --out runs/tolerance
     su3d-bench robustness tolerance --corruptions calibration --protocol homes-instance --metric AP50 --dry-run
     """
+    from su3d_bench.corruptions.apply import Condition
+    from su3d_bench.corruptions.model import MAX_SEVERITY
     from su3d_bench.corruptions.table import CORRUPTIONS
-    from su3d_bench.robustness.sweep import conditions_of
+    from su3d_bench.robustness.sweep import conditions_of, methods_of
     from su3d_bench.robustness.tables import tolerance_table
     from su3d_bench.robustness.tolerance import find_tolerances, numbers_of
     from su3d_bench.runs.plan import named_method
+    from su3d_bench.runs.runner import run_plan
     from su3d_bench.runs.verify import read_checked
 
     if not 0 < arguments.share < 1:
@@ -133,6 +136,10 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
     corruptions = [CORRUPTIONS[one[0].corruption.address] for one in conditions if len(one) == 1]
     target_of = {named_method(text).name: text for text in arguments.methods or ["opensu3d"]}
     arguments.pictures = bool(arguments.pictures)
+    if arguments.dry_run:  # one of its steps
+        highest = [(Condition(corruption, MAX_SEVERITY),) for corruption in corruptions]
+        arguments.methods = methods_of(list(target_of.values()), highest)
+        return execute(plan_of(arguments), arguments)
     requested: dict[str, None] = {}
     score: list[tuple[str, str]] = []
     n_scenes = 0
@@ -142,8 +149,10 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
         requested.update(dict.fromkeys(target_of[cell.method] + cell.suffix for cell in cells))
         arguments.methods, arguments.extend = list(requested), Path(arguments.out, "run.json").is_file()
         plan = plan_of(arguments)
-        if (code := execute(plan, arguments)) != EXIT_DONE:
-            raise ConfigError(f"{arguments.out}: the run is incomplete (exit code {code}); fix the failures and repeat")
+        with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+            result = run_plan(plan, report)
+        if result.failures:
+            raise DataError(f"{arguments.out}: {result.failures[0][2]}; the same command resumes the search")
         run = read_checked(plan.folder.path)
         score[:] = [_score_of(run, arguments)]
         n_scenes = len(run.scenes)

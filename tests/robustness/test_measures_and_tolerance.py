@@ -25,7 +25,9 @@ def numbers(of_scenes: Sequence[float]) -> Numbers:
     return Numbers(float(values.mean()), values, without_each, None)
 
 
-def evaluator(score: Callable[[float, int], float], n_scenes: int) -> Callable[[Sequence[Cell]], Mapping[Cell, Numbers]]:
+def evaluator(
+    score: Callable[[float, int], float], n_scenes: int
+) -> Callable[[Sequence[Cell]], Mapping[Cell, Numbers]]:
     """``score`` is that of a scene at a severity."""
 
     def evaluate(cells: Sequence[Cell]) -> Mapping[Cell, Numbers]:

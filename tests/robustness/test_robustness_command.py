@@ -1,0 +1,94 @@
+"""The commands of ``robustness`` on a small room with perfect masks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.cli.main import main
+
+SMALL = "--set rooms.width=160 rooms.height=120 rooms.n_frames=40 --stride 10 --profile oracle --jobs 1"
+ROOM = f"rooms/bathroom0 {SMALL} --protocols rooms-instance"
+CORRUPTIONS = "depth/holes pose/jitter-translation masks/eroded names/distractors time/lost-bursts light/exposure"
+
+
+def prediction(run: str, name: str) -> bytes:
+    return Path(run, "scenes", "rooms.bathroom0", name, "prediction.npz").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweep") / "run"
+    words = f"robustness run {ROOM} --corruptions {CORRUPTIONS} --severities 0 4 --out {folder}"
+    assert main(words.split()) == 0
+    return folder
+
+
+def test_severity_0_is_the_clean_run_byte_for_byte(sweep: Path) -> None:
+    clean = prediction(str(sweep), "opensu3d")
+    for name in CORRUPTIONS.replace("/", "-").split():
+        assert prediction(str(sweep), f"opensu3d~{name}-0") == clean
+    for name in ("depth-holes", "pose-jitter-translation", "masks-eroded", "time-lost-bursts"):
+        assert prediction(str(sweep), f"opensu3d~{name}-4") != clean
+    assert prediction(str(sweep), "opensu3d~names-distractors-4") == clean
+
+
+def test_cell_run_alone_equals_the_cell_of_the_sweep(sweep: Path, tmp_path: Path) -> None:
+    for text in ("depth/holes/4", "time/lost-bursts/4"):
+        out = tmp_path / text.replace("/", "-")
+        assert main(f"robustness run {ROOM} --only {text} --out {out}".split()) == 0
+        name = f"opensu3d~{text.replace('/', '-')}"
+        assert prediction(str(out), name) == prediction(str(sweep), name)
+
+
+def test_report_has_every_family_and_writes_its_figure(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    figure = tmp_path / "figure.png"
+    assert main(f"robustness report {sweep} --figure {figure} --json".split()) == 0
+    (method,) = json.loads(capsys.readouterr().out)["methods"]
+    assert list(method["families"]) == ["depth", "pose", "masks", "names", "time", "light"]
+    assert method["cells"]["masks/eroded/4"]["difference"] < 0
+    assert method["cells"]["masks/eroded/0"]["difference"] == 0
+    assert figure.read_bytes()[:4] == b"\x89PNG"
+    assert main(f"robustness report {sweep} --format latex".split()) == 0
+    assert r"\begin{tabular}" in capsys.readouterr().out
+
+
+def test_tolerance_is_between_the_severities_that_keep_and_lose(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capsys.readouterr()
+    words = f"robustness tolerance {ROOM} --corruptions masks/eroded --quiet --json --out {tmp_path / 'run'}"
+    assert main(words.split()) == 0
+    (found,) = json.loads(capsys.readouterr().out)
+    assert 0 < found["severity"] < 5
+    assert found["corruption"] == "masks/eroded"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("run rooms/bathroom0 --corruptions dpeth", "did you mean 'depth'"),
+        ("run rooms/bathroom0 --only depth/holes/9", "severity from 0 to 5"),
+        ("run rooms/bathroom0 --severities 7", "expected 0 to 5"),
+        ("tolerance rooms/bathroom0 --share 2 --out out", "must be above 0 and below 1"),
+        ("tolerance rooms/bathroom0", "name the run folder with --out"),
+        ("report none", "none"),
+    ],
+)
+def test_wrong_request_is_one_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robustness", *words.split()]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+def test_list_has_every_corruption_with_its_source(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robustness", "list", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) >= 47
+    assert all(len(row["values"]) == 5 and row["source"] for row in rows)
