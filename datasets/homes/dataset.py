@@ -13,6 +13,8 @@ from pydantic import Field
 
 from su3d_bench.core.errors import DataError, nearest
 from su3d_bench.core.types import Float64Array, Frame, LabelSet, UInt8Array
+from su3d_bench.corruptions.sensors.colour import mean_luminance
+from su3d_bench.corruptions.sensors.poses import shutter
 from su3d_bench.datasets.homes.catalogue import HomeClass, catalogue, read_classes
 from su3d_bench.datasets.homes.furnish import furnish
 from su3d_bench.datasets.homes.plan import PERSON_M, HomePlan
@@ -29,8 +31,6 @@ from su3d_bench.datasets.procedural.rendering.light import lit_mesh
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import Renderer
 from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
-from su3d_bench.sensors.colour import mean_luminance
-from su3d_bench.sensors.poses import shutter
 
 LIGHT_M, TRAINING_LIGHT_M = 0.06, 0.15  # between points at which light is computed; coarser where speed counts more
 METERED_WIDTH = 80  # of the images from which the exposure follows: a mean needs no more

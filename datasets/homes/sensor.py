@@ -9,8 +9,8 @@ from numpy.random import Generator
 
 from su3d_bench.core.types import Float32Array as Image
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.corruptions.sensors import colour, depth, poses
 from su3d_bench.datasets.procedural.rendering.render import RenderedFrame
-from su3d_bench.sensors import colour, depth, poses
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,9 @@ class SensorSettings:
     grain_px: int = depth.WINDOW_PX
     step_px: float = depth.STEP_PX
     baseline_m: float = depth.BASELINE_M
-    camera_offset_m: float = 0.025  # infrared camera left of the colour camera (the ROS page of ``sensors/depth.py``)
+    camera_offset_m: float = (
+        0.025  # infrared camera left of the colour camera (ROS page of ``corruptions/sensors/depth.py``)
+    )
     near_m: float = 0.5  # Khoshelham and Elberink 2012 (Sensors 12) measure errors from here to 5 m
     far_m: float = 5.0
     # The Kinect is specified to 4 m (Microsoft, DepthRange.Default); there a grey card (0.18) still faces it seen.

@@ -1,4 +1,4 @@
-"""Apply corruptions to the inputs of one scene: its frames, its detections and the class names of a protocol.
+"""Apply corruptions to the inputs of one scene: its frames, its detections and the class names.
 
 A corrupted method is written ``METHOD~FAMILY/NAME/SEVERITY``, with ``+`` between two corruptions:
 ``opensu3d~depth/holes/4+pose/jitter-rotation/2``.
@@ -19,7 +19,6 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, PerceptionNeeds
 from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, Stage, generator
 from su3d_bench.corruptions.table import CORRUPTIONS
-from su3d_bench.metrics.protocols.model import ProtocolRules
 
 MARK = "~"  # between a method and its corruptions
 
@@ -111,18 +110,11 @@ class SceneCorruption:
             places = self.call(condition, 0, places)
         return places
 
-    def rules(self, rules: ProtocolRules) -> ProtocolRules:
-        """The protocol with other names in its prompts, and with distractors."""
-        clean = tuple(entry.name for entry in rules.classes)
-        names = tuple(rules.prompt_names.get(name, name) for name in clean)
+    def names(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """The names to search for, and after these the distractors."""
         for condition in self.at("names"):
             names = self.call(condition, 0, names)
-        return rules.model_copy(
-            update={
-                "prompt_names": dict(zip(clean, names, strict=False)),
-                "distractors": (*rules.distractors, *names[len(clean) :]),
-            }
-        )
+        return names
 
 
 class CorruptedFrames(Sequence[Frame]):

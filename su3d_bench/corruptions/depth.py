@@ -14,8 +14,8 @@ from numpy.random import Generator
 
 from su3d_bench.core.types import BoolArray, Frame
 from su3d_bench.corruptions.model import Corruption, Recording
-from su3d_bench.sensors import depth
-from su3d_bench.sensors.colour import LUMINANCE, to_linear
+from su3d_bench.corruptions.sensors import depth
+from su3d_bench.corruptions.sensors.colour import LUMINANCE, to_linear
 
 HOLE_SHARE = 1 / 40  # smoothing of the field whose lowest places become holes, as a share of the image's width
 

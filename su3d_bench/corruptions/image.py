@@ -20,7 +20,7 @@ from numpy.random import Generator
 
 from su3d_bench.core.types import Float32Array, Float64Array, FloatArray, Frame, UInt8Array
 from su3d_bench.corruptions.model import Corruption, FrameFunction, Recording
-from su3d_bench.sensors import colour
+from su3d_bench.corruptions.sensors import colour
 
 ImageFunction = Callable[[UInt8Array, float, Generator], UInt8Array]
 DEFOCUS = ((3, 0.1), (4, 0.5), (6, 0.5), (8, 0.5), (10, 0.5))  # radius of the disc, sigma that smooths its edge; px

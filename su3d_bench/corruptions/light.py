@@ -11,8 +11,8 @@ from numpy.random import Generator
 
 from su3d_bench.core.types import Frame
 from su3d_bench.corruptions.model import Corruption, Recording
-from su3d_bench.sensors import colour
-from su3d_bench.sensors.poses import shutter
+from su3d_bench.corruptions.sensors import colour
+from su3d_bench.corruptions.sensors.poses import shutter
 
 SHOT, READ = 1e-4, 6.3e-9  # variances at base gain: lowest of Brooks et al. 2019, ln(read) = 2.18 ln(shot) + 1.2
 MAX_GAIN_STOPS = 6.0  # ISO 100 to 6400, a common limit of cameras for video; then images get darker

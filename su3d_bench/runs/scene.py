@@ -363,7 +363,8 @@ class _Scene:
             self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
             configured = jobs.with_visible_truth(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
-            asked = corruption.rules(rules) if corruption and corruption.at("names") else rules
+            names = tuple(rules.prompt_names.get(entry.name, entry.name) for entry in rules.classes)
+            asked = rules.with_names(corruption.names(names)) if corruption and corruption.at("names") else rules
             scores[rules.name] = score_located(asked, known, configured, encoder)
         return scores, unscored
 

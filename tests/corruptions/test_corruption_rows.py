@@ -37,7 +37,7 @@ every_frame_row = pytest.mark.parametrize("row", FRAME_ROWS, ids=by_address)
 
 
 def test_addresses_are_unique_and_every_value_has_a_source() -> None:
-    assert len({row.address for row in ROWS}) == len(ROWS) == 22
+    assert len({row.address for row in ROWS}) == len(ROWS) == 24
     assert [row.address for row in ROWS if not row.source.endswith(".") or not row.unit] == []
 
 

@@ -13,7 +13,7 @@ from recordings import SCENES, recording
 from su3d_bench.core.types import Frame, UInt8Array
 from su3d_bench.corruptions import light
 from su3d_bench.corruptions.model import Corruption, Recording, generator
-from su3d_bench.sensors.colour import to_linear
+from su3d_bench.corruptions.sensors.colour import to_linear
 
 ROWS = {row.name: row for row in light.ROWS}
 INDEX = 9

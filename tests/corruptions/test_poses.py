@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from recordings import recording
+from scipy.spatial.transform import Rotation
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.corruptions.model import Corruption, generator
-from su3d_bench.corruptions.poses import ROWS
+from su3d_bench.corruptions.poses import ROWS, aligned
 
-JITTER_ROTATION, JITTER_TRANSLATION, DRIFT_ROTATION, DRIFT_TRANSLATION, JUMPS = ROWS
+JITTER_ROTATION, JITTER_TRANSLATION, DRIFT_ROTATION, DRIFT_TRANSLATION, JUMPS = ROWS[:5]
 LONG = np.tile(np.eye(4), (900, 1, 1))
 
 
@@ -57,3 +58,11 @@ def test_there_is_one_jump_for_every_300_frames(n_frames: int, n_jumps: int) -> 
     # between jumps the error grows by equal steps: all others are those of n_jumps + 1 straight lines
     assert len(np.unique(np.round(step, 9))) <= 2 * n_jumps + 1
     assert np.count_nonzero(step > 3 * np.median(step)) == n_jumps
+
+
+def test_alignment_undoes_a_rigid_motion_of_the_trajectory() -> None:
+    clean, motion = recording().poses, np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+    motion[:3, 3] = 1.0, 2.0, 3.0
+    found = aligned(lambda given, size, rng: motion @ given)(clean, 1.0, np.random.default_rng(0))
+    assert found == pytest.approx(clean, abs=1e-9)

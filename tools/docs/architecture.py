@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 TEMPLATES = PACKAGE / "cli" / "new"  # files that a user copies
 PURPOSE = {
     "core": "shared types, interfaces, registry, settings, errors, atomic files, locks, devices",
-    "sensors": "errors of depth cameras, colour cameras and poses",
+    "corruptions": "errors of cameras, poses, time, masks and names, in five severities",
     "numerics": "statistics, clustering, spatial relations, loading Open3D",
     "store": "run folders with records and predictions; the cache",
     "formats": "readers of plain data: images, PLY, HDF5, npz, torch archives, pickles, CSV",
@@ -37,6 +37,7 @@ PURPOSE = {
     "runs": "splits a run into jobs, in processes or on clusters; resuming",
     "evaluation": "scores of predictions from files",
     "human_eval": "annotation sheets: creation, answers, scores",
+    "robustness": "sweeps over corruptions, and the errors that methods tolerate",
     "analysis": "comparison, regression checks, rankings and attribution of finished runs",
     "reproducing": "recipes for a paper's experiments; bundles; registries",
     "api": "the Python interface: runs and predictions as pandas tables",

@@ -1,6 +1,6 @@
 """Draw ``docs/pictures/corruptions.jpg``: one tile per corruption at severity 4, and the clean inputs.
 
-    python tools/docs/draw_corruptions.py
+python tools/docs/draw_corruptions.py
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _depth(frame: Frame) -> UInt8Array:
 
 def _overlay(frame: Frame) -> UInt8Array:
     """Edges of depth in red on colour."""
-    from su3d_bench.sensors.depth import edges
+    from su3d_bench.corruptions.sensors.depth import edges
 
     picture = frame.rgb.copy()
     picture[edges(frame.depth_m)] = (255, 0, 0)

@@ -337,6 +337,12 @@ class ProtocolRules(_Strict):
         templates = self.prompts if self.prompt is None else (self.prompt,)
         return tuple(template.replace("{}", self.prompt_names.get(name, name)) for template in templates)
 
+    def with_names(self, names: Sequence[str]) -> Self:
+        """The same rules with other ``names`` in the prompts, in the order of the classes; further ones distract."""
+        texts = {entry.name: name for entry, name in zip(self.classes, names, strict=False)}
+        distractors = (*self.distractors, *names[len(self.classes) :])
+        return self.model_copy(update={"prompt_names": texts, "distractors": distractors})
+
     @property
     def digest(self) -> str:
         """A content key of all rules; fields with their default value do not affect it."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.sensors import colour
+from su3d_bench.corruptions.sensors import colour
 
 CAMERA = np.array([[400.0, 0, 159.5], [0, 400.0, 119.5], [0, 0, 1]])
 SHAPE = (240, 320)

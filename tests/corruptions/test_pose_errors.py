@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.sensors import poses
+from su3d_bench.corruptions.sensors import poses
 
 N = 600
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float32Array, Float64Array
-from su3d_bench.sensors import depth
+from su3d_bench.corruptions.sensors import depth
 
 CAMERA = np.array([[400.0, 0, 319.5], [0, 400.0, 239.5], [0, 0, 1]])
 SHAPE = (480, 640)

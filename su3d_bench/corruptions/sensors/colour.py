@@ -13,7 +13,7 @@ from numpy.random import Generator
 
 from su3d_bench.core.types import Float32Array as Light
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.sensors.depth import inverse_depth, normal_noise
+from su3d_bench.corruptions.sensors.depth import inverse_depth, normal_noise
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
 
