@@ -15,7 +15,7 @@ from su3d_bench.cli.output import answer, answer_either, answer_json, remark, sh
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
 
 SHELLS = ("bash", "zsh", "fish")
-KIND_NAMES = ("perception", "model-digests", "runs", "replies")
+KIND_NAMES = ("perception", "model-digests", "replies")
 DAY_S = 86400
 MAX_REFUSED = 20  # lines
 

@@ -33,7 +33,6 @@ RUN_OPTIONS = (
     "refiner",
     "offline",
     "executor",
-    "ray_address",
     "gpus_per_job",
     "retries",
     "slurm",
@@ -101,15 +100,15 @@ def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: arg
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise early if the GPU does not exist, except on clusters, whose machines have their own."""
+    """Raise early if the GPU does not exist, except under Slurm, whose machines have their own."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors import ELSEWHERE
+    from su3d_bench.runs.executors import SLURM
 
     if arguments.device is None:
         return
     if DEVICE.fullmatch(arguments.device) is None:
         raise ConfigError(f"--device {printable(arguments.device, 40)}: {EXPECTED_DEVICE}")
-    if not arguments.dry_run and arguments.executor not in ELSEWHERE:
+    if not arguments.dry_run and arguments.executor != SLURM:
         device_for(arguments.device, 0)
 
 

@@ -22,7 +22,7 @@ from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig, models_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
-from su3d_bench.runs.executors import ELSEWHERE
+from su3d_bench.runs.executors import SLURM
 from su3d_bench.runs.job import Part, build_method
 from su3d_bench.runs.plan import asks_language_model, method_part, named_method
 from su3d_bench.runs.scenes import data_root
@@ -168,7 +168,7 @@ def asks(run: RecipeRun) -> list[str]:
 def language_needs(run: RecipeRun, out: Path) -> Iterator[Need]:
     """The missing key of the language model, if requests would be sent."""
     has_replies = run.values.get("offline") or (run.folder(out) / "language").is_dir()
-    if not asks(run) or has_replies or run.values.get("executor") in ELSEWHERE:
+    if not asks(run) or has_replies or run.values.get("executor") == SLURM:
         return
     key = perception_of(run).language.key_variable
     try:

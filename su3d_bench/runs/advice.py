@@ -87,8 +87,8 @@ def pictures_of(result: RunResult) -> list[Path]:
 
 
 def next_commands(result: RunResult) -> list[str]:
-    """Commands to run next, each of which works on this run; empty if it is incomplete or in a remote store."""
-    if not result.is_complete or result.plan.place.url is not None:
+    """Commands to run next, each of which works on this run; empty if it is incomplete."""
+    if not result.is_complete:
         return []
     run = str(result.plan.folder.path)
     commands = [["report", "html", run, "--out", f"{run}.html" if result.plan.folder.path.name else "../page.html"]]

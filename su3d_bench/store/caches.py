@@ -15,7 +15,6 @@ from pathlib import Path
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
 from su3d_bench.core.files.atomic import remove_file
-from su3d_bench.core.files.locks import is_locked
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 _HEX = "[0-9a-f]"
@@ -69,12 +68,10 @@ class CacheKind:
 
 
 _PERCEPTION = f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"
-_RUN = f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"
 _REPLY = f"(images/)?{_HEX}+\\.(json|png)"
 _KINDS = (
     CacheKind("perception", _PERCEPTION, "detections in frames: further runs on the same frames are many times faster"),
     CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds per gigabyte"),
-    CacheKind("runs", _RUN, "small files of runs that are stored elsewhere, such as s3://"),
     CacheKind("replies", _REPLY, "replies of language models outside a run, which may have cost money", is_paid=True),
 )
 KINDS = {kind.name: kind for kind in _KINDS}
@@ -105,19 +102,12 @@ def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
 def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tuple[int, int]:
     """Remove the files of ``kind`` written before a time; returns their number and bytes.
 
-    Folders stay, because a run may be about to write there; files locked by a running process stay too.
+    Folders stay, because a run may be about to write there.
     """
-    top, state = root / kind.name, dict[str, bool]()
-    n_files = n_bytes = 0
-    for entry in cache_entries(root, kind):
-        run = entry.name.partition("/")[0]
-        if kind.name == "runs" and run not in state:
-            state[run] = is_locked(top / run)
-        if entry.written >= before or state.get(run, False):
-            continue
-        remove_file(top / entry.name)
-        n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
-    return n_files, n_bytes
+    old = [entry for entry in cache_entries(root, kind) if entry.written < before]
+    for entry in old:
+        remove_file(root / kind.name / entry.name)
+    return len(old), sum(entry.n_bytes for entry in old)
 
 
 def size_text(n_bytes: int) -> str:

@@ -10,16 +10,14 @@ import pytest
 
 from su3d_bench.cli.dev import KIND_NAMES
 from su3d_bench.cli.main import main
-from su3d_bench.core.files.atomic import write_bytes, write_json
+from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.language.chat import ChatRequest, Reply, ReplyStore
 from su3d_bench.perception.models.files import file_sha256
 from su3d_bench.perception.profiles import REPLIES
-from su3d_bench.runs.remote_store import mirror_of
 from su3d_bench.store import caches
-from su3d_bench.store.run_folder import RunFolder
 
-FOREIGN = ("perception/notes.txt", "perception/ab/mine.npz", "mine/0.npz", "runs/mine/scenes/x", "replies/mine.txt")
+FOREIGN = ("perception/notes.txt", "perception/ab/mine.npz", "mine/0.npz", "replies/mine.txt")
 
 
 @pytest.fixture
@@ -31,12 +29,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     weights = tmp_path / "weights.bin"
     weights.write_bytes(bytes(2**20))
     file_sha256(weights)
-    mirror = mirror_of("s3://bucket/run", root)
-    with RunFolder(mirror).locked():
-        job = RunFolder(mirror).job("rooms/living0", "opensu3d")
-        job.prepare()
-        write_json(job.done, {})
-        write_json(mirror / "run.json", {})
     request = ChatRequest("ask", "m", "", "x")
     ReplyStore(root / REPLIES).save(request, Reply("y"), "nowhere")
     for name in FOREIGN:
@@ -54,7 +46,7 @@ def contents(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
 
 def test_cache_list_counts_every_kind_of_entry(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert tuple(caches.KINDS) == KIND_NAMES
-    assert contents(capsys) == {"perception": 1, "model-digests": 1, "runs": 2, "replies": 1}
+    assert contents(capsys) == {"perception": 1, "model-digests": 1, "replies": 1}
     assert main(["dev", "cache", "list"]) == 0
     text = capsys.readouterr().out
     assert str(cache) in text
@@ -72,7 +64,7 @@ def test_clear_removes_cache_files_and_replies_only_by_name(cache: Path, capsys:
     assert contents(capsys) == before
     assert main(["dev", "cache", "clear", "all"]) == 0
     assert "to remove them: su3d-bench dev cache clear replies" in capsys.readouterr().err
-    assert contents(capsys) == {"perception": 0, "model-digests": 0, "runs": 0, "replies": 1}
+    assert contents(capsys) == {"perception": 0, "model-digests": 0, "replies": 1}
     assert main(["dev", "cache", "clear", "replies"]) == 0
     assert sum(contents(capsys).values()) == 0
     assert sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*") if path.is_file()) == sorted(FOREIGN)
@@ -107,9 +99,3 @@ def test_older_than_removes_only_old_files(cache: Path, capsys: pytest.CaptureFi
     assert contents(capsys)["perception"] == 1
     assert main(["dev", "cache", "clear", "perception", "--older-than", "-1"]) == 2
     assert "--older-than -1: expected a number of days" in capsys.readouterr().err
-
-
-def test_locked_run_is_not_cleared(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RunFolder(mirror_of("s3://bucket/run", cache)).locked():
-        assert main(["dev", "cache", "clear", "runs"]) == 0
-    assert contents(capsys)["runs"] == 2
