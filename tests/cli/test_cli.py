@@ -64,7 +64,7 @@ def test_simple_commands_import_no_heavy_modules(words: list[str], unneeded: tup
     ("line", "words"),
     [
         ("su3d-bench re", {"report", "reproduce"}),
-        ("su3d-bench query ", {"text", "ask", "make", "show", "audit", "score"}),
+        ("su3d-bench query ", {"text", "ask", "make", "show", "score"}),
         ("su3d-bench report tables runs/demo --format ", {"text", "markdown", "latex", "csv", "html"}),
         ("su3d-bench run rooms/liv", {"rooms/living0", "rooms/living1"}),
         ("su3d-bench run --scenes re", {"replica/"}),

@@ -56,7 +56,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "sheets pictures": ("out --texts toilet --out heat.svg", 0, "heat.svg"),
     "query text": ("rooms/bathroom0 'plant on shelf' --run out", 0, "opensu3d"),
     "query make": (f"--scenes {PAINTED}/a --per-kind 1 --out queries.toml", 0, "queries.toml"),
-    "query audit": (f"--scenes {PAINTED}/a --n-questions 2 --out audit", 0, "audit/index.html"),
     "query score": ("none.json --answers none.json", 2, "none.json"),
     "query show": ("paper", 0, "904 questions on 13 scenes"),
     "query ask": ("rooms/bathroom0 'What is the largest object?' --run out", 0, "#"),
