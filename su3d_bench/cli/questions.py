@@ -17,7 +17,6 @@ from su3d_bench.core.errors import ConfigError, counted, printable
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
 FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question with --json
 N_SHOWN = 20
@@ -27,11 +26,10 @@ MAX_CHARACTERS = 80
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", _make, data=True)
     parser.option("--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')", required=True)
-    parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", type=output_path, required=True)
+    parser.option("--out FILE", ".toml or .csv file to write", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
     parser.option("--generated", "generate all questions (default: use the dataset's own, if any)")
     parser.shared("--exclude-ids")
-    parser.option("--to", "format to write (default: own)", default=FORMS[0], choices=FORMS)
     parser = add_verb(verbs, "show", _show)
     parser.option(
         "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
@@ -48,42 +46,15 @@ def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
     su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
-    su3d-bench query make --scenes 'rooms/*' --to beacon3d-qa --out metadata_qa.json
+    su3d-bench query make --scenes replica/room0 --generated --out queries.csv
     """
     from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.to != FORMS[0]:
-        _make_beacon3d(arguments)
-        return
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
     output.answer_either(arguments, *_counts(made))
-
-
-def _make_beacon3d(arguments: argparse.Namespace) -> None:
-    """Write a metadata file of Beacon3D about objects of the scenes."""
-    from su3d_bench.cli.scenes import chosen_scenes
-    from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains import made_files
-    from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, scene_objects
-
-    if arguments.exclude_ids is not None or arguments.generated:
-        raise ConfigError("query make: --exclude-ids and --generated need --to own")
-    if arguments.out.suffix != ".json":
-        raise ConfigError(f"query make: --to {arguments.to} writes JSON; use --out FILE.json")
-    objects = {}
-    for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        if scene in objects:
-            raise ConfigError(f"query make: two datasets have a scene '{scene}', this form identifies scenes by name")
-        objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
-        remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
-    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.to) - 1]
-    write_json(arguments.out, content)
-    n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
-    line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
-    output.answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
