@@ -116,7 +116,7 @@ def test_protocols_show_lists_every_rule(capsys: pytest.CaptureFixture[str]) -> 
         ("help run", " run"),
         ("help report tables", " report tables"),
         ("report help", " report"),
-        ("dev cache help", " dev cache"),
+        ("dev registry help", " dev registry"),
     ],
 )
 def test_bare_call_and_help_show_the_help(words: str, prog: str, capsys: pytest.CaptureFixture[str]) -> None:

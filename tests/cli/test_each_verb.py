@@ -81,8 +81,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "datasets new": ("my_dataset.py", 0, "my_dataset.py"),
     "protocols new": ("mine.toml", 0, "mine.toml"),
     "dev registry new": ("my-registry", 0, "my-registry/README.md"),
-    "dev cache list": ("", 0, "perception"),
-    "dev cache clear": ("all --dry-run", 0, "would be removed"),
     "dev completion": ("bash", 0, "complete -o"),
     "dev doctor": ("", 0, "the main job can run"),
     "runs export": ("out --to openlex3d --method opensu3d --out exported", 0, "exported"),
@@ -91,7 +89,7 @@ CASES: dict[str, tuple[str, int, str]] = {
 # These write nothing, so they can be run twice.
 READING = (
     *("compare", "report leaderboard", "runs list", "runs show", "query show", "datasets list", "models list"),
-    *("methods list", "methods show", "protocols list", "protocols show", "protocols diff", "dev cache list"),
+    *("methods list", "methods show", "protocols list", "protocols show", "protocols diff"),
 )
 FINISHED: dict[str, str] = {}  # digests of the run's files by name, after the command run
 

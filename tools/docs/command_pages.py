@@ -53,7 +53,6 @@ MORE = {
     "datasets check": "See [Datasets](datasets.md).",
     "datasets make": "See [Datasets](datasets.md).",
     "models list": "See [Models](methods/models.md).",
-    "dev cache list": "See [Environment](running/environment.md).",
     "dev doctor": "See [Environment](running/environment.md).",
     "dev completion": "See [Environment](running/environment.md).",
 }
