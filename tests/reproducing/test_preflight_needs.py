@@ -9,7 +9,6 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.perception import profiles
-from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import provider_for
 from su3d_bench.reproducing.preflight import Need, preflight
 from su3d_bench.reproducing.recipe import RecipeRequest, asked_runs, load_recipe
@@ -56,8 +55,8 @@ def test_parallel_jobs_depend_on_number_and_memory_of_gpus(
 def test_exported_models_use_the_gpu_if_onnxruntime_can(monkeypatch: pytest.MonkeyPatch) -> None:
     for known, expected in ((["CUDAExecutionProvider"], ("cuda", 1)), ([], ("cpu", 0))):
         monkeypatch.setattr("onnxruntime.get_available_providers", lambda known=known: [*known, "CPUExecutionProvider"])
-        assert provider_for(ModelsConfig(device="cuda"), "cuda:1") == expected
-        assert provider_for(ModelsConfig(), "cpu") == ("cpu", 0)
+        assert provider_for("cuda:1") == expected
+        assert provider_for("cpu") == ("cpu", 0)
 
 
 def test_missing_ram_plus_states_its_replacement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

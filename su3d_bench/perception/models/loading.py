@@ -29,15 +29,14 @@ from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate
 from su3d_bench.perception.models.masks import grounded_sam
 from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
-from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
-from su3d_bench.perception.models.onnx import OnnxManifest, Provider, has_provider, open_session, wrong_files
+from su3d_bench.perception.models.masks.sam import Sam, load_sam
+from su3d_bench.perception.models.onnx import Provider, has_provider, open_session
 
 _log = logging.getLogger(__name__)
-RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
+RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
     "torch": ("torch", "transformers"),
     "open_clip": ("torch", "open_clip"),
-    "onnx": ("onnxruntime", "transformers"),
 }
 
 
@@ -62,8 +61,6 @@ def load_encoder(
     files = encoder_files(config, name)
     for package in PACKAGES_OF_RUNTIME[config.runtime]:
         require(package, f"encoder '{name}'")
-    if config.runtime == "onnx":
-        return _onnx_encoder(config, files, cache, job_index)
     return _torch_encoder(config, files, cache, job_index)
 
 
@@ -100,25 +97,6 @@ def _torch_encoder(
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
-def _onnx_encoder(
-    config: ModelsConfig, files: ModelFiles, cache: FrameCache | None, job_index: int
-) -> FoundationEncoder:
-    provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
-    device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
-    manifest = encoders.EncoderManifest.read(files.weights)
-    if manifest.name != files.entry.name:
-        raise ConfigError(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    spec = encoders.onnx_spec(files, config.transform)
-
-    def identity() -> Mapping[str, Any]:
-        return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
-
-    load_towers = partial(_onnx_towers, files, files.state, provider, device_index, config.batch)
-    device = CPU if provider == "cpu" else f"cuda:{device_index}"
-    tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
-
-
 # A worker creates a new encoder for each method and scene; the towers, which take gigabytes, are cached.
 @lru_cache(maxsize=1)
 def _torch_towers(
@@ -127,11 +105,6 @@ def _torch_towers(
     if runtime == "open_clip":
         return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
     return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
-
-
-@lru_cache(maxsize=1)
-def _onnx_towers(files: ModelFiles, state: object, provider: Provider, device_index: int, batch: int) -> Towers:
-    return encoders.OnnxTowers(files, provider, device_index, batch)
 
 
 def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
@@ -157,22 +130,10 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     # Numbers depend on the kind of device, not on which of several is used.
     digests = [content_key(device.partition(":")[0], precision)]
     digests += [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
-    if config.sam_runtime == "onnx":
-        provider: Provider = models.provider or ("cpu" if device == "cpu" else "cuda")
-        index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
-        digests.append(provider)
-
-        def network() -> SamNetwork:
-            return kept(sam, (provider, str(index)), lambda: load_onnx_sam(sam, provider, index))
-    else:
-
-        def network() -> SamNetwork:
-            return load_sam(sam, device, precision)
-
     return Networks(
         _tagger(config, models, encoder, device),
         lambda: load_grounding_dino(detector, device, precision),
-        lambda: Sam(network()),
+        lambda: Sam(load_sam(sam, device, precision)),
         content_key(*digests),
     )
 
@@ -210,7 +171,7 @@ def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> Mod
 
 
 def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
-    return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+    return _locate(models, config.segmenter, _SAM_FORMS)
 
 
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
@@ -229,20 +190,21 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
             tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
-            provider, index = provider_for(models, device)
+            provider, index = provider_for(device)
             key = [] if provider == "cpu" else [provider]
             load = partial(open_session, files.weights, provider, index)
             return grounded_sam.OnnxRamTagger(load, tags, content_key(*key, *files.digests().values()))
     return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
-def provider_for(models: ModelsConfig, device: str) -> tuple[Provider, int]:
-    """The configured provider and GPU of exported models, otherwise that of ``device`` if onnxruntime has it."""
-    provider = models.provider or ("cpu" if device == CPU else "cuda")
-    if models.provider is None and not has_provider(provider):
+def provider_for(device: str) -> tuple[Provider, int]:
+    """The provider and GPU of the exported RAM++: those of ``device`` if onnxruntime has them, otherwise the CPU."""
+    if device == CPU:
+        return "cpu", 0
+    if not has_provider("cuda"):
         _log.info("exported RAM++ runs on the CPU: this onnxruntime has no CUDA provider")
-        provider = "cpu"
-    return provider, 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
+        return "cpu", 0
+    return "cuda", int(device.partition(":")[2] or 0)
 
 
 def _skip_missing(tagger: str) -> AbstractContextManager[None]:
@@ -286,7 +248,7 @@ def problems_of(files: ModelFiles) -> list[str]:
     problems = files.wrong_digests()
     try:
         if files.form.form == "onnx":
-            return problems + _problems_of_export(files)
+            return problems + grounded_sam.wrong_tagger(files)
         if files.form.form == "transformers":
             if files.entry.kind == "encoder":
                 encoders.transformers_spec(files, "original")
@@ -297,17 +259,6 @@ def problems_of(files: ModelFiles) -> list[str]:
     except (DataError, ModelMissing) as error:
         problems.append(str(error))
     return problems
-
-
-def _problems_of_export(files: ModelFiles) -> list[str]:
-    if files.entry.kind == "tagger":
-        return grounded_sam.wrong_tagger(files)
-    kind: type[OnnxManifest] = encoders.EncoderManifest if files.entry.kind == "encoder" else SamManifest
-    manifest = kind.read(files.weights)
-    wrong = wrong_files(manifest, files.folder)
-    if manifest.name != files.entry.name:
-        wrong.append(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    return wrong
 
 
 def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[str, str]]:

@@ -1,8 +1,6 @@
-"""Encoders with two towers: CLIP and SigLIP through transformers, open_clip if it is installed, or exported.
+"""Encoders with two towers: CLIP and SigLIP through transformers, or open_clip if it is installed.
 
-Preprocessing, batching, normalisation and caching are the same for all. The folder of an exported encoder contains
-``image.onnx``, ``text.onnx`` (and ``.data`` files next to large ones), the tokenizer's files and ``manifest.json`` with
-the spec and the SHA-256 of every file.
+Preprocessing, batching, normalisation and caching are the same for both.
 """
 
 from __future__ import annotations
@@ -11,8 +9,8 @@ import itertools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -28,7 +26,6 @@ from su3d_bench.perception.models import files as model_files
 from su3d_bench.perception.models.encoders.images import Convention, ImageTransform, read_transform
 from su3d_bench.perception.models.encoders.texts import TOKENS_VERSION, TokensKind
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_settings
-from su3d_bench.perception.models.onnx import PROVIDERS, OnnxManifest, Provider, open_session, wrong_files
 
 ENCODER_VERSION = "1"
 # 65,536 features of 1024 numbers take 256 MB.
@@ -96,8 +93,6 @@ class FoundationEncoder:
         Features then differ only by rounding, and texts of one may be compared with images of the other.
         """
         known = dict(self._identity())
-        if "provider" in known:
-            return any(digest == self._digest_of(known | {"provider": name}) for name in PROVIDERS)
         kinds = itertools.product(("cpu", "cuda"), ("float32", "float16", "bfloat16"))
         return any(digest == self._digest_of(known | {"device": d, "precision": p}) for d, p in kinds)
 
@@ -363,40 +358,3 @@ class OpenClipTowers(TorchTowers):
         # 30 MB per image in float32: about four times ViT-H-14's widest layer
         super().__init__(model, device, precision, batch, 7_500_000)
         self.encode_image, self.encode_text = model.encode_image, model.encode_text
-
-
-# ---- ONNX
-
-IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"
-GPU_BATCH = 32
-
-
-class EncoderManifest(OnnxManifest):
-    """The manifest of an exported encoder."""
-
-    FORMAT = "su3d-bench onnx encoder 1"
-    REQUIRES = (IMAGE_FILE, TEXT_FILE)
-
-    spec: EncoderSpec
-
-
-def onnx_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """The spec in the manifest, with images prepared according to ``convention``."""
-    spec = EncoderManifest.read(files.weights).spec
-    return replace(spec, transform=replace(spec.transform, convention=convention))
-
-
-class OnnxTowers:
-    """The towers of an exported encoder, each loaded at its first use."""
-
-    def __init__(self, files: ModelFiles, provider: Provider, device_index: int, batch: int) -> None:
-        if wrong := wrong_files(EncoderManifest.read(files.weights), files.folder):
-            raise DataError(wrong[0])
-        self._session = cache(lambda name: open_session(files.folder / name, provider, device_index))
-        self.batch = batch or (1 if provider == "cpu" else GPU_BATCH)
-
-    def image_features(self, pixels: Float32Array) -> Float32Array:
-        return np.asarray(self._session(IMAGE_FILE).run(["features"], {"pixels": pixels})[0], np.float32)
-
-    def text_features(self, tokens: Int64Array) -> Float32Array:
-        return np.asarray(self._session(TEXT_FILE).run(["features"], {"tokens": tokens})[0], np.float32)

@@ -25,14 +25,22 @@ from su3d_bench.perception.cache import CropsOnDemand, LastFrameCache, content_k
 from su3d_bench.perception.embedded.lexicon import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
-from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
+from su3d_bench.perception.models.files import (
+    ModelFiles,
+    bounded,
+    checked,
+    file_sha256,
+    read_settings,
+    read_weights,
+    what_to_fetch,
+)
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 
 RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
+RAM_FORMAT = "su3d-bench onnx tagger 1"  # of the manifest
 # Tensors that the network computes itself from its window size; the authors' loader drops them too.
 RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
 WORDS_CAVEAT = "tags: RAM++ is not installed; using the most probable words of a list by the encoder instead"
@@ -111,17 +119,29 @@ class OnnxRamTagger:
         return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
 
 
-class RamManifest(OnnxManifest):
-    """The manifest of an exported RAM++."""
-
-    FORMAT = "su3d-bench onnx tagger 1"
-    REQUIRES = (RAM_MODEL, RAM_TAG_LIST)
+def exported_files(manifest: Path) -> dict[str, str]:
+    """SHA-256 by file name, from the manifest of an exported RAM++; raises ``DataError`` for anything else."""
+    content = read_settings(manifest)
+    if (layout := content.get("format")) != RAM_FORMAT:
+        raise DataError(f"{manifest}: format is {str(layout)[:60]!r}; expected {RAM_FORMAT!r}; export it again")
+    files = checked(dict[str, str], content.get("files") or {}, f"{manifest}: files")
+    if any(Path(name).name != name for name in files) or not {RAM_MODEL, RAM_TAG_LIST} <= set(files):
+        needed = f"{RAM_MODEL} and {RAM_TAG_LIST}"
+        raise DataError(f"{manifest}: files must be names inside the folder, including {needed}; export it again")
+    return files
 
 
 def wrong_tagger(files: ModelFiles) -> list[str]:
-    """One line per invalid file of an exported RAM++; an export without a manifest cannot be checked."""
+    """One line per file of an exported RAM++ that is missing or differs from the exported one; an export without a
+    manifest cannot be checked."""
     path = files.folder / ONNX_MANIFEST
-    return wrong_files(RamManifest.read(path), files.folder) if is_file(path) else []
+    wrong = []
+    for name, digest in exported_files(path).items() if is_file(path) else ():
+        if not (place := files.folder / name).is_file():
+            wrong.append(f"{place}: is missing; export it again")
+        elif file_sha256(place) != digest:
+            wrong.append(f"{place}: does not match the manifest; export it again")
+    return wrong
 
 
 class WordTagger:
