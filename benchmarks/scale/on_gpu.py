@@ -35,7 +35,6 @@ from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.system.devices import device_for, make_deterministic
 from su3d_bench.core.system.timing import synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
-from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
@@ -102,12 +101,8 @@ def similarities() -> Iterator[Comparison]:
 
 
 def encoders(folder: Path) -> Iterator[Comparison]:
-    """The embedded encoder, and a small CLIP by torch in two precisions and by ONNX Runtime."""
+    """A small CLIP by torch in two precisions."""
     images = noise_images(32)
-
-    def embedded(device: str) -> Callable[[], Arrays]:
-        encoder = EmbeddedEncoder(device=device)
-        return lambda: (encoder.encode_images(images), encoder.encode_texts(TEXTS))
 
     write_tiny_clip(folder / CLIP)
 
@@ -121,7 +116,6 @@ def encoders(folder: Path) -> Iterator[Comparison]:
 
         return on
 
-    yield Comparison("embedded encoder, 32 images", embedded, 1e-4)
     yield Comparison("CLIP by torch, float32, 32 images", clip(precision="float32"), 1e-4)
     yield Comparison("CLIP by torch, float16 (the CPU: float32), 32 images", clip(precision="float16"), 2e-2)
 
