@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -195,9 +194,7 @@ def _models(run: RecipeRun) -> Iterator[Need]:
 
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
-    forms: tuple[FormName, ...] | None = None
-    if name == TAGGER:  # its original checkpoint requires its own package
-        forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
+    forms: tuple[FormName, ...] | None = ("onnx",) if name == TAGGER else None
     place = config.models.paths.get(name), config.models.folder
     remark = "" if is_required else f"replaced by the {config.paper.n_tags} most likely words of a list, by the encoder"
     try:
@@ -205,7 +202,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
         how = f"su3d-bench models fetch {'--profile paper' if name in FETCHED_FOR_PAPER else name}"
-        how += ", then tools/export_onnx.py ram-plus" if forms == ("onnx",) else ""
+        how += ", then tools/export_onnx.py ram-plus" if forms else ""
         return Need("model", name, is_available=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_available=True, n_bytes=0.0, remark=str(files.folder))
 

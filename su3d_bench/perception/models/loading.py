@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, FormName, ModelEntry, model_entry
-from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig, Runtime
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.models.encoders import encoder as encoders
-from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
-from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
-from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate, read_settings, read_weights
+from su3d_bench.perception.models.encoders.encoder import FoundationEncoder, Towers
+from su3d_bench.perception.models.encoders.texts import read_tokeniser
+from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
 from su3d_bench.perception.models.masks import grounded_sam
 from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
@@ -33,11 +32,7 @@ from su3d_bench.perception.models.masks.sam import Sam, load_sam
 from su3d_bench.perception.models.onnx import Provider, has_provider, open_session
 
 _log = logging.getLogger(__name__)
-RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip"}
-PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
-    "torch": ("torch", "transformers"),
-    "open_clip": ("torch", "open_clip"),
-}
+PACKAGES = ("torch", "transformers")
 
 
 def load_encoder(
@@ -52,14 +47,9 @@ def load_encoder(
     if name == EMBEDDED:
         from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
-        if config.runtime != "torch":
-            raise ConfigError(
-                f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; choose "
-                "perception.models.encoder or --profile paper"
-            )
         return EmbeddedEncoder(device=device_for(config.device, job_index))
     files = encoder_files(config, name)
-    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+    for package in PACKAGES:
         require(package, f"encoder '{name}'")
     return _torch_encoder(config, files, cache, job_index)
 
@@ -67,14 +57,14 @@ def load_encoder(
 def check_encoder(config: ModelsConfig, name: str) -> None:
     """Raises the errors of ``load_encoder`` for packages and files of encoder ``name``; nothing is imported or read."""
     encoder_files(config, name)
-    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+    for package in PACKAGES:
         require_installed(package, f"encoder '{name}'")
 
 
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
-    """The files of encoder ``name`` in the form that the configured runtime reads."""
+    """The files of encoder ``name``."""
     model_entry(name, "encoder")
-    return locate(name, (RUNTIME_FORM[config.runtime],), path=config.paths.get(name), folder=config.folder)
+    return locate(name, ("transformers",), path=config.paths.get(name), folder=config.folder)
 
 
 def _torch_encoder(
@@ -82,37 +72,24 @@ def _torch_encoder(
 ) -> FoundationEncoder:
     device = device_for(config.device, job_index)
     precision = precision_for(config.precision, device)
-    load_towers = partial(_torch_towers, files, files.state, config.runtime, device, precision, config.batch)
+    load_towers = partial(_torch_towers, files, files.state, device, precision, config.batch)
 
     def identity() -> Mapping[str, Any]:
         kind = device.partition(":")[0]
-        return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
+        return {"runtime": "torch", "files": files.digests(), "precision": precision, "device": kind}
 
-    if config.runtime == "open_clip":
-        spec = encoders.open_clip_spec(files, config.transform)
-        tokeniser: Callable[[], Tokeniser] = partial(encoders.open_clip_tokeniser, files)
-    else:
-        spec = encoders.transformers_spec(files, config.transform)
-        tokeniser = _tokeniser_of(files, spec)
+    spec = encoders.transformers_spec(files, config.transform)
+    tokeniser = partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 # A worker creates a new encoder for each method and scene; the towers, which take gigabytes, are cached.
 @lru_cache(maxsize=1)
-def _torch_towers(
-    files: ModelFiles, state: object, runtime: Runtime, device: str, precision: str, batch: int
-) -> Towers:
-    if runtime == "open_clip":
-        return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
+def _torch_towers(files: ModelFiles, state: object, device: str, precision: str, batch: int) -> Towers:
     return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
 
 
-def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
-    return partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)
-
-
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
-PACKAGES = ("torch", "transformers")
 _SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
 
 
@@ -150,10 +127,7 @@ def is_front_end_available(config: PaperConfig, models: ModelsConfig) -> bool:
 def check_front_end(config: PaperConfig, models: ModelsConfig) -> None:
     """Raises ``ModelMissing`` for the first missing package or file; nothing heavy is imported or read."""
     _check_networks(config, models)
-    if config.tagger == "ram":
-        require_installed("ram", "tagger 'ram'")
-        _locate(models, TAGGER, ("original",))
-    elif config.tagger == "ram-onnx":
+    if config.tagger == "ram-onnx":
         _locate(models, TAGGER, ("onnx",))
 
 
@@ -176,14 +150,6 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
 
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The configured tagger, or with ``auto`` the first that is available."""
-    if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
-        with _skip_missing(config.tagger):
-            require("ram", "tagger 'ram'")
-            files = _locate(models, TAGGER, ("original",))
-            digests = [text for pair in sorted(files.digests().items()) for text in pair]
-            # RAM++'s own code mixes in float32, so it runs in float32 on every device.
-            load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
-            return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         with _skip_missing(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
