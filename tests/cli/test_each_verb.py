@@ -69,7 +69,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "methods show": ("opensu3d", 0, "opensu3d"),
     "models list": ("", 0, "clip-vit-h-14"),
     "models check": ("clip-vit-h-14", 1, "clip-vit-h-14"),
-    "models warm": ("--profile embedded", 0, ""),
     "models fetch": ("sam-vit-h --dry-run", 0, "sam_vit_h_4b8939.pth"),
     "datasets fetch replica": ("frames --dry-run", 0, "Replica.zip"),
     "datasets fetch scannet": ("", 2, "ScanNet_TOS.pdf"),

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import CPU, device_for, precision_for, require, require_installed
-from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, FormName, ModelEntry, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
@@ -178,9 +173,6 @@ def _skip_missing(tagger: str) -> AbstractContextManager[None]:
     return suppress(ModelMissing) if tagger == "auto" else nullcontext()
 
 
-WARM_TEXT = "a chair in a scene"
-
-
 @dataclass(frozen=True)
 class ModelState:
     """A model of the catalogue and its forms on this machine; if there is none, ``missing`` names what to download."""
@@ -231,87 +223,3 @@ def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[
     """For a run's record: the SHA-256 of every file of the installed models ``names``, by model and file name."""
     states = [model_state(model_entry(name), config.paths.get(name), config.folder) for name in dict.fromkeys(names)]
     return {state.entry.name: state.files[0].digests() for state in states if state.files}
-
-
-@dataclass(frozen=True)
-class WarmUp:
-    """The cost of loading and running something once: ``stages_ms`` of the run, peak ``memory_mb``.
-
-    ``memory_of``: ``cuda:0`` for torch's memory there, ``process`` for the whole process in main memory.
-    """
-
-    what: str
-    load_s: float
-    run_s: float
-    stages_ms: dict[str, float]
-    memory_mb: float
-    memory_of: str
-    digest: str
-
-
-def warm_encoder(encoder: Encoder, device: str) -> WarmUp:
-    """Load the towers of ``encoder`` and run them on one image and one text."""
-    images = [warm_frame().rgb]
-
-    def load() -> None:
-        encoder.encode_images(images)
-        encoder.encode_texts([WARM_TEXT])
-
-    return _warmed(encoder.name, device, load, lambda _: encoder.encode_images(images), lambda: encoder.digest)
-
-
-def warm_perception(perception: Any, device: str) -> WarmUp:
-    """Run ``perception`` of a built profile on one synthetic frame twice: loading, then running."""
-    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))  # S_r of the paper
-    frame = warm_frame()
-
-    def run(timer: Timer) -> None:
-        perception.detect(frame, needs, timer)
-
-    return _warmed(perception.profile, device, lambda: run(Timer()), run, lambda: perception.digest)
-
-
-def _warmed(
-    what: str, device: str, load: Callable[[], object], run: Callable[[Timer], object], digest: Callable[[], str]
-) -> WarmUp:
-    if device != "cpu":
-        import torch
-
-        torch.cuda.reset_peak_memory_stats(device)
-    start = time.perf_counter()
-    load()
-    loaded = time.perf_counter()
-    timer = Timer()
-    run(timer)
-    run_s = time.perf_counter() - loaded
-    memory_mb, memory_of = _peak_memory(device)
-    stages = {name: round(ms, 3) for name, ms in timer.take().items()}
-    return WarmUp(what, loaded - start, run_s, stages, memory_mb, memory_of, digest())
-
-
-def warm_scene() -> SceneInfo:
-    """The scene of ``warm_frame``."""
-    return SceneInfo("warm", "frame", 1, 1, "camera")
-
-
-def warm_frame() -> Frame:
-    """A synthetic frame (480, 640): three coloured boxes in front of a wall."""
-    rgb = np.full((480, 640, 3), 205, np.uint8)
-    depth_m = np.full((480, 640), 3.0, np.float32)
-    for left, colour, distance_m in ((60, (190, 40, 40), 2.0), (260, (50, 140, 60), 2.3), (460, (40, 60, 180), 2.6)):
-        rgb[180:380, left : left + 120] = colour
-        depth_m[180:380, left : left + 120] = distance_m
-    intrinsics = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
-    return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics)
-
-
-def _peak_memory(device: str) -> tuple[float, str]:
-    if device != "cpu":
-        import torch
-
-        return torch.cuda.max_memory_allocated(device) / 1e6, device
-    import resource
-    import sys
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB on Linux, bytes on macOS
-    return peak / (1e6 if sys.platform == "darwin" else 1e3), "process"
