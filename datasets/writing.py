@@ -1,8 +1,7 @@
-"""Generated rooms, written as files in another dataset's layout: atomic, and resumable after a kill.
+"""Generated rooms, written as files in another dataset's layout; a scene appears when it is complete.
 
-A scene is built in a hidden folder next to its destination and moved there when complete; a killed process leaves
-frames that the next one reuses, and no incomplete scene. ``rooms.json`` in the folder of the scenes lists those
-that were generated here, each with the key of its inputs.
+A scene is built in a temporary folder next to its destination, which is renamed at the end. ``rooms.json`` in the
+folder of the scenes lists those that were generated here, each with the key of its inputs.
 """
 
 from __future__ import annotations
@@ -10,15 +9,15 @@ from __future__ import annotations
 import os
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json, write_text
-from su3d_bench.core.files.locks import clear_unfinished
+from su3d_bench.core.files.atomic import make_folder, write_error, write_json, write_text
+from su3d_bench.core.files.locks import publish, unfinished_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.recordings.file_dataset import MARKER, read_marker
@@ -31,30 +30,19 @@ if TYPE_CHECKING:
 class SceneTarget:
     """A scene to generate, under the ``key`` of its inputs.
 
-    ``folder`` is named after the scene. ``frames`` is the path in it that contains the frames; if that
-    is a single file, it is written atomically. ``truth``: other files required for completeness. ``apart``:
-    files and folders with a destination outside ``folder``, each with its name while the scene is built.
+    ``folder`` is named after the scene. ``files``: what a complete scene has. ``apart``: files and folders with a
+    destination outside ``folder``, each with its name while the scene is built.
     """
 
     scene: str
     key: str
     folder: Path
-    frames: str
-    truth: tuple[Path, ...] = ()
+    files: tuple[Path, ...]
     apart: tuple[tuple[str, Path], ...] = ()
 
     @property
-    def partial(self) -> Path:
-        """Where the scene is built; named by the key, so that frames from other inputs are never reused."""
-        return self.folder.with_name(f".{self.folder.name}.{self.key[:12]}.partial")
-
-    @property
-    def has_frames(self) -> bool:
-        return (self.folder / self.frames).exists() or (self.partial / self.frames).is_file()
-
-    @property
     def is_whole(self) -> bool:
-        return all(path.exists() for path in (self.folder / self.frames, *self.truth))
+        return all(path.exists() for path in self.files)
 
 
 class Layout(ABC):
@@ -83,19 +71,14 @@ class Layout(ABC):
         """Write the files shared by all scenes; a ``StoreError`` if they exist with other content."""
 
     @abstractmethod
-    def frame_names(self, index: int) -> Sequence[str]:
-        """The files of a frame, relative to the folder in which the scene is built."""
+    def write_frames(
+        self, frames: Iterator[Frame], dataset: GeneratedScenes, target: SceneTarget, folder: Path
+    ) -> None:
+        """Write the files of all frames into ``folder``."""
 
     @abstractmethod
-    def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        """The content of each of ``frame_names``."""
-
-    @abstractmethod
-    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
-        """Write all files except those of the frames into ``target.partial``."""
-
-    def join(self, dataset: GeneratedScenes, target: SceneTarget) -> None:  # noqa: B027 - most have one file per frame
-        """Create in ``target.partial`` the file for all frames; called after everything else is written."""
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget, folder: Path) -> None:
+        """Write all files except those of the frames into ``folder``."""
 
 
 def plan_scenes(layout: Layout, dataset: GeneratedScenes, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
@@ -126,9 +109,6 @@ def plan_scenes(layout: Layout, dataset: GeneratedScenes, scenes: Sequence[str],
     marked = marked | {target.folder.name: target.key for target in targets}
     marker = {"generator": f"su3d-bench {dataset.name}", "version": layout.settings[0]}
     write_json(folder / MARKER, marker | {"scenes": dict(sorted(marked.items()))})
-    for target in pending:
-        for folder in (target.partial, *(path for path in target.partial.rglob("*") if path.is_dir())):
-            clear_unfinished(folder)
     return pending
 
 
@@ -139,49 +119,31 @@ def write_shared_text(path: Path, text: str, complaint: str) -> None:
     write_text(path, text)
 
 
-def write_frames(
+def write_scene(
     layout: Layout,
     dataset: GeneratedScenes,
     target: SceneTarget,
-    indices: range,
     report: Callable[[int], None] = lambda n_done: None,
 ) -> None:
-    """The files of the frames at ``indices``; those written by an earlier process are kept."""
-    if target.has_frames:
-        return
-    for folder in {(target.partial / name).parent: None for name in layout.frame_names(0)}:
-        make_folder(folder)
-    frames = dataset.frames(target.scene, 1)
-    for n_done, index in enumerate(indices, 1):
-        paths = [target.partial / name for name in layout.frame_names(index)]
-        if not all(path.exists() for path in paths):
-            for path, content in zip(paths, layout.frame_files(frames[index]), strict=True):
-                write_bytes(path, content)
-        report(n_done)
+    """Write a scene and move it to its destination, its folder last, so that only complete scenes appear."""
 
+    def frames() -> Iterator[Frame]:
+        for n_done, frame in enumerate(dataset.frames(target.scene, 1), 1):
+            yield frame
+            report(n_done)
 
-def finish_scene(layout: Layout, dataset: GeneratedScenes, target: SceneTarget) -> None:
-    """Move everything to its destination, the scene's folder last, so that only complete scenes appear."""
     try:
-        layout.join(dataset, target)
-        for name, place in target.apart:
-            if place.is_dir():
-                shutil.rmtree(place)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(target.partial / name, place)
-        if target.folder.exists():
-            _add_files(target.partial, target.folder)
-        else:
-            os.replace(target.partial, target.folder)
-        for leftover in target.folder.parent.glob(f".{target.folder.name}.*.partial"):
-            shutil.rmtree(leftover)
+        with unfinished_folder(target.folder) as folder:
+            layout.write_frames(frames(), dataset, target, folder)
+            layout.write_truth(dataset, target, folder)
+            for name, place in target.apart:
+                if place.is_dir():
+                    shutil.rmtree(place)
+                place.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(folder / name, place)
+            if target.folder.exists():  # with files missing
+                shutil.copytree(folder, target.folder, dirs_exist_ok=True)
+            else:
+                publish(folder, target.folder)
     except OSError as error:
-        raise StoreError(f"cannot write {target.folder}: {error.strerror or error}") from error
-
-
-def _add_files(source: Path, folder: Path) -> None:
-    """Move every file below ``source`` to the same place below ``folder``."""
-    for path in sorted(path for path in source.rglob("*") if path.is_file()):
-        place = folder / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(path, place)
+        raise write_error(target.folder, error) from error

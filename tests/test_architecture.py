@@ -28,7 +28,7 @@ from places import ROOT
 
 CODE = [path for module, path in code_files().items() if module.startswith("su3d_bench")]
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
-LATE = ("compiled.py", "torch_towers.py")  # imported lazily as a whole, like kernels
+LATE = ("compiled.py",)  # imported lazily as a whole, like kernels
 
 
 def test_folders_form_at_most_ten_layers_without_a_cycle() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch_towers import ImageTower, TextTower
 from training_captions import (
     Caption,
     TruthTable,
@@ -26,7 +27,6 @@ from training_crops import CropSet
 
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.embedded.lexicon import PADDING, token_ids
-from su3d_bench.perception.embedded.torch_towers import ImageTower, TextTower
 
 logger = logging.getLogger(__name__)
 

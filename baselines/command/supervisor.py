@@ -31,7 +31,7 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 
 
 def main(answers: int) -> None:
-    # Detached from its parent: Ray and others kill the children of a worker, or whole process trees.
+    # Detached from its parent: some schedulers kill the children of a worker, or whole process trees.
     if os.fork() > 0:
         os._exit(0)
     # Killing all processes of a job (as closing a terminal does) must not leave the program without its supervisor.

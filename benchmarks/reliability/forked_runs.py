@@ -43,7 +43,6 @@ SUBJECTS["program"] = (
 EXECUTORS = {
     "inline": ("--jobs", "1"),
     "processes": ("--jobs", "2"),
-    "ray": ("--executor", "ray", "--jobs", "2"),
 }
 PROGRAM_FIELDS = ("info: program: ", "info: the program took ")
 TIMES = ("_ms", "rss_bytes")

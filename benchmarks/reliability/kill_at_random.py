@@ -16,7 +16,7 @@ and leftovers, files and folders without an owner once the same command has comp
 
 Each run is forked from a process with loaded modules, so that kills hit the work, not the start.
 ``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run, ``worker`` kills
-one worker of a run. With ray, the workers are those of a cluster that is started here and outlives the runs.
+one worker of a run.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -53,13 +52,12 @@ from measured import write_measured
 RUNS = {
     "inline": (None, "inline"),
     "processes": (None, "processes"),
-    "ray": (None, "ray"),
     "program": ("program", "inline"),
     "programs": ("program", "processes"),
 }
-VICTIMS = {"inline": ("group", "driver"), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
+VICTIMS = {"inline": ("group", "driver"), "processes": ("group", "driver", "worker")}
 # Shares of the kills: a run in workers takes much longer.
-SHARES = dict.fromkeys(VERBS, 2) | {"inline": 8, "processes": 3, "ray": 2, "program": 4, "programs": 2}
+SHARES = dict.fromkeys(VERBS, 2) | {"inline": 8, "processes": 3, "program": 4, "programs": 2}
 COLUMNS = (
     "kills", "of a group", "of a driver", "of a worker", "SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "power cuts",
     "files corrupted", "compared",
@@ -72,44 +70,11 @@ NOTE = (
 )
 
 
-class Cluster:
-    """A Ray cluster of two machines on this one, the second of which takes jobs; a separate process runs it."""
-
-    CODE = (
-        "import sys; from ray.cluster_utils import Cluster\n"
-        "small = {'object_store_memory': 80_000_000, 'include_dashboard': False}\n"
-        "made = Cluster(initialize_head=True, head_node_args={'num_cpus': 0, **small})\n"
-        "made.add_node(num_cpus=2, **small); print(made.address, flush=True); sys.stdin.read(); made.shutdown()"
-    )
-
-    def __init__(self) -> None:
-        words = [sys.executable, "-c", self.CODE]
-        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdout is not None
-        output = iter(self._process.stdout.readline, "")
-        self.address = next(line.strip() for line in output if line.startswith("127.") or line[:1].isdigit())
-        self.pid = self._process.pid
-
-    def processes(self) -> list[int]:
-        """All processes of the cluster, which end with it."""
-        import psutil
-
-        return [one.pid for one in psutil.Process(self.pid).children(recursive=True)]
-
-    def close(self) -> None:
-        self._process.communicate("")
-
-
 class Trial:
     """Runs of one kind: the undisturbed one, and as many killed ones as requested."""
 
-    def __init__(
-        self, scratch: Path, subject: str, executor: str, cluster: Cluster | None, seed: str, tally: Tally
-    ) -> None:
+    def __init__(self, scratch: Path, subject: str, executor: str, seed: str, tally: Tally) -> None:
         self._request = (*SUBJECTS[subject], *EXECUTORS[executor])
-        if cluster is not None:
-            self._request += ("--ray-address", cluster.address)
-        self._cluster = cluster
         self._scratch, self._executor, self._tally = scratch, executor, tally
         self._moments = random.Random(f"{seed} {tally.name}")
         self._cache, self._temporary = scratch / "cache", scratch.parent / "temporary"
@@ -128,7 +93,7 @@ class Trial:
         if outcome(scratch / "timed") != self.expected:
             raise SystemExit("two undisturbed runs differ; killed ones cannot be compared")
         shutil.rmtree(scratch / "timed")
-        self._kept = {path.name for path in self._temporary.iterdir()}  # as for a cluster
+        self._kept = {path.name for path in self._temporary.iterdir()}
 
     def _ready(self) -> Path:
         """A map for the program to write."""
@@ -154,8 +119,7 @@ class Trial:
         victim, sent = self._moments.choice(VICTIMS[self._executor]), self._moments.choice(SIGNALS)
         run = Run(folder, self._request)
         time.sleep(self._moments.uniform(0, self._whole_s))
-        above = run.pid if self._cluster is None else self._cluster.pid
-        was_hit = kill(run, victim, sent, workers_below(above) if victim == "worker" else (), self._moments)
+        was_hit = kill(run, victim, sent, workers_below(run.pid) if victim == "worker" else (), self._moments)
         code = end_of(run, self._tally) if was_hit else run.finish()
         if not was_hit:
             self._tally.done["nobody there"] += 1
@@ -178,9 +142,8 @@ class Trial:
         return True
 
     def _end_orphans(self) -> None:
-        spared = () if self._cluster is None else (self._cluster.pid, *self._cluster.processes())
         for place in (self._scratch, self._temporary):
-            end_orphans(place, self._tally, spared)
+            end_orphans(place, self._tally)
 
     def _lock(self, folder: Path) -> None:
         from su3d_bench.core.errors import StoreError
@@ -231,9 +194,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scratch = Path(place)
         (scratch / "temporary").mkdir()
         os.environ["TMPDIR"] = tempfile.tempdir = str(scratch / "temporary")
-        for name, (subject, _) in RUNS.items():
+        for name, (subject, executor) in RUNS.items():
             if name in tallies:
-                try_runs(scratch / name, subject or given.subject, counts[name], given.seed, tallies[name])
+                (scratch / name).mkdir()
+                trial = Trial(scratch / name, subject or given.subject, executor, given.seed, tallies[name])
+                trial.kills(counts[name])
         of_verbs = {name: counts[name] for name in VERBS if name in tallies}
         if of_verbs:
             load_verbs()
@@ -252,17 +217,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         columns = ["killed", *COLUMNS, *COUNTED]
         write_measured(given.json, "Runs and verbs killed at random", command, columns, rows, [NOTE])
     return 0 if all(tally.is_clean for tally in tallies.values()) else 1
-
-
-def try_runs(scratch: Path, subject: str, n: int, seed: str, tally: Tally) -> None:
-    scratch.mkdir()
-    executor = RUNS[tally.name][1]
-    cluster = Cluster() if executor == "ray" else None
-    try:
-        Trial(scratch, subject, executor, cluster, seed, tally).kills(n)
-    finally:
-        if cluster is not None:
-            cluster.close()
 
 
 if __name__ == "__main__":

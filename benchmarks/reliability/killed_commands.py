@@ -71,7 +71,7 @@ class VerbTrial:
         self._moments = random.Random(f"{seed} {name}")
         self._place, self._log, self._temporary = scratch / "place", scratch / "log", scratch.parent / "temporary"
         scratch.mkdir()
-        self._kept = {path.name for path in self._temporary.iterdir()}  # as left by a finished Ray cluster
+        self._kept = {path.name for path in self._temporary.iterdir()}
         found = [self._undisturbed() for _ in range(2)]
         if found[0] != found[1]:
             raise SystemExit(f"two undisturbed results of {name} differ; killed ones cannot be compared")

@@ -17,7 +17,7 @@ from forked_runs import ForkedProcess
 
 # The signal that cannot be handled, and those of a terminal, a scheduler and a user.
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
-WORKER_COMMANDS = ("spawn_main", "ray::_on_node")  # in the command lines of workers
+WORKER_COMMAND = "spawn_main"  # in the command line of a worker
 GRACE_S = 5.0  # until the children of a killed process must have ended
 MAX_S = 120.0  # until a process that received a signal it can handle must have ended
 LAST_SECOND_NS = 1_000_000_000
@@ -68,7 +68,7 @@ def workers_below(pid: int) -> list[int]:
 
     with contextlib.suppress(psutil.NoSuchProcess):
         children = psutil.Process(pid).children(recursive=True)
-        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in WORKER_COMMANDS)]
+        return [one.pid for one in children if WORKER_COMMAND in " ".join(one.cmdline())]
     return []
 
 
@@ -108,10 +108,10 @@ def check_end(run: ForkedProcess, code: int, sent: signal.Signals, usual: Collec
         tally.fault(f"showed a traceback after {sent.name}: {run.output()}")
 
 
-def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None:
+def end_orphans(place: Path, tally: Tally) -> None:
     """Count and kill processes that work below ``place``, after giving ending ones time to finish."""
     limit = time.monotonic() + GRACE_S
-    while (found := _working_below(place, spared)) and time.monotonic() < limit:
+    while (found := _working_below(place)) and time.monotonic() < limit:
         time.sleep(0.05)
     for pid, words in found:
         tally.orphan(f"still runs after {GRACE_S:.0f} s: {words}")
@@ -119,14 +119,14 @@ def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None
             os.kill(pid, signal.SIGKILL)
 
 
-def _working_below(place: Path, spared: Collection[int]) -> list[tuple[int, str]]:
+def _working_below(place: Path) -> list[tuple[int, str]]:
     """Other processes whose working folder, or a word of whose command line, is below ``place``."""
     import psutil
 
     found = []
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error, OSError):
-            if process.pid in (os.getpid(), *spared) or process.status() == psutil.STATUS_ZOMBIE:
+            if process.pid == os.getpid() or process.status() == psutil.STATUS_ZOMBIE:
                 continue
             words = process.cmdline()
             if any(str(place) in text for text in (os.readlink(f"/proc/{process.pid}/cwd"), *words)):

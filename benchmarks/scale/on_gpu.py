@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
 from tiny_models import DINO_PX, SAM_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
@@ -36,9 +35,7 @@ from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.system.devices import device_for, make_deterministic
 from su3d_bench.core.system.timing import synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
-from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
@@ -104,15 +101,10 @@ def similarities() -> Iterator[Comparison]:
 
 
 def encoders(folder: Path) -> Iterator[Comparison]:
-    """The embedded encoder, and a small CLIP by torch in two precisions and by ONNX Runtime."""
+    """A small CLIP by torch in two precisions."""
     images = noise_images(32)
 
-    def embedded(device: str) -> Callable[[], Arrays]:
-        encoder = EmbeddedEncoder(device=device)
-        return lambda: (encoder.encode_images(images), encoder.encode_texts(TEXTS))
-
     write_tiny_clip(folder / CLIP)
-    export_encoder(locate(CLIP, ("transformers",), folder=folder), folder / f"{CLIP}-onnx")
 
     def clip(**settings: Any) -> Callable[[str], Callable[[], Arrays]]:
         def on(device: str) -> Callable[[], Arrays]:
@@ -124,10 +116,8 @@ def encoders(folder: Path) -> Iterator[Comparison]:
 
         return on
 
-    yield Comparison("embedded encoder, 32 images", embedded, 1e-4)
     yield Comparison("CLIP by torch, float32, 32 images", clip(precision="float32"), 1e-4)
     yield Comparison("CLIP by torch, float16 (the CPU: float32), 32 images", clip(precision="float16"), 2e-2)
-    yield Comparison("CLIP by ONNX Runtime, 32 images", clip(runtime="onnx"), 1e-4)
 
 
 def networks(folder: Path) -> Iterator[Comparison]:

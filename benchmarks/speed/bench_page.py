@@ -1,8 +1,7 @@
-"""Time to create the page of a run the first time, and again from the cache: two small rooms, one method."""
+"""Time to create the page of a run: two small rooms, one method."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import pytest
 
 from su3d_bench.analysis.page.contents import Contents, PageOptions, page_contents
-from su3d_bench.analysis.page.page_cache import FOLDER
 from su3d_bench.cli.main import main
 
 GROUP = "page of two small rooms"
@@ -35,13 +33,6 @@ def contents(run: Path) -> Contents:
 
 
 @pytest.mark.benchmark(group=GROUP)
-def test_first(benchmark: Any, run: Path) -> None:
+def test_page(benchmark: Any, run: Path) -> None:
     expected = contents(run)
-    found = benchmark.pedantic(contents, (run,), setup=lambda: shutil.rmtree(run / FOLDER), rounds=3, iterations=1)
-    assert found == expected
-
-
-@pytest.mark.benchmark(group=GROUP)
-def test_again(benchmark: Any, run: Path) -> None:
-    expected = contents(run)
-    assert benchmark(contents, run) == expected
+    assert benchmark.pedantic(contents, (run,), rounds=3, iterations=1) == expected

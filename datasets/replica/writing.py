@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,8 +45,8 @@ class ReplicaLayout(Layout):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         folder, mesh = out / RENDER_FOLDER / scene, out / RENDER_FOLDER / f"{scene}_mesh.ply"
         original = out / ORIGINAL_FOLDER / original_name(scene)
-        truth = (mesh, original / MESH_NAME, original / INFO_NAME)
-        return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
+        files = (folder / "results", folder / "traj.txt", mesh, original / MESH_NAME, original / INFO_NAME)
+        return SceneTarget(scene, key, folder, files, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
 
     def write_shared(self, dataset: GeneratedScenes, scene: str, out: Path) -> None:
         make_folder(out / ORIGINAL_FOLDER)
@@ -57,23 +57,26 @@ class ReplicaLayout(Layout):
         complaint = f"differs from the camera of {dataset.name} ({width}x{height})"
         write_shared_text(out / RENDER_FOLDER / "cam_params.json", text, complaint)
 
-    def frame_names(self, index: int) -> Sequence[str]:
-        return colour_name(index), depth_name(index)
+    def write_frames(
+        self, frames: Iterator[Frame], dataset: GeneratedScenes, target: SceneTarget, folder: Path
+    ) -> None:
+        make_folder(folder / "results")
+        for frame in frames:
+            depth = images.depth_in_units(frame.depth_m, DEPTH_SCALE)
+            (folder / colour_name(frame.index)).write_bytes(images.jpeg_bytes(frame.rgb))
+            (folder / depth_name(frame.index)).write_bytes(images.png_bytes(depth))
 
-    def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        return images.jpeg_bytes(frame.rgb), images.png_bytes(images.depth_in_units(frame.depth_m, DEPTH_SCALE))
-
-    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget, folder: Path) -> None:
         """Trajectory, annotated mesh, table of objects and plain mesh."""
         scan = dataset.scan(target.scene)
-        staged = target.partial / STAGED_ORIGINAL
+        staged = folder / STAGED_ORIGINAL
         make_folder((staged / MESH_NAME).parent)
         write_ply(staged / MESH_NAME, _annotated_mesh(scan))
         write_json(staged / INFO_NAME, _info(dataset.objects(target.scene)))
-        write_ply(target.partial / STAGED_MESH, _plain_mesh(scan))
+        write_ply(folder / STAGED_MESH, _plain_mesh(scan))
         poses = dataset.trajectory(target.scene)
         lines = [" ".join(repr(float(value)) for value in pose.reshape(-1)) for pose in poses]
-        write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
+        write_text(folder / "traj.txt", "\n".join(lines) + "\n")
 
 
 def _vertex_element(scan: SceneScan) -> PlyElement:

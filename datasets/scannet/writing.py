@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,11 +15,11 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import make_folder, write_text
-from su3d_bench.core.system.files import file_bytes, file_text, parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.datasets.scannet import sens, truth
 from su3d_bench.datasets.writing import Layout, SceneTarget, write_shared_text
-from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes, list_column, triangles_of
+from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, jpeg_bytes, list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 
 ROOM_NAME = re.compile(r"([a-z]+)(\d{1,2})")
@@ -196,13 +195,12 @@ LAYOUT_VERSION = 1  # increase it when the written bytes of a scene change
 DEPTH_SHIFT = 1000.0  # units per metre, in every recording of the release
 SCANS_FOLDER = "scans"
 SENSOR_NAME = "StructureSensor"  # as in the release; readers may depend on it
-PIECES = ".frames"
 
 
 class ScannetLayout(Layout):
     """Scenes as scans ``scene9000_00`` etc., each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
 
-    It is joined from records that were written separately. Time stamps are microseconds from the first frame.
+    Time stamps are microseconds from the first frame.
     """
 
     name = "scannet"
@@ -218,39 +216,27 @@ class ScannetLayout(Layout):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         scan = scan_name(scene)
         folder = out / SCANS_FOLDER / scan
-        names = *truth.truth_names(scan), truth.meta_name(scan)
-        return SceneTarget(scene, key, folder, f"{scan}.sens", tuple(folder / name for name in names))
+        names = f"{scan}.sens", *truth.truth_names(scan), truth.meta_name(scan)
+        return SceneTarget(scene, key, folder, tuple(folder / name for name in names))
 
     def write_shared(self, dataset: GeneratedScenes, scene: str, out: Path) -> None:
         write_shared_text(out / truth.TABLE_NAME, label_table_text(), "differs from the label table of the rooms")
 
-    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
-        write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
+    def write_truth(self, dataset: GeneratedScenes, target: SceneTarget, folder: Path) -> None:
+        write_scan_truth(dataset, target.scene, target.folder.name, folder)
 
-    def frame_names(self, index: int) -> Sequence[str]:
-        return (f"{PIECES}/{index:06d}.record",)
-
-    def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        time = round(frame.timestamp_s * sens.MICROSECONDS)
-        depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
-        return (sens.SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
-
-    def join(self, dataset: GeneratedScenes, target: SceneTarget) -> None:
-        if not target.has_frames:
-            n_frames = len(dataset.frames(target.scene, 1))
-            pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
-            header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[sens.FRAME_RECORD.itemsize :]))
-            records = (file_bytes(piece) for piece in pieces)
-            sens.write_sens(target.partial / target.frames, header, records)
-        if (target.partial / PIECES).exists():
-            shutil.rmtree(target.partial / PIECES)
+    def write_frames(
+        self, frames: Iterator[Frame], dataset: GeneratedScenes, target: SceneTarget, folder: Path
+    ) -> None:
+        height, width = dataset.frames(target.scene, 1)[0].depth_m.shape
+        header = sens_header(dataset.intrinsics, (width, height))
+        sens.write_sens(folder / f"{target.folder.name}.sens", header, map(_record, frames))
 
 
-def size_of(jpeg: bytes) -> tuple[int, int]:
-    """Width and height of a colour image, which are also those of its depth image."""
-    size = image_size(jpeg)
-    assert size is not None
-    return size
+def _record(frame: Frame) -> bytes:
+    time = round(frame.timestamp_s * sens.MICROSECONDS)
+    depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
+    return sens.SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored
 
 
 def intrinsics_4x4(intrinsics: Float64Array) -> Float64Array:

@@ -1,15 +1,14 @@
-"""Instances, one per row, as CSV and Parquet, and tables of the cost of each kind of error."""
+"""Instances, one per row, as CSV, and tables of the cost of each kind of error."""
 
 from __future__ import annotations
 
-import io
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.core.errors import ModelMissing, counted
+from su3d_bench.core.errors import counted
 from su3d_bench.core.system.files import file_text
 from su3d_bench.formats.tables.table import Prose, Table, csv_lines, percent, signed, text_table
 
@@ -90,33 +89,6 @@ def csv_of(rows: Sequence[InstanceRow]) -> str:
 
 def _cell(value: object) -> object:
     return "" if value is None else int(value) if isinstance(value, bool) else value
-
-
-def parquet_of(rows: Sequence[InstanceRow]) -> bytes:
-    """Return the rows as a Parquet file with described columns; ``ModelMissing`` without pyarrow."""
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ModelMissing(
-            ".parquet files need the parquet extra: pip install 'su3d-bench[parquet]'; or write a .csv file"
-        ) from error
-    types = {
-        "text": pyarrow.string(),
-        "whole number": pyarrow.int64(),
-        "number": pyarrow.float64(),
-        "yes or no": pyarrow.bool_(),
-    }
-    form = pyarrow.schema(
-        [
-            pyarrow.field(one.name, types[one.kind], nullable=one.may_lack, metadata={"meaning": one.meaning})
-            for one in COLUMNS
-        ]
-    )
-    columns = {one.name: [getattr(row, one.name) for row in rows] for one in COLUMNS}
-    stream = io.BytesIO()
-    pyarrow.parquet.write_table(pyarrow.table(columns, schema=form), stream)
-    return stream.getvalue()
 
 
 LEFT = {"overlap": "interaction", "rest": "remaining"}  # row labels of the two remainders

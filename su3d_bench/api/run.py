@@ -106,7 +106,7 @@ def run(
         assigned = [f"{key}={toml_value(value)}" for key, value in (settings or {}).items()]
     except TypeError as error:
         raise ConfigError(f"run(settings=...): {error}; expected text, numbers, bools, or lists of these") from error
-    place = out if out is None or "://" in str(out) else Path(out)
+    place = None if out is None else Path(out)
     plan = make_plan(asked, assigned, place, into=into)
     with _script_kept_out_of_workers():
         result = run_plan(plan, report or _ignore_progress)

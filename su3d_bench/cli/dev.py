@@ -1,10 +1,8 @@
-"""``su3d-bench dev``: the cache, the installation, shell completion, and registries of results."""
+"""``su3d-bench dev``: the installation, shell completion, and registries of results."""
 
 from __future__ import annotations
 
 import argparse
-import math
-import time
 from pathlib import Path
 from typing import Any
 
@@ -12,108 +10,24 @@ from su3d_bench.cli import doctor
 from su3d_bench.cli.new import REGISTRY, add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, output_path, searched_folder
 from su3d_bench.cli.output import answer, answer_either, answer_json, remark, show
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
 SHELLS = ("bash", "zsh", "fish")
-KIND_NAMES = ("perception", "model-digests", "runs", "replies")
-DAY_S = 86400
 MAX_REFUSED = 20  # lines
 
 
 def add_parser(verbs: Verbs) -> None:
-    """Manage the cache, check the installation, set up shell completion, keep registries of results.
+    """Check the installation, set up shell completion, keep registries of results.
 
     su3d-bench dev doctor
-    su3d-bench dev cache list
+    su3d-bench dev completion fish | source
     """
     actions = add_group(verbs, "dev", add_parser)
-    _add_cache(actions)
     # computes nothing, and shows the thread settings
     add_verb(actions, "doctor", doctor.call, data=True).set_defaults(uses_all_cores=True)
     parser = add_verb(actions, "completion", call_completion)
     parser.option("shell", "shell to complete for", choices=SHELLS)
     _add_registry(actions)
-
-
-def _add_cache(verbs: Verbs) -> None:
-    """Show and clear the cache in $SU3D_CACHE.
-
-    su3d-bench dev cache list
-    su3d-bench dev cache clear perception --older-than 30
-    """
-    actions = add_group(verbs, "cache", _add_cache, lists=True)
-    add_verb(actions, "list", call_cache_list)
-    parser = add_verb(actions, "clear", call_cache_clear)
-    parser.option(
-        "kinds KIND...",
-        "perception, model-digests, runs (copies from URLs), replies, or all (but replies)",
-        choices=(*KIND_NAMES, "all"),
-    )
-    parser.option("--older-than DAYS", "remove only older files (default: 0)", type=float, default=0.0)
-    parser.shared("--dry-run")
-
-
-def call_cache_list(arguments: argparse.Namespace) -> None:
-    """Show the number, size and age of cached files by kind.
-
-    su3d-bench dev cache list
-    su3d-bench dev cache list --json
-    """
-    from su3d_bench.runs.scenes import cache_root
-    from su3d_bench.store.caches import KINDS, cache_entries, size_text
-
-    root = cache_root()
-    rows: list[dict[str, Any]] = []
-    for kind in KINDS.values():
-        entries = list(cache_entries(root, kind))
-        times = [entry.written for entry in entries]
-        n_bytes = sum(entry.n_bytes for entry in entries)
-        ages = {"oldest": min(times, default=None), "newest": max(times, default=None)}
-        rows.append({"kind": kind.name, "n_files": len(entries), "n_bytes": n_bytes, **ages})
-    n_bytes = sum(row["n_bytes"] for row in rows)
-    lines = [f"cache: {shown(root)} ($SU3D_CACHE): {size_text(n_bytes)}"]
-    for row in rows:
-        old = f"written {_ago(row['newest'])} to {_ago(row['oldest'])} ago" if row["n_files"] else "nothing"
-        n_files = counted(row["n_files"], "file")
-        lines.append(f"  {row['kind']:<13}  {size_text(row['n_bytes']):>9}  {n_files:>13}  {old}")
-        lines.append(f"  {'':<13}  {KINDS[row['kind']].what}")
-    answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes, "kinds": rows}, *lines)
-
-
-def _ago(written: float) -> str:
-    seconds = max(0.0, time.time() - written)
-    return counted(round(seconds / DAY_S), "day") if seconds >= DAY_S else counted(round(seconds / 3600), "hour")
-
-
-def call_cache_clear(arguments: argparse.Namespace) -> None:
-    """Remove cached files of some kinds or all; only cache files are removed, and links are not followed.
-
-    su3d-bench dev cache clear all --dry-run
-    su3d-bench dev cache clear perception --older-than 30
-    """
-    from su3d_bench.runs.scenes import cache_root
-    from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
-
-    if not 0 <= arguments.older_than < math.inf:
-        raise ConfigError(f"--older-than {arguments.older_than:g}: expected a number of days, 0 or more")
-    before = time.time() - arguments.older_than * DAY_S if arguments.older_than else math.inf
-    root, wanted = cache_root(), arguments.kinds
-    rows, lines = [], []
-    for kind in KINDS.values():
-        if kind.name not in wanted and ("all" not in wanted or kind.is_paid):
-            continue
-        if arguments.dry_run:
-            sizes = [entry.n_bytes for entry in cache_entries(root, kind) if entry.written < before]
-            n_files, n_bytes = len(sizes), sum(sizes)
-        else:
-            n_files, n_bytes = clear_cache(root, kind, before=before)
-        rows.append({"kind": kind.name, "n_files": n_files, "n_bytes": n_bytes})
-        done = "would be removed" if arguments.dry_run else "removed"
-        lines.append(f"{kind.name}: {counted(n_files, 'file')}, {size_text(n_bytes)} {done}")
-    answer_either(arguments, {"folder": str(root), "is_dry": arguments.dry_run, "kinds": rows}, *lines)
-    if "all" in wanted and "replies" not in wanted and any(cache_entries(root, KINDS["replies"])):
-        text = "replies of language models were not removed; to remove them: su3d-bench dev cache clear replies"
-        remark(text, quiet=arguments.quiet)
 
 
 def call_completion(arguments: argparse.Namespace) -> None:

@@ -163,10 +163,7 @@ def _folders() -> Iterator[Check]:
     from su3d_bench.core.files.atomic import scratch_folder
     from su3d_bench.runs.scenes import cache_root, data_root
 
-    if "://" in (named := os.environ.get("SU3D_DATA", "")):
-        yield Check("data", "ok", f"{shown(Path(named))}: a store, which run and ablate read")
-    else:
-        yield _folder("data", data_root(), "SU3D_DATA")
+    yield _folder("data", data_root(), "SU3D_DATA")
     yield _folder("cache", cache_root(), "SU3D_CACHE")
     yield _folder("temporary", scratch_folder(), "TMPDIR")
     yield _folder("runs", Path("runs").absolute(), "--out")
@@ -205,8 +202,6 @@ def _datasets() -> Iterator[Check]:
     from su3d_bench.core import registry
     from su3d_bench.runs.scenes import data_root
 
-    if "://" in (os.environ.get("SU3D_DATA") or ""):
-        return
     for name in registry.names("dataset"):
         try:
             dataset_class = registry.load("dataset", name)

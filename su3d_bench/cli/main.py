@@ -97,9 +97,9 @@ def _exit_code(words: Sequence[str]) -> int:
         from su3d_bench.runs.executors import limit_threads  # late, so that --help stays fast
 
         if data := getattr(arguments, "data", None):
-            if "://" not in data and not os.path.isdir(data):
+            if not os.path.isdir(data):
                 raise ConfigError(f"--data {data}: no such folder; name the one that contains the datasets")
-            os.environ["SU3D_DATA"] = data if "://" in data else os.path.abspath(data)  # workers inherit it
+            os.environ["SU3D_DATA"] = os.path.abspath(data)  # workers inherit it
         check_outputs(arguments.parser, arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are imported

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from su3d_bench.cli.output import answer_either, overall_progress, remark
 from su3d_bench.core import registry
@@ -17,19 +15,18 @@ from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import ConfigError, DataError, nearest
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
+from su3d_bench.datasets.writing import SceneTarget, plan_scenes, write_scene
 from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
-FRAMES_PER_UNIT = 400  # a quarter of a room: much more work than building the room in each process
 LAYOUT_PARAMETERS = ("scan", "objects", "trajectory", "intrinsics")
 
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """A unit of work: the frames at ``indices``, or (None) the ground truth; without ``target`` only the scan.
+    """A unit of work: a scene with its ``n_steps``; without ``target`` only its scan.
 
     ``layout`` is a name, because units are sent to other processes.
     """
@@ -39,11 +36,7 @@ class WorkUnit:
     scene: str
     layout: str
     target: SceneTarget | None
-    indices: range | None
-
-    @property
-    def n_steps(self) -> int:
-        return 1 if self.indices is None else len(self.indices)
+    n_steps: int
 
 
 def make(arguments: argparse.Namespace) -> None:
@@ -93,66 +86,44 @@ def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
 
 
 def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    units = [WorkUnit(part, out, scene, arguments.layout, None, None) for scene in scenes]
-    _run(units, arguments, lambda unit: None)
-    return set(scenes)
+    return _run([WorkUnit(part, out, scene, arguments.layout, None, 1) for scene in scenes], arguments)
 
 
 def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
     """Write scenes in the layout of ``arguments`` (also ``jobs``, ``quiet``); returns those that were missing."""
-    layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
-    units = []
-    for target in plan_scenes(layout, dataset, scenes, out):
-        n_frames = dataset.info(target.scene, 1).n_frames
-        starts = range(0, n_frames, FRAMES_PER_UNIT)
-        pieces = [range(start, min(start + FRAMES_PER_UNIT, n_frames)) for start in starts]
-        units += [WorkUnit(part, data_root(), target.scene, layout.name, target, piece) for piece in (*pieces, None)]
-    n_open = Counter(unit.scene for unit in units)
-
-    def count_down(unit: WorkUnit) -> None:
-        n_open[unit.scene] -= 1
-        if n_open[unit.scene] == 0:
-            assert unit.target is not None
-            finish_scene(layout, dataset, unit.target)
-
-    _run(units, arguments, count_down)
-    return set(n_open)
+    layout, root = LAYOUTS[arguments.layout], data_root()
+    dataset = build_dataset(part, root)
+    targets = plan_scenes(layout, dataset, scenes, out)
+    units = [
+        WorkUnit(part, root, target.scene, layout.name, target, dataset.info(target.scene, 1).n_frames)
+        for target in targets
+    ]
+    return _run(units, arguments)
 
 
-def _run(units: Sequence[WorkUnit], arguments: argparse.Namespace, done: Callable[[WorkUnit], None]) -> None:
+def _run(units: Sequence[WorkUnit], arguments: argparse.Namespace) -> set[str]:
+    """Do the work, and return the names of its scenes."""
     n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
     with overall_progress("generating", is_quiet=arguments.quiet) as (begin, report):
         begin(sum(unit.n_steps for unit in units))
         if n_workers > 1:
-            outcomes = run_processes(_work, units, report, jobs=n_workers, lost=_lost)
-        else:
-            outcomes = run_inline(_work, units, report)
-        for unit in outcomes:
-            done(unit)
+            return set(run_processes(_work, units, report, jobs=n_workers, lost=_lost))
+        return set(run_inline(_work, units, report))
 
 
-def _work(unit: WorkUnit, report: Report) -> WorkUnit:
-    dataset = _dataset(unit.dataset, unit.root)
-    name = f"{unit.scene}, {'ground truth' if unit.indices is None else f'frames from {unit.indices.start}'}"
+def _work(unit: WorkUnit, report: Report) -> str:
+    dataset = build_dataset(unit.dataset, unit.root)
     if unit.target is None:
         dataset.scan(unit.scene)
-    elif unit.indices is None:
-        LAYOUTS[unit.layout].write_truth(dataset, unit.target)
     else:
-        layout, n = LAYOUTS[unit.layout], unit.n_steps
-
-        def count(n_done: int) -> None:
-            report(Event(name, "generating", n_done, n))
-
-        write_frames(layout, dataset, unit.target, unit.indices, count)
-    report(Event(name, "generated", unit.n_steps, unit.n_steps))
-    return unit
-
-
-@cache
-def _dataset(part: Part, root: Path) -> Any:
-    """One dataset per process, because it caches the room that the next unit is likely to use."""
-    return build_dataset(part, root)
+        write_scene(
+            LAYOUTS[unit.layout],
+            dataset,
+            unit.target,
+            lambda n_done: report(Event(unit.scene, "generating", n_done, unit.n_steps)),
+        )
+    report(Event(unit.scene, "generated", unit.n_steps, unit.n_steps))
+    return unit.scene
 
 
 def _lost(unit: WorkUnit, cause: str) -> NoReturn:

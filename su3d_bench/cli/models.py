@@ -1,10 +1,8 @@
-"""``su3d-bench models``: list, download, check and benchmark foundation models."""
+"""``su3d-bench models``: list, download and check foundation models."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import fetch
@@ -17,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    """List, download, check and benchmark foundation models.
+    """List, download and check foundation models.
 
     su3d-bench models list
     su3d-bench models fetch --profile paper --dry-run
@@ -28,10 +26,6 @@ def add_parser(verbs: Verbs) -> None:
     checking = add_verb(actions, "check", call_check)
     checking.option("names [MODEL...]", "models to check (default: all that are present)")
     checking.shared("--set")
-    parser = add_verb(actions, "warm", call_warm)
-    parser.option("name [ENCODER]", "encoder to load (default: all models of the profile)")
-    parser.option("--profile PROFILE", "perception profile (default: paper)")
-    parser.shared("--device", "--set")
     fetch.add_models(actions)
 
 
@@ -123,31 +117,3 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
     state = "invalid" if row["problems"] else "OK"
     digests = [f"  {digest}  {name}" for name, digest in row["sha256"].items()]
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
-
-
-def call_warm(arguments: argparse.Namespace) -> None:
-    """Load models, run them on a synthetic frame, and report time and memory.
-
-    su3d-bench models warm --profile paper --device cuda
-    su3d-bench models warm clip-vit-b-32
-    """
-    from su3d_bench.core.system.devices import device_for
-    from su3d_bench.perception.models.loading import load_encoder, warm_encoder, warm_perception, warm_scene
-    from su3d_bench.perception.profiles import build_perception
-
-    config = perception_config(arguments)
-    device = device_for(config.models.device, 0)
-    if arguments.name is None:
-        config = config.model_copy(update={"cache": False})  # a cached result cannot be timed
-        profile = arguments.profile or "paper"
-        perception = build_perception(profile, config, scene=warm_scene(), cache_root=Path(), mesh=None)
-        result = warm_perception(perception, device)
-    elif arguments.profile is not None:
-        raise ConfigError("models warm: give an encoder or --profile, not both")
-    else:
-        models = config.models.model_copy(update={"encoder": arguments.name})
-        result = warm_encoder(load_encoder(models), device)
-    lines = [f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s"]
-    lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]
-    lines.append(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
-    answer_either(arguments, asdict(result), *lines)

@@ -188,11 +188,6 @@ def figure_path(text: str) -> Path:
     return Path(text)
 
 
-def run_place(text: str) -> Path | str:
-    """Option type: a run folder that the command writes, or a URL as text."""
-    return text if "://" in text else Path(text)
-
-
 def searched_folder(text: str) -> Path:
     """Option type: a folder to search, which may contain the outputs."""
     return Path(text)
@@ -266,13 +261,9 @@ SHARED: dict[str, dict[str, Any]] = dict(
             "--queries FILE",
             "queries for protocols without classes (.toml, .csv, .txt, ScanRefer, Nr3D, OpenLex3D)",
         ),
-        option("--executor WHERE", "where jobs run: inline, processes, ray or slurm (default: processes)"),
-        option(
-            "--ray-address ADDRESS",
-            "address of the Ray cluster, or local to start one (default: $RAY_ADDRESS)",
-        ),
-        option("--gpus-per-job N", "GPUs per job (ray, slurm), such as 0.5", type=float),
-        option("--retries N", "number of retries (of a scene after a lost worker; default: 2)", type=int),
+        option("--executor WHERE", "where jobs run: inline, processes or slurm (default: processes)"),
+        option("--gpus-per-job N", "GPUs per Slurm job (default: 0)", type=int),
+        option("--retries N", "number of retries (of a scene whose Slurm job died; default: 2)", type=int),
         option("--slurm KEY=VALUE...", "submitit options, such as slurm_partition=gpu timeout_min=60"),
         option("--offline", "use only stored replies of language models", action=argparse.BooleanOptionalAction),
         option("--dry-run", "show what would be done and what it needs, and exit"),
@@ -281,7 +272,7 @@ SHARED: dict[str, dict[str, Any]] = dict(
 # Of commands that run methods.
 JOBS = "number of parallel jobs (default: one per CPU core, with foundation models on GPUs at most 2 per GPU)"
 # Where scenes run; see docs/running/clusters.md.
-EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
+EXECUTOR = ("--executor", "--gpus-per-job", "--retries", "--slurm")
 
 
 def open_map(arguments: argparse.Namespace, verb: str, text: str) -> tuple[RunFolder, JobFolder, Prediction]:

@@ -1,7 +1,7 @@
 """Paths on the command line: which options are outputs, and the check that no output replaces or lies in an input.
 
-An option is an output if its type is ``output_path``, ``figure_path`` or ``run_place``, or if it is ``--json``; every
-other path is an input. Folders that are only searched, such as that of ``report leaderboard``, may contain outputs.
+An option is an output if its type is ``output_path`` or ``figure_path``, or if it is ``--json``; every other path is
+an input. Folders that are only searched, such as that of ``report leaderboard``, may contain outputs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.options import figure_path, output_path, run_place, searched_folder
+from su3d_bench.cli.options import figure_path, output_path, searched_folder
 from su3d_bench.core.errors import ConfigError, shown
 
 RUN_VERBS = ("run", "ablate", "evaluate")  # whose --out may be an existing run
@@ -28,7 +28,7 @@ def data_root() -> Path:
 
 
 def is_output(action: argparse.Action) -> bool:
-    return action.type in (output_path, run_place, figure_path) or action.dest == "json"
+    return action.type in (output_path, figure_path) or action.dest == "json"
 
 
 def check_outputs(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

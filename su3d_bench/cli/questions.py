@@ -1,4 +1,4 @@
-"""``su3d-bench query make|show|audit|score``: question sets with known answers."""
+"""``su3d-bench query make|show|score``: question sets with known answers."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli import options, output
 from su3d_bench.cli.options import Verbs, add_verb, count, output_path
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import ConfigError, DataError, counted, printable
+from su3d_bench.core.errors import ConfigError, counted, printable
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
 FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question with --json
 N_SHOWN = 20
@@ -25,28 +24,16 @@ MAX_CHARACTERS = 80
 
 
 def add_parser(verbs: Verbs) -> None:
-    scenes = "--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')"
     parser = add_verb(verbs, "make", _make, data=True)
-    parser.option(*scenes, required=True)
-    parser.option("--out FILE", ".toml or .csv file to write (.json for Beacon3D)", type=output_path, required=True)
+    parser.option("--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')", required=True)
+    parser.option("--out FILE", ".toml or .csv file to write", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
     parser.option("--generated", "generate all questions (default: use the dataset's own, if any)")
     parser.shared("--exclude-ids")
-    parser.option("--to", "format to write (default: own)", default=FORMS[0], choices=FORMS)
     parser = add_verb(verbs, "show", _show)
     parser.option(
         "file FILE", "question set (.toml, .csv, ScanRefer, ...), or 'paper' for those of OpenSU3D's paper", type=str
     )
-    parser = add_verb(verbs, "audit", _audit, data=True)
-    parser.option(*scenes)
-    parser.option("--out DIR", "folder for page, pictures and table", type=output_path)
-    parser.option("--n-questions N", "number of questions (default: 200)", type=count, default=200)
-    parser.shared("--seed")
-    parser.option(
-        "--question-kinds KIND...", "kinds of questions, such as retrieval or property (default: all)", default=[]
-    )
-    parser.option("--score FILE", "summarise the verdicts in this audit.csv")
-    parser.shared("--format")
     parser = add_verb(verbs, "score", _score)
     parser.option("file FILE", "metadata_*.json of Beacon3D")
     parser.option("--answers FILE", "JSON list of answers, in the order of Beacon3D's scannet_*.json", required=True)
@@ -59,42 +46,15 @@ def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
     su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
-    su3d-bench query make --scenes 'rooms/*' --to beacon3d-qa --out metadata_qa.json
+    su3d-bench query make --scenes replica/room0 --generated --out queries.csv
     """
     from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.to != FORMS[0]:
-        _make_beacon3d(arguments)
-        return
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
     output.answer_either(arguments, *_counts(made))
-
-
-def _make_beacon3d(arguments: argparse.Namespace) -> None:
-    """Write a metadata file of Beacon3D about objects of the scenes."""
-    from su3d_bench.cli.scenes import chosen_scenes
-    from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains import made_files
-    from su3d_bench.questions.ground_truths import MIN_VERTICES, fullest_truth, scene_objects
-
-    if arguments.exclude_ids is not None or arguments.generated:
-        raise ConfigError("query make: --exclude-ids and --generated need --to own")
-    if arguments.out.suffix != ".json":
-        raise ConfigError(f"query make: --to {arguments.to} writes JSON; use --out FILE.json")
-    objects = {}
-    for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        if scene in objects:
-            raise ConfigError(f"query make: two datasets have a scene '{scene}', this form identifies scenes by name")
-        objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
-        remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
-    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.to) - 1]
-    write_json(arguments.out, content)
-    n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
-    line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
-    output.answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
@@ -151,46 +111,6 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
         text += f", {n_replies} with a free-form answer"
     content = {"n": len(questions), "n_known": n_known, "n_replies": n_replies, "kinds": dict(counts)}
     return content, text
-
-
-def _audit(arguments: argparse.Namespace) -> None:
-    """Sample questions with pictures for a manual audit, or summarise its verdicts.
-
-    su3d-bench query audit --scenes 'rooms/*' --n-questions 200 --out audit
-    su3d-bench query audit --score audit/audit.csv
-    """
-    from su3d_bench.cli.scenes import chosen_scenes
-    from su3d_bench.human_eval.audit import audit_json, audit_table, make_audit, read_verdicts
-    from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
-
-    if arguments.score is not None:
-        verdicts = read_verdicts(arguments.score)
-        output.answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
-        return
-    if not arguments.scenes or arguments.out is None:
-        raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
-    scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
-    n_each = n_of_each(arguments.n_questions, len(scenes))
-    every = []
-    for dataset, scene in scenes:
-        of_scene = list(audited_questions(dataset, scene, n_each=n_each, seed=arguments.seed))
-        remark(f"{dataset.name}/{scene}: {counted(len(of_scene), 'question')}", quiet=arguments.quiet)
-        every += of_scene
-    drawn = sample(of_kinds(every, arguments.question_kinds), arguments.n_questions, arguments.seed)
-    if not drawn:
-        raise DataError("query audit: these scenes give no questions")
-    places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
-    page = make_audit(
-        drawn, places.__getitem__, arguments.out, lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet)
-    )
-    counts = dict(sorted(Counter(question.kind for question in drawn).items()))
-    kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
-    lines = (
-        f"{counted(len(drawn), 'question')} ({kinds})",
-        f"open {page}, enter right, arguable or wrong into audit.csv, then: "
-        f"su3d-bench query audit --score {arguments.out}/audit.csv",
-    )
-    output.answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
 
 
 def _score(arguments: argparse.Namespace) -> None:

@@ -150,7 +150,7 @@ def _add_instances(verbs: Verbs) -> None:
     parser = add_verb(verbs, "instances", call_instances, data=True)
     parser.shared("runs", nargs="*")
     parser.shared("--methods", "--protocols", "--scenes")
-    parser.option("--out FILE", ".csv or .parquet file to write (default: print CSV)", type=output_path)
+    parser.option("--out FILE", ".csv file to write (default: print CSV)", type=output_path)
     parser.option("--describe-columns", "describe the columns and exit")
     parser.set_defaults(table_format=None)
 
@@ -159,11 +159,11 @@ def call_instances(arguments: argparse.Namespace) -> None:
     """List every predicted and ground-truth instance: class, confidence, best IoU, error type, box.
 
     su3d-bench report instances runs/my-run --out instances.csv
-    su3d-bench report instances runs/a runs/b --methods opensu3d --out instances.parquet
+    su3d-bench report instances runs/a runs/b --methods opensu3d --out instances.csv
     """
     from su3d_bench.analysis.instances import Selection, instance_rows
-    from su3d_bench.core.files.atomic import make_folder, write_bytes
-    from su3d_bench.reports.tables.instances import COLUMNS, columns_table, csv_of, parquet_of
+    from su3d_bench.core.files.atomic import make_folder, write_text
+    from su3d_bench.reports.tables.instances import COLUMNS, columns_table, csv_of
     from su3d_bench.runs.finished import read_run
 
     if arguments.describe_columns == bool(arguments.runs):
@@ -172,9 +172,6 @@ def call_instances(arguments: argparse.Namespace) -> None:
         output.answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
         return
     out = arguments.out
-    is_parquet = out is not None and out.suffix == ".parquet"
-    if is_parquet:
-        parquet_of(())  # fail early if it is not installed
     chosen = Selection(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
     with output.progress(n_scenes, is_quiet=arguments.quiet) as report:
@@ -182,7 +179,7 @@ def call_instances(arguments: argparse.Namespace) -> None:
     remark(*found.remarks, quiet=arguments.quiet)
     if out is not None:
         make_folder(out.parent)
-        write_bytes(out, parquet_of(found.rows) if is_parquet else csv_of(found.rows).encode())
+        write_text(out, csv_of(found.rows))
     if output.answer_json(arguments, [asdict(row) for row in found.rows]):
         return
     if out is None:

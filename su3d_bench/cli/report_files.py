@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 from dataclasses import asdict
 from functools import partial
@@ -18,7 +17,7 @@ MEGABYTE = 10**6
 
 
 def add_pages(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "html", call_html, resumes=True, data=True)
+    parser = add_verb(verbs, "html", call_html, data=True)
     parser.shared("runs")
     parser.option("--out FILE", "page to write (default: page.html)", type=output_path, default=Path("page.html"))
     parser.option("--title TEXT", "title of the page (default: the run folders)")
@@ -68,7 +67,6 @@ def call_html(arguments: argparse.Namespace) -> None:
         with_gallery=not (arguments.no_gallery or arguments.no_errors),
         jobs=arguments.jobs or 0,
     )
-    arguments.resumes = all(os.access(run, os.W_OK) for run in arguments.runs)  # otherwise nothing is cached
     with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
         contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
@@ -78,7 +76,7 @@ def call_html(arguments: argparse.Namespace) -> None:
         {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": summary_of(contents.galleries)},
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
-        [gallery.to_json() for gallery in contents.galleries],
+        list(map(asdict, contents.galleries)),
         command=shlex.join(["su3d-bench", *arguments.words]),
     )
     output.written(arguments.out, page)

@@ -33,7 +33,6 @@ RUN_OPTIONS = (
     "refiner",
     "offline",
     "executor",
-    "ray_address",
     "gpus_per_job",
     "retries",
     "slurm",
@@ -101,15 +100,15 @@ def _check_key(recipe: Recipe, experiments: Sequence[Experiment], arguments: arg
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise early if the GPU does not exist, except on clusters, whose machines have their own."""
+    """Raise early if the GPU does not exist, except under Slurm, whose machines have their own."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors import ELSEWHERE
+    from su3d_bench.runs.executors import SLURM
 
     if arguments.device is None:
         return
     if DEVICE.fullmatch(arguments.device) is None:
         raise ConfigError(f"--device {printable(arguments.device, 40)}: {EXPECTED_DEVICE}")
-    if not arguments.dry_run and arguments.executor not in ELSEWHERE:
+    if not arguments.dry_run and arguments.executor != SLURM:
         device_for(arguments.device, 0)
 
 
@@ -134,7 +133,6 @@ def _asked(arguments: argparse.Namespace) -> RecipeRequest:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.estimate import estimate, estimate_tables
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
@@ -142,9 +140,7 @@ def _reproduce(
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs, out)
     if arguments.dry_run:
-        costs = estimate(runs, known)
-        value = known.to_json() | {"estimate": asdict(costs)}
-        output.answer_tables(arguments, value, [*preflight_tables(known), *estimate_tables(costs)])
+        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
     remark(*summary(known), quiet=arguments.quiet)
     if known.missing:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, run_place
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, output_path
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -51,9 +51,7 @@ def add_run_options(parser: Parser) -> None:
     )
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
     parser.shared("--set", "--config", "--dry-run", "--format")
-    parser.option(
-        "--out DIR", "run folder or URL, such as s3://bucket/run (default: a folder in runs/)", type=run_place
-    )
+    parser.option("--out DIR", "run folder (default: a folder in runs/)", type=output_path)
     into = parser.add_mutually_exclusive_group()
     what = "add scenes, methods and protocols to the run in --out"
     parser.option("--extend", what, into)
@@ -92,7 +90,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 
 def execute(plan: Plan, arguments: argparse.Namespace) -> int:
-    """Run the plan, or with ``--dry-run`` print its estimated cost."""
+    """Run the plan, or with ``--dry-run`` print its jobs."""
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.store.caches import cache_warning
 
@@ -102,7 +100,7 @@ def execute(plan: Plan, arguments: argparse.Namespace) -> int:
     if line := cache_warning():
         remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     if arguments.out is None:
-        remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.place.name}", quiet=arguments.quiet)
+        remark(f"{counted(len(plan.jobs), 'scene')}, run folder: {plan.folder.path}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)
@@ -123,8 +121,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     found = {"found": [asdict(found) for found in result.found]} if result.found else {}
     output.answer_tables(arguments, result.metrics | found, run_tables(result.metrics, result.found))
     plan = result.plan
-    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (small files: {plan.folder.path})"
-    remark(*result.remarks, f"run folder: {place}", quiet=arguments.quiet)
+    remark(*result.remarks, f"run folder: {plan.folder.path}", quiet=arguments.quiet)
     if arguments.quiet:
         return
     if pictures := pictures_of(result):
@@ -135,17 +132,14 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
 
 
 def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
-    from su3d_bench.runs.advice import estimate
+    from su3d_bench.runs.advice import planned_jobs
 
-    rows = estimate(plan)
+    rows = planned_jobs(plan)
     lines = []
     for row in rows:
-        state = "already done" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
+        state = "already done" if row.is_done else counted(row.n_updates, "update")
         lines.append(f"{row.scene:<24} {row.method:<12} {row.remark or state}")
-    minutes = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers / 60
-    source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
-    n_jobs = counted(plan.n_workers, "job")
-    lines.append(f"about {minutes:.1f} minutes with {n_jobs} ({source}); folder {plan.folder.path}")
+    lines.append(f"{counted(plan.n_workers, 'job')} in parallel; folder {plan.folder.path}")
     lines += [f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.config.profile}" for job in plan.jobs[:1]]
     value = {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": [asdict(row) for row in rows]}
     output.answer_either(arguments, value, *lines)
@@ -168,7 +162,6 @@ def call_ablate(arguments: argparse.Namespace) -> int:
     code = execute(plan, arguments)
     if code == EXIT_DONE and not arguments.dry_run:
         write_rows(plan.folder.path, rows, joins=arguments.extend)
-        plan.place.publish()
         remark(
             f"table: su3d-bench report tables {plan.folder.path} --tables I", quiet=arguments.quiet or arguments.json
         )

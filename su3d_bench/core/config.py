@@ -108,8 +108,8 @@ class RunConfig(BaseModel):
     ``perception.language``; ``refiner``: how labels n' are chosen, by vote or by that model; ``offline``: no language
     model is called, replies stored with the run are used; ``accept_poses``: also run recordings whose depth contradicts
     their poses; ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
-    ``executor`` auto: this process for one job, otherwise processes; ``ray_address`` empty: ``RAY_ADDRESS``, or the
-    cluster on this machine; ``retries``: for a scene whose machine was lost; ``slurm``: KEY=VALUE for submitit.
+    ``executor`` auto: this process for one job, otherwise processes; ``retries``: for a scene whose job
+    died; ``slurm``: KEY=VALUE for submitit.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -128,9 +128,8 @@ class RunConfig(BaseModel):
     offline: bool = False
     accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
-    executor: Literal["auto", "inline", "processes", "ray", "slurm"] = "auto"
-    ray_address: str = ""
-    gpus_per_job: float = Field(default=0.0, ge=0, le=64, allow_inf_nan=False)
+    executor: Literal["auto", "inline", "processes", "slurm"] = "auto"
+    gpus_per_job: int = Field(default=0, ge=0, le=64)
     retries: int = Field(default=2, ge=0)
     slurm: tuple[str, ...] = ()
 

@@ -311,5 +311,5 @@ def _remarks(planned: Planned, arrived: Sequence[FetchedFile]) -> tuple[str, ...
             f"{record_path(planned.root)}, and later downloads are compared with it"
         )
     if planned.source.name == "ram-plus":
-        remarks.append(f"RAM++ needs its own package or an exported model; see {documentation('methods/models')}")
+        remarks.append(f"RAM++ must be exported; see {documentation('methods/models')}")
     return tuple(remarks)

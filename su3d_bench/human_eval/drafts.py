@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.english import plural
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
@@ -28,8 +29,7 @@ from su3d_bench.metrics.questions.score import TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.questions import ground_truths, model
-from su3d_bench.questions.audit import reference_objects
-from su3d_bench.questions.generated import generate_questions
+from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.model import REASONING, Answer, Question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap
@@ -469,7 +469,26 @@ def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Co
     for made in generate_questions(objects, n_each=per_kind):
         key, answer = question_id(scene, REASONING, made.text), made.answer
         if key not in left_out:
-            reply, related = answer.text, [thing.id for thing in reference_objects(made, objects)]
+            reply, related = answer.text, reference_ids(made, objects)
             reply = "no" if answer.value is False else reply
             add(made.text, reply, key, made.kind, answer.object_ids, related)
     return drafts
+
+
+def reference_ids(question: GeneratedQuestion, objects: SceneMap) -> list[int]:
+    """The ids of the reference objects of an answer; for negative answers, of those with the last name in the text."""
+    ids = [one for one in question.answer.reference_ids if one in objects.ids]
+    if not ids and question.answer.value is False:
+        ids = _last_mentioned(question.text, objects)
+    return [one for one in dict.fromkeys(ids) if one not in question.answer.object_ids]
+
+
+def _last_mentioned(text: str, objects: SceneMap) -> list[int]:
+    """The ids of the objects whose name is the last in a text; "coffee table" does not match "table"."""
+    last, found, left = -1, "", text.lower()
+    for name in sorted({thing.name for thing in objects.objects if thing.name}, key=lambda name: (-len(name), name)):
+        forms = "|".join(re.escape(form.lower()) for form in (name, plural(name)))
+        for match in re.finditer(rf"\b(?:{forms})\b", left):
+            last, found = max((last, found), (match.start(), name))
+            left = left[: match.start()] + " " * len(match[0]) + left[match.end() :]
+    return [thing.id for thing in objects.objects if found and thing.name == found]

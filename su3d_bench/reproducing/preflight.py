@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig, models_of
 from su3d_bench.reproducing.recipe import RecipeRun, dataset_named, known_scenes, scene_names
-from su3d_bench.runs.executors import ELSEWHERE
+from su3d_bench.runs.executors import SLURM
 from su3d_bench.runs.job import Part, build_method
 from su3d_bench.runs.plan import asks_language_model, method_part, named_method
 from su3d_bench.runs.scenes import data_root
@@ -168,7 +167,7 @@ def asks(run: RecipeRun) -> list[str]:
 def language_needs(run: RecipeRun, out: Path) -> Iterator[Need]:
     """The missing key of the language model, if requests would be sent."""
     has_replies = run.values.get("offline") or (run.folder(out) / "language").is_dir()
-    if not asks(run) or has_replies or run.values.get("executor") in ELSEWHERE:
+    if not asks(run) or has_replies or run.values.get("executor") == SLURM:
         return
     key = perception_of(run).language.key_variable
     try:
@@ -195,9 +194,7 @@ def _models(run: RecipeRun) -> Iterator[Need]:
 
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
-    forms: tuple[FormName, ...] | None = None
-    if name == TAGGER:  # its original checkpoint requires its own package
-        forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
+    forms: tuple[FormName, ...] | None = ("onnx",) if name == TAGGER else None
     place = config.models.paths.get(name), config.models.folder
     remark = "" if is_required else f"replaced by the {config.paper.n_tags} most likely words of a list, by the encoder"
     try:
@@ -205,7 +202,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
         how = f"su3d-bench models fetch {'--profile paper' if name in FETCHED_FOR_PAPER else name}"
-        how += ", then tools/export_onnx.py ram-plus" if forms == ("onnx",) else ""
+        how += ", then tools/export_onnx.py ram-plus" if forms else ""
         return Need("model", name, is_available=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_available=True, n_bytes=0.0, remark=str(files.folder))
 

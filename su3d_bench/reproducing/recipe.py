@@ -375,7 +375,6 @@ def execute(run: RecipeRun, plan: Plan, report: Report) -> RunResult:
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
         write_rows(plan.folder.path, run.rows, joins=True)
-        plan.place.publish()
     return result
 
 

@@ -222,14 +222,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-# The options of executors on other machines; a value other than the default is rejected for other executors.
-USED_BY = {
-    "ray_address": ("ray",),
-    "gpus_per_job": ("ray", "slurm"),
-    "retries": ("ray", "slurm"),
-    "slurm": ("slurm",),
-}
-ELSEWHERE = ("ray", "slurm")  # executors whose units run on machines that share at most a disk or a store
+# The executor on other machines, and its options; a value other than the default is rejected for other executors.
+SLURM = "slurm"
+SLURM_OPTIONS = ("gpus_per_job", "retries", "slurm")
 
 
 def executor_of(config: RunConfig, n_workers: int) -> str:
@@ -241,20 +236,13 @@ def executor_of(config: RunConfig, n_workers: int) -> str:
 
 def check_execution(config: RunConfig) -> None:
     """A ``ConfigError`` if an option has no effect with the requested executor."""
-    for name, executors in USED_BY.items():
+    for name in SLURM_OPTIONS:
         value = getattr(config, name)
-        if value != RunConfig.model_fields[name].default and config.executor not in executors:
-            shown = " ".join(value) if isinstance(value, tuple) else value
-            wanted = " or ".join(f"--executor {executor}" for executor in executors)
-            raise ConfigError(
-                f"--{name.replace('_', '-')} {shown}: has no effect with the executor '{config.executor}'; add {wanted}"
-            )
+        if value != RunConfig.model_fields[name].default and config.executor != SLURM:
+            flag = f"--{name.replace('_', '-')} {' '.join(value) if isinstance(value, tuple) else value}"
+            raise ConfigError(f"{flag}: has no effect with the executor '{config.executor}'; add --executor {SLURM}")
     if config.executor == "inline" and config.jobs > 1:
         raise ConfigError(f"--jobs {config.jobs}: the executor 'inline' runs one job; choose --executor processes")
-    is_whole = config.gpus_per_job == int(config.gpus_per_job)
-    if not is_whole and (config.executor == "slurm" or config.gpus_per_job > 1):
-        what = "Slurm allocates whole GPUs" if config.executor == "slurm" else "only values below 1 may be fractions"
-        raise ConfigError(f"--gpus-per-job {config.gpus_per_job:g}: {what}")
     slurm_parameters(config)
 
 

@@ -112,7 +112,7 @@ def _as_first_requested(entry: Setting, lines: Sequence[str]) -> Setting:
 
 
 def extended(asked: Settings, existing: ExistingRun | None, where: str) -> Settings:
-    """The request of ``existing`` merged with the present one; ``where`` is the run's folder or its URL."""
+    """The request of ``existing`` merged with the present one; ``where`` is the run's folder."""
     if existing is None or not existing.is_known:
         raise ConfigError(f"--extend: {printable(where, 300)} has no complete run.toml; omit --extend to start a run")
     joined = []

@@ -358,7 +358,6 @@ def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     """The text encoder that matches the run's features, on ``device``; a different one raises ``PredictionError``."""
     from su3d_bench.perception.cache import FrameCache
-    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import encoder_known_as
     from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
@@ -369,13 +368,13 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     config = PerceptionConfig()
     if entry is not None:
         config = resolve(read_file(run.path / "run.toml"), ("perception",), PerceptionConfig)
-    here = {"device": device, "precision": "auto", "provider": None, "batch": 0}
+    here = {"device": device, "precision": "auto", "batch": 0}
     models = config.models.model_copy(update={**here, "encoder": entry.name if entry else None})
     encoder = load_encoder(models, cache=FrameCache(cache_root() if config.cache else None))
     made_with = record.encoder_digest
     if made_with is None or made_with == encoder.digest:
         return encoder
-    if isinstance(encoder, FoundationEncoder | EmbeddedEncoder) and encoder.is_same_space(made_with):
+    if isinstance(encoder, FoundationEncoder) and encoder.is_same_space(made_with):
         return encoder
     raise PredictionError(
         f"{run.path}: its features were made by encoder {record.encoder} ({made_with[:12]}), not by "

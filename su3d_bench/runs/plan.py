@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +25,7 @@ from su3d_bench.core.config import (
     resolve,
 )
 from su3d_bench.core.digests import code_digest, digest_json
-from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
+from su3d_bench.core.errors import ConfigError, counted, printable, some, suggest
 from su3d_bench.core.registry import CEILING_METHOD, GENERATED
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.types import ImageDomain
@@ -43,7 +41,7 @@ from su3d_bench.metrics.protocols.loading import (
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.language.client import check_key
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models, default_jobs, resolve_profile
-from su3d_bench.runs.executors import ELSEWHERE, check_execution
+from su3d_bench.runs.executors import SLURM, check_execution
 from su3d_bench.runs.existing import (
     ExistingRun,
     Into,
@@ -63,7 +61,6 @@ from su3d_bench.runs.job import (
     options_model,
     part_of,
 )
-from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
 
@@ -161,23 +158,13 @@ class Plan:
 
     config: RunConfig
     settings: Settings
-    place: RunPlace
+    folder: RunFolder
     jobs: tuple[SceneJob, ...]
     n_workers: int
     notes: tuple[str, ...]
-    data: RemoteData | None = None
     existing: ExistingRun | None = None
     start: Start = "begun"
     removes: tuple[JobFolder, ...] = ()
-
-    @property
-    def folder(self) -> RunFolder:
-        return self.place.folder
-
-    @property
-    def is_distant(self) -> bool:
-        """Whether workers share at most a disk or a store with this process."""
-        return self.config.executor in ELSEWHERE or self.place.url is not None or self.data is not None
 
     @property
     def values(self) -> list[tuple[KeyPath, Any]]:
@@ -212,20 +199,17 @@ class Plan:
 
 
 def make_plan(
-    settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None, *, into: Into = "own"
+    settings: Settings, assignments: Sequence[str] = (), out: Path | None = None, *, into: Into = "own"
 ) -> Plan:
     """The plan of a request; every error in the request itself is found here, before any work.
 
     ``assignments`` are ``KEY=VALUE`` texts for ``read_assignments``. ``out`` None: a folder below ``runs/`` named after
-    datasets, profile and a key of the request, so that the same command resumes its own run; a text: the URL of a
-    store. A folder that contains a run of another request is rejected, or extended or replaced, depending on ``into``.
+    datasets, profile and a key of the request, so that the same command resumes its own run. A folder that
+    contains a run of another request is rejected, or extended or replaced, depending on ``into``.
     """
     if into != "own" and out is None:
         raise ConfigError(f"--{into}: name the run with --out, such as --out runs/demo")
-    place: RunPlace | None = LocalRun(RunFolder(out)) if isinstance(out, Path) else None
-    if isinstance(out, str):
-        place = StoredRun.opened(out, cache_root())
-    existing = None if place is None else existing_run(place.folder.path)
+    existing = None if out is None else existing_run(out)
     check_keys(settings)
     if into == "extend":
         settings = extended(settings, existing, str(out))
@@ -244,7 +228,7 @@ def make_plan(
     _check_sections("dataset", settings, targets)
     of_perception = resolve(settings, ("perception",), PerceptionConfig)
     check_models(config.profile, of_perception)
-    if config.executor not in ELSEWHERE:
+    if config.executor != SLURM:
         device_for(of_perception.models.device, 0)  # raises if there is no such GPU
     perception = of_perception.model_dump_json()
     methods = tuple(method_part(method, settings) for method in named_methods)
@@ -256,21 +240,18 @@ def make_plan(
     for name in asked:
         if not any(map(USES_LANGUAGE[name], rules)):
             raise ConfigError(f"{flag_of(name)}: needs a reasoning protocol, such as --protocols rooms-reasoning")
-    if place is None:
-        place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
-        existing = existing_run(place.folder.path)
-    if place.url is None:
-        place.folder.check_is_run_folder()
+    if out is None:
+        out = Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)
+        existing = existing_run(out)
+    folder = RunFolder(out)
+    folder.check_is_run_folder()
     domain: ImageDomain = "rendered-rooms" if set(targets) <= GENERATED else "camera"
     profile = resolve_profile(config.profile, domain, of_perception)
     uses_captions = profile == "paper" and of_perception.paper.captions == "model"
-    has_replies = config.offline or (place.folder.path / "language").is_dir()  # else requests are sent
-    if (asked or uses_captions) and not has_replies and config.executor not in ELSEWHERE:
+    has_replies = config.offline or (folder.path / "language").is_dir()  # else requests are sent
+    if (asked or uses_captions) and not has_replies and config.executor != SLURM:
         check_key(of_perception.language)
-    root = os.environ.get("SU3D_DATA") or ""
-    with data_place(root) if is_url(root) else nullcontext(DataPlace(data_root())) as data_root_here:
-        chosen, notes = expand_scenes(config.scenes, datasets, data_root_here.root)
-        data = data_root_here.needed({datasets[target] for target, _ in chosen})
+    chosen, notes = expand_scenes(config.scenes, datasets)
     jobs = tuple(
         SceneJob(
             scene=f"{datasets[target].name}/{scene}",
@@ -280,29 +261,25 @@ def make_plan(
             protocols=protocols[target],
             config=config,
             perception=perception,
-            folder=place.folder.path,
-            data_root=data_root_here.root,
+            folder=folder.path,
+            data_root=data_root(),
             cache_root=cache_root(),
             index=index,
             replaces=into == "replace",
         )
         for index, (target, scene) in enumerate(chosen)
     )
-    n_here = config.jobs or (len(jobs) if config.executor in ELSEWHERE else default_jobs(profile, of_perception))
+    n_here = config.jobs or (len(jobs) if config.executor == SLURM else default_jobs(profile, of_perception))
     n_workers = min(n_here, len(jobs))
     notes += tuple(_notes_on_protocols(protocols, config.protocols))
-    plan = Plan(config, settings, place, jobs, n_workers, notes, data, existing)
-    try:
-        return _started(plan, into)
-    except StoreError as error:
-        raise StoreError(str(error).replace(str(place.folder.path), place.name)) from error
+    return _started(Plan(config, settings, folder, jobs, n_workers, notes, existing), into)
 
 
 def _started(plan: Plan, into: Into) -> Plan:
     """``plan`` with what happens to the run in its folder; a ``StoreError`` if that is a different one."""
     existing = plan.existing
     if existing is not None:
-        check_request(existing, plan.request, into, plan.place.name)
+        check_request(existing, plan.request, into, str(plan.folder.path))
     methods = ConfiguredMethods()
     for job in plan.jobs:
         for part in job.methods:
@@ -325,7 +302,7 @@ def _removed_lines(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
     scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
     which = f"{some([scene_of_folder(name) for name in scenes], MAX_NAMED)} by {some(methods, MAX_NAMED)}"
     n_all = len(plan.folder.jobs())
-    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} will be removed: {which}"]
+    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.folder.path} will be removed: {which}"]
 
 
 def _check_unique_names(flag: str, named: Iterable[tuple[str, Any]]) -> None:

@@ -11,7 +11,7 @@ is *replaced*, except for the maps that the new request has too.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +26,6 @@ from su3d_bench.runs.existing import differences, with_end_marker
 from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.poses import judged_where_read_here
-from su3d_bench.runs.remote_jobs import distant_jobs, failed_distant, run_distant_scene
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.runs.summary import found_in, outcomes_without_score, record, remarks_of, summarise
@@ -58,8 +57,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     Raises ``PosesContradicted`` if the depth of a recording contradicts its poses, and an error if the executor does
     not answer, both before anything is written.
     """
-    if plan.data is None:  # otherwise each worker checks the data that it fetches
-        plan = replace(plan, jobs=judged_where_read_here(plan.jobs))
+    plan = replace(plan, jobs=judged_where_read_here(plan.jobs))
     with executor_for(plan.config, plan.n_workers, plan.folder.path, report) as run, _prepared(plan):
         if plan.start != "kept":
             _write_request(plan)
@@ -100,7 +98,7 @@ def _check_still_empty(plan: Plan) -> None:
     file = plan.folder.path / "run.toml"
     planned = None if plan.existing is None else plan.existing.content
     if is_file(file) and planned != file_bytes(file):
-        raise StoreError(f"{plan.place.name}: another run just started in this folder; run the command again")
+        raise StoreError(f"{plan.folder.path}: another run just started in this folder; run the command again")
 
 
 def _remove_replaced(plan: Plan) -> None:
@@ -108,8 +106,8 @@ def _remove_replaced(plan: Plan) -> None:
     that a command killed here continues where it stopped."""
     for name in ("metrics.json", "ablation.json"):
         remove_file(plan.folder.path / name)
-    plan.place.publish()
-    plan.place.remove(plan.removes)
+    for job in plan.removes:
+        job.remove()
 
 
 # ---- 2: write the request
@@ -119,7 +117,6 @@ def _write_request(plan: Plan) -> None:
     """Write the records of a run in progress: its request, and no metrics."""
     remove_file(plan.folder.path / "metrics.json")
     _write_request_records(plan)
-    plan.place.publish()
 
 
 def _write_request_records(plan: Plan) -> None:
@@ -148,18 +145,12 @@ def _execute(plan: Plan, report: Report, run: RunUnits) -> tuple[MethodOutcome, 
     except BaseException:
         if plan.start != "kept":
             write_json(plan.folder.path / "run.json", plain(record(plan, (), "interrupted")))
-            with suppress(StoreError):  # the error that ended the run is more informative
-                plan.place.publish()
         raise
-    plan.place.fetch_results()
     return tuple(outcome for job in plan.jobs for outcome in by_scene[job.scene])
 
 
 def _finished_scenes(plan: Plan, run: RunUnits) -> Iterator[tuple[MethodOutcome, ...]]:
-    """The outcomes of each scene as it finishes, here or on another machine; first those that need no worker."""
-    if plan.is_distant:
-        yield from run(run_distant_scene, distant_jobs(plan), lost=failed_distant)
-        return
+    """The outcomes of each scene as it finishes; first those that need no worker."""
     known, left = FinishedScenes(), []
     for job in plan.jobs:
         outcomes = known.outcomes(job)
@@ -185,7 +176,6 @@ def _write_results(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mappi
     status = "incomplete" if _failures(plan, outcomes) else "complete"
     write_json(plan.folder.path / "metrics.json", metrics)
     write_json(plan.folder.path / "run.json", plain(record(plan, outcomes, status)))
-    plan.place.publish()
 
 
 def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mapping[str, Any]) -> bool:

@@ -15,7 +15,6 @@ from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, suggest
 from su3d_bench.core.interfaces import Dataset, HasGroups
 from su3d_bench.runs.job import Part, build_dataset, part_of
-from su3d_bench.runs.remote_store import is_url
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
@@ -23,10 +22,7 @@ CACHE_ROOT = "~/.cache/su3d-bench/cache"
 
 def data_root() -> Path:
     """Where datasets are: ``$SU3D_DATA``, otherwise the user's cache."""
-    named = os.environ.get("SU3D_DATA") or DATA_ROOT
-    if is_url(named):
-        raise ConfigError(f"SU3D_DATA={named}: only su3d-bench run and ablate can read a store; name a folder")
-    return Path(named).expanduser()
+    return Path(os.environ.get("SU3D_DATA") or DATA_ROOT).expanduser()
 
 
 def cache_root() -> Path:
@@ -88,14 +84,14 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
 
 
 def expand_scenes(
-    addresses: Sequence[str], datasets: Mapping[str, Part], root: Path | None = None
+    addresses: Sequence[str], datasets: Mapping[str, Part]
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
     """(dataset target, scene) of every address or pattern, each once, in the given order; and notes.
 
     Files among the addresses, which a shell adds when it expands ``dataset/*``, are ignored with a note if other
-    addresses match. ``root`` None: ``data_root()``.
+    addresses match.
     """
-    root = data_root() if root is None else root
+    root = data_root()
     chosen: dict[tuple[str, str], None] = {}
     ignored = []
     for address in addresses:
@@ -151,7 +147,7 @@ def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:
 
 def _with_dataset(name: str) -> str:
     """A clause suggesting the address of a scene, group or pattern that was named without its built-in dataset."""
-    if "/" in name or is_url(os.environ.get("SU3D_DATA") or ""):
+    if "/" in name:
         return ""
     known: list[str] = []
     for target in registry.DATASETS:

@@ -216,7 +216,7 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
             lines.append(f"{outcome.scene}: no ground-truth ceiling: {outcome.error}")
     usual = {name for job in plan.jobs for name in usual_protocols(job.dataset.target)}
     if not plan.config.protocols and (more := usual - {rules.name for rules in plan.rules}):
-        how = f"su3d-bench run --extend --all-protocols --out {shlex.quote(plan.place.name)}"
+        how = f"su3d-bench run --extend --all-protocols --out {shlex.quote(str(plan.folder.path))}"
         lines.append(more_protocols_line(more, how))
     return tuple(dict.fromkeys(lines))
 

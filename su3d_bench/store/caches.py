@@ -1,24 +1,15 @@
-"""The cache: the content of the cache folder by kind, and whether compiled code can be cached."""
+"""Whether compiled code can be cached, and sizes as text."""
 
 from __future__ import annotations
 
-import math
 import os
-import re
-import stat
 import tempfile
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
-from su3d_bench.core.files.atomic import remove_file
-from su3d_bench.core.files.locks import is_locked
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
-_HEX = "[0-9a-f]"
 SMALL_BYTES = 1 << 16  # about the size of a cached kernel: fails on a full disk
 
 
@@ -53,71 +44,6 @@ def _takes_files(folder: Path) -> bool:
     except (OSError, RuntimeError):  # RuntimeError: unknown home folder
         return False
     return True
-
-
-@dataclass(frozen=True)
-class CacheKind:
-    """One kind of cache content: the folder's name, the form of a file's path in it, and a description.
-
-    ``form`` is a regular expression. ``is_paid``: it is not recomputed but requested again, which may cost money.
-    """
-
-    name: str
-    form: str
-    what: str
-    is_paid: bool = False
-
-
-_PERCEPTION = f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"
-_RUN = f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"
-_REPLY = f"(images/)?{_HEX}+\\.(json|png)"
-_KINDS = (
-    CacheKind("perception", _PERCEPTION, "detections in frames: further runs on the same frames are many times faster"),
-    CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds per gigabyte"),
-    CacheKind("runs", _RUN, "small files of runs that are stored elsewhere, such as s3://"),
-    CacheKind("replies", _REPLY, "replies of language models outside a run, which may have cost money", is_paid=True),
-)
-KINDS = {kind.name: kind for kind in _KINDS}
-
-
-@dataclass(frozen=True)
-class CacheEntry:
-    """A cached file: its path below the kind's folder, its size, and its modification time (seconds since 1970)."""
-
-    name: str
-    n_bytes: int
-    written: float
-
-
-def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
-    """The files of ``kind`` below ``root``; files with another form of name and links are ignored."""
-    top = root / kind.name
-    for place, folders, names in () if top.is_symlink() else os.walk(top):
-        folders.sort()
-        for path in (Path(place, name) for name in sorted(names)):
-            name = path.relative_to(top).as_posix()
-            with suppress(FileNotFoundError):  # removed meanwhile
-                status = path.lstat()
-                if stat.S_ISREG(status.st_mode) and re.fullmatch(kind.form, name):
-                    yield CacheEntry(name, status.st_size, status.st_mtime)
-
-
-def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tuple[int, int]:
-    """Remove the files of ``kind`` written before a time; returns their number and bytes.
-
-    Folders stay, because a run may be about to write there; files locked by a running process stay too.
-    """
-    top, state = root / kind.name, dict[str, bool]()
-    n_files = n_bytes = 0
-    for entry in cache_entries(root, kind):
-        run = entry.name.partition("/")[0]
-        if kind.name == "runs" and run not in state:
-            state[run] = is_locked(top / run)
-        if entry.written >= before or state.get(run, False):
-            continue
-        remove_file(top / entry.name)
-        n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
-    return n_files, n_bytes
 
 
 def size_text(n_bytes: int) -> str:

@@ -150,13 +150,3 @@ def test_instances_command_has_one_row_each(run: Path, tmp_path: Path, capsys: p
     assert main(["report", "instances", str(run), "--methods", "oracle", "--scenes", "painted/b"]) == 0
     result = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert {(row["method"], row["scene"]) for row in result} == {("oracle", "painted/b")}
-
-
-def test_parquet_has_the_same_rows_and_column_descriptions(run: Path, tmp_path: Path) -> None:
-    from pyarrow import parquet
-
-    file = tmp_path / "samples.parquet"
-    assert main(["report", "instances", str(run), "--out", str(file), "--quiet"]) == 0
-    table = parquet.read_table(file)
-    assert [InstanceRow(**row) for row in table.to_pylist()] == list(instance_rows([run]).rows)
-    assert table.schema.field("best_iou").metadata[b"meaning"].startswith(b"highest IoU")

@@ -56,7 +56,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "sheets pictures": ("out --texts toilet --out heat.svg", 0, "heat.svg"),
     "query text": ("rooms/bathroom0 'plant on shelf' --run out", 0, "opensu3d"),
     "query make": (f"--scenes {PAINTED}/a --per-kind 1 --out queries.toml", 0, "queries.toml"),
-    "query audit": (f"--scenes {PAINTED}/a --n-questions 2 --out audit", 0, "audit/index.html"),
     "query score": ("none.json --answers none.json", 2, "none.json"),
     "query show": ("paper", 0, "904 questions on 13 scenes"),
     "query ask": ("rooms/bathroom0 'What is the largest object?' --run out", 0, "#"),
@@ -70,7 +69,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "methods show": ("opensu3d", 0, "opensu3d"),
     "models list": ("", 0, "clip-vit-h-14"),
     "models check": ("clip-vit-h-14", 1, "clip-vit-h-14"),
-    "models warm": ("--profile embedded", 0, ""),
     "models fetch": ("sam-vit-h --dry-run", 0, "sam_vit_h_4b8939.pth"),
     "datasets fetch replica": ("frames --dry-run", 0, "Replica.zip"),
     "datasets fetch scannet": ("", 2, "ScanNet_TOS.pdf"),
@@ -82,8 +80,6 @@ CASES: dict[str, tuple[str, int, str]] = {
     "datasets new": ("my_dataset.py", 0, "my_dataset.py"),
     "protocols new": ("mine.toml", 0, "mine.toml"),
     "dev registry new": ("my-registry", 0, "my-registry/README.md"),
-    "dev cache list": ("", 0, "perception"),
-    "dev cache clear": ("all --dry-run", 0, "would be removed"),
     "dev completion": ("bash", 0, "complete -o"),
     "dev doctor": ("", 0, "the main job can run"),
     "runs export": ("out --to openlex3d --method opensu3d --out exported", 0, "exported"),
@@ -92,7 +88,7 @@ CASES: dict[str, tuple[str, int, str]] = {
 # These write nothing, so they can be run twice.
 READING = (
     *("compare", "report leaderboard", "runs list", "runs show", "query show", "datasets list", "models list"),
-    *("methods list", "methods show", "protocols list", "protocols show", "protocols diff", "dev cache list"),
+    *("methods list", "methods show", "protocols list", "protocols show", "protocols diff"),
 )
 FINISHED: dict[str, str] = {}  # digests of the run's files by name, after the command run
 

@@ -63,7 +63,6 @@ CASES: dict[str, list[list[str]]] = {
     "sheets pictures": [["RUN", "--draw", "labels", "--out", "out/labels.svg"]],
     "query text": [["SCENE", "plant", "--run", "RUN", "--method", "METHOD"]],
     "query show": [["questions.toml"]],
-    "query audit": [["--score", "audit.csv"]],
     "query ask": [["SCENE", "What is the largest object?", "--run", "RUN", "--method", "METHOD"]],
     "runs refine": [["RUN", "--method", "METHOD"]],
     "datasets list": [["--json"]],
@@ -184,7 +183,6 @@ def write_files(whole: Path) -> None:
     )
     Path("questions.toml").write_text(f"[[query]]\nscene = {quoted}\ntext = {quoted}\nobjects = [1]\n")
     Path("lines.txt").write_text("a chair\n" + " ".join(HOSTILE.splitlines()) + "\n")  # one text per line
-    Path("audit.csv").write_text(f'number,scene,kind,text,answer,verdict,remark\n1,a,b,"{HOSTILE}",c,right,d\n')
     Path("answers.csv").write_text(f'sheet_id,item_id,annotator,ask,answer\n"{HOSTILE}",1,a,b,c\n')
     for folder in ("predictions", "truth"):
         Path(folder).mkdir()

@@ -83,9 +83,6 @@ def test_check_reports_faults_with_exit_code_1(found: Path, capsys: pytest.Captu
     [
         (["models", "check"], "no models found"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),
-        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench models fetch clip-vit-b-32"),
-        (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
-        (["models", "warm", "embedded", "--profile", "paper"], "give an encoder or --profile, not both"),
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
     ],
 )
@@ -95,13 +92,6 @@ def test_invalid_request_is_a_one_line_error(words: list[str], line: str, capsys
     assert out == ""
     assert line in err
     assert len(err.splitlines()) == 1
-
-
-def test_warm_prints_time_memory_and_the_digest_of_run_records(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["models", "warm", "clip-vit-b-32"]) == 0
-    out = capsys.readouterr().out
-    assert "ViT-B-32/openai: loaded and first run" in out
-    assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
 
 
 def test_invalid_device_is_an_early_error(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,8 +17,9 @@ from written_scenes import write_scene
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets import writing
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.writing import plan_scenes, write_frames
+from su3d_bench.datasets.writing import plan_scenes
 
 CHAIR, WALL = 20, 93
 WIDTH, HEIGHT, N_FRAMES = 16, 12, 5
@@ -164,29 +165,22 @@ def test_kill_leaves_no_partial_scene_and_resuming_gives_the_same_bytes(
         write_scene(LAYOUTS[name], Stage(), ROOM, root)
         assert content(root) == undisturbed[name], n
         assert not list(root.rglob(".*")), n
-    assert n > N_FRAMES
+    assert n > 3
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_frames_of_a_killed_process_are_reused_only_for_the_same_inputs(name: str, tmp_path: Path) -> None:
+def test_scene_of_a_killed_process_is_written_again(
+    name: str, tmp_path: Path, undisturbed: dict[str, dict[str, bytes]]
+) -> None:
     with pytest.raises(KeyboardInterrupt):
-        write_scene(LAYOUTS[name], Stage(dies_at=3), ROOM, tmp_path / "one")
-    assert scenes(name, tmp_path / "one") == []
-    next((tmp_path / "one").rglob(".*.partial")).joinpath(".half.0123456789ab.unfinished").write_bytes(b"half")
-    again = Stage()
-    write_scene(LAYOUTS[name], again, ROOM, tmp_path / "one")
-    assert set(again.rendered) - {0} == {3, 4}  # the first is rendered for the image size
-    check_is_whole(name, tmp_path / "one")
-    assert not list((tmp_path / "one").rglob(".*"))
-    with pytest.raises(KeyboardInterrupt):
-        write_scene(LAYOUTS[name], Stage(dies_at=3), ROOM, tmp_path / "two")
-    other = Stage(kind="other")
-    write_scene(LAYOUTS[name], other, ROOM, tmp_path / "two")
-    assert set(other.rendered) == set(range(N_FRAMES))
+        write_scene(LAYOUTS[name], Stage(dies_at=3), ROOM, tmp_path)
+    assert scenes(name, tmp_path) == []
+    write_scene(LAYOUTS[name], Stage(), ROOM, tmp_path)
+    assert content(tmp_path) == undisturbed[name]
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_complete_scene_is_kept_and_lost_ground_truth_is_restored_without_frames(
+def test_complete_scene_is_kept_and_lost_files_are_restored(
     name: str, tmp_path: Path, undisturbed: dict[str, dict[str, bytes]]
 ) -> None:
     layout = LAYOUTS[name]
@@ -194,11 +188,9 @@ def test_complete_scene_is_kept_and_lost_ground_truth_is_restored_without_frames
     before = {path: (tmp_path / path).stat().st_mtime_ns for path in files_below(tmp_path)}
     write_scene(layout, Stage(dies_at=0), ROOM, tmp_path)
     assert {path: (tmp_path / path).stat().st_mtime_ns for path in files_below(tmp_path)} == before
-    for path in layout.target(ROOM, "", tmp_path).truth:
+    for path in (path for path in layout.target(ROOM, "", tmp_path).files if path.is_file()):
         path.unlink()
-        again = Stage()
-        write_scene(layout, again, ROOM, tmp_path)
-        assert set(again.rendered) <= {0}
+        write_scene(layout, Stage(), ROOM, tmp_path)
         assert content(tmp_path) == undisturbed[name]
 
 
@@ -231,8 +223,8 @@ def test_full_disk_is_one_line_and_leaves_nothing_partial(
 
     layout = LAYOUTS[name]
     stage: Any = Stage()
-    target = plan_scenes(layout, stage, [ROOM], tmp_path)[0]
+    (target,) = plan_scenes(layout, stage, [ROOM], tmp_path)
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match="disk is full"):
-        write_frames(layout, stage, target, range(N_FRAMES))
-    assert not [path for path in files_below(tmp_path) if path.endswith(".unfinished")]
+        writing.write_scene(layout, stage, target)
+    assert not list(tmp_path.rglob(".*")) and scenes(name, tmp_path) == []

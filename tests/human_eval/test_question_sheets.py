@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bedroom_map import placed
 from painted import LABELS, Painted
 from painted_runs import PAINTED
 from simulated_annotators import SET_ID
 
 from su3d_bench.cli.main import main
 from su3d_bench.human_eval.answers import Judgement, check_key
-from su3d_bench.human_eval.drafts import question_drafts
+from su3d_bench.human_eval.drafts import question_drafts, reference_ids
 from su3d_bench.human_eval.items import (
     ANSWER_COLUMNS,
     ARGUABLE,
@@ -36,6 +37,7 @@ from su3d_bench.human_eval.sources import TruthSource, ground_truth_of_addresses
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.ground_truths import fullest_truth, scene_objects
 from su3d_bench.questions.model import GENERATED_KINDS, REASONING, question_id
+from su3d_bench.questions.scene_map import SceneMap
 
 SCENE = f"{PAINTED}/a"
 PARTS = tuple(ask.name for ask in ASKS["questions"])
@@ -59,6 +61,26 @@ def painted_objects() -> Any:
 
 
 # Creating
+
+
+def test_reference_of_a_negative_answer_is_the_last_name_in_the_text() -> None:
+    # Two tables, a vase on each and one on the floor far away, a coffee table with a lamp, a desk with a cup.
+    scene = SceneMap(
+        (
+            placed(1, "table", (0.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
+            placed(2, "table", (6.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
+            placed(3, "vase", (0.4, 0.4, 0.7), (0.2, 0.2, 0.3)),
+            placed(4, "vase", (9.0, 9.0, 0.0), (0.2, 0.2, 0.3)),
+            placed(5, "coffee table", (3.0, 3.0, 0.0), (1.0, 0.5, 0.4)),
+            placed(6, "lamp", (3.2, 3.2, 0.4), (0.2, 0.2, 0.4)),
+            placed(7, "desk", (9.0, 0.0, 0.0), (1.0, 0.5, 0.7)),
+            placed(8, "cup", (9.4, 0.2, 0.7), (0.1, 0.1, 0.1)),
+        )
+    )
+    made = {one.text: one for one in generate_questions(scene, n_each=20)}
+    no, yes = (made[f"Is there a {name} on the coffee table?"] for name in ("cup", "lamp"))
+    assert no.answer.value is False and reference_ids(no, scene) == [5]
+    assert yes.answer.object_ids == (6,) and reference_ids(yes, scene) == [5]
 
 
 def test_each_kind_and_template_has_the_ground_truth_answer(source: TruthSource) -> None:

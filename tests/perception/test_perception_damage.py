@@ -13,25 +13,14 @@ from test_perception_stored import written
 from test_perception_stored_images import images, write_image
 
 from su3d_bench.perception.models.catalogue import model_entry
-from su3d_bench.perception.models.encoders.encoder import EncoderManifest, transformers_spec
+from su3d_bench.perception.models.encoders.encoder import transformers_spec
 from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.masks.grounded_sam import read_word_list
-from su3d_bench.perception.models.masks.sam import SamManifest
+from su3d_bench.perception.models.masks.grounded_sam import RAM_FORMAT, exported_files, read_word_list
 from su3d_bench.perception.stored import read_stored
 from su3d_bench.perception.stored_masks import read_names
 
-TRANSFORM = {
-    "size": 32, "fit": "shortest", "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5, 0.5], "resample": 3,
-    "convention": "original",
-}  # fmt: skip
-ENCODER = {
-    "format": EncoderManifest.FORMAT, "name": "clip-vit-h-14",
-    "spec": {"dim": 24, "n_tokens": 16, "n_words": 90, "tokens": "clip", "pad_id": None, "transform": TRANSFORM},
-    "files": {"image.onnx": "0" * 64, "text.onnx": "1" * 64},
-}  # fmt: skip
-SEGMENTER = {
-    "format": SamManifest.FORMAT, "name": "sam-vit-h", "image_px": 64,
-    "files": {"encoder.onnx": "0" * 64, "decoder.onnx": "1" * 64},
+TAGGER = {
+    "format": RAM_FORMAT, "name": "ram-plus", "files": {"ram_plus.onnx": "0" * 64, "ram_tag_list.txt": "1" * 64},
 }  # fmt: skip
 CONFIG = {
     "model_type": "siglip", "vision_config": {"image_size": 32, "patch_size": 8, "hidden_size": 32},
@@ -56,14 +45,13 @@ def encoder_spec(path: Path) -> object:
 @pytest.mark.parametrize(
     ("name", "content", "read"),
     [
-        ("manifest.json", json.dumps(ENCODER), EncoderManifest.read),
-        ("manifest.json", json.dumps(SEGMENTER), SamManifest.read),
+        ("manifest.json", json.dumps(TAGGER), exported_files),
         ("config.json", json.dumps(CONFIG), encoder_spec),
         ("preprocessor_config.json", json.dumps(PREPROCESSOR), encoder_spec),
         ("names.toml", '48 = "book"\n132 = "box of things"\n', lambda path: read_names(path, "rgbd/desk")),
         ("words.txt", "# things\nchair\ncoffee table\n", read_word_list),
     ],
-    ids=["encoder", "segmenter", "config", "preprocessor", "names", "words"],
+    ids=["tagger", "config", "preprocessor", "names", "words"],
 )
 def test_damaged_texts_are_read_or_rejected(
     tmp_path: Path, name: str, content: str, read: Callable[[Path], object]

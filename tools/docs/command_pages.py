@@ -44,7 +44,6 @@ MORE = {
     "check": "See [Regression check in CI](running/regression-check.md).",
     "query ask": "See [Questions about a scene](questions/reasoning.md).",
     "query make": "Score maps with `--protocols rooms-retrieval`: [Several texts per object](questions/objects.md).",
-    "query audit": "See [Check generated questions](questions/check-questions.md).",
     "sheets make": "Sheets do not reveal the method: [Human evaluation](questions/human-evaluation.md).",
     "sheets score": "Tables IV and V of the paper: [Scores of human evaluation](questions/human-scores.md).",
     "compare": "Sign-flip test with Holm's correction; runs with other data, rules or encoders are rejected: "
@@ -54,7 +53,6 @@ MORE = {
     "datasets check": "See [Datasets](datasets.md).",
     "datasets make": "See [Datasets](datasets.md).",
     "models list": "See [Models](methods/models.md).",
-    "dev cache list": "See [Environment](running/environment.md).",
     "dev doctor": "See [Environment](running/environment.md).",
     "dev completion": "See [Environment](running/environment.md).",
 }

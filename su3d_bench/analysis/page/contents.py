@@ -1,4 +1,4 @@
-"""All contents of the HTML report of runs: their numbers and their scenes, computed in parallel or from the cache."""
+"""All contents of the HTML report of runs: their numbers and their scenes, computed in parallel."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ import itertools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.attribution import Explained, explained_of
+from su3d_bench.analysis.attribution import Explained, JobCounts, attribution_of, explained_of
 from su3d_bench.analysis.comparison import compare
-from su3d_bench.analysis.page import page_cache
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
-from su3d_bench.analysis.page.page_cache import Job, SceneContent
 from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.analysis.sides import Side, SideNumbers
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, printable_json
@@ -287,14 +285,26 @@ class Contents:
         return [page_map for scene in self.scenes for page_map in scene.maps]
 
 
+Job = tuple[int, str]  # index of the run, method
+
+
+@dataclass
+class SceneContent:
+    """The results of one scene; the errors of a job are a text if they could not be computed."""
+
+    scene: str
+    errors: dict[Job, JobCounts | str] = field(default_factory=dict)
+    page: PageScene | None = None
+    gallery: SceneGallery | None = None
+
+
 @dataclass(frozen=True)
 class SceneRequest:
-    """What is needed for one scene: maps of some jobs, errors of some jobs, and the cache entry."""
+    """What is needed for one scene: maps of some jobs, and errors of some jobs."""
 
     scene: str
     maps: tuple[Job, ...]
     explained: tuple[Job, ...]
-    place: page_cache.CacheFile
 
     @property
     def n_steps(self) -> int:
@@ -331,18 +341,17 @@ def page_contents(
     explained = _explained(runs) if options.with_errors and are_all_read(runs) else {}
     reported = [job for job, one in explained.items() if isinstance(one, Explained)]
     max_photos = photos_of_each(len({scene for index, _ in reported for scene in runs[index].scenes}), len(reported))
-    wanted = _wanted(runs, maps, reported, [options.queries, max_points, max_photos, options.with_gallery])
-    made = {one.scene: found for one in wanted if (found := one.place.load(runs)) is not None}
-    asked = [one for one in wanted if one.scene not in made]
-    begin(sum(one.n_steps for one in asked))
-    batch = Batch(folders, options, max_points, max_photos, tuple(asked))
-    made |= {one.scene: one for one in _all_made(batch, report)}
-    made = {one.scene: made[one.scene] for one in wanted}
+    wanted = _wanted(runs, maps, reported)
+    begin(sum(one.n_steps for one in wanted))
+    found = {
+        one.scene: one for one in _all_made(Batch(folders, options, max_points, max_photos, tuple(wanted)), report)
+    }
+    made = {one.scene: found[one.scene] for one in wanted}
     errors = []
     for (index, method), one in explained.items():
         job = index, method
         of_scenes = {scene: made[scene].errors[job] for scene in made if job in made[scene].errors}
-        errors.append({**page_cache.errors_of(one, method, of_scenes), "run": index})  # replaces the name of the run
+        errors.append({**_errors_of(one, method, of_scenes), "run": index})  # replaces the name of the run
     shown = tuple(one.page for one in made.values() if one.page is not None)
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
     return Contents(page_numbers(runs, errors), shown, galleries, max_points)
@@ -360,9 +369,7 @@ def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
     return explained
 
 
-def _wanted(
-    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], options: Sequence[Any]
-) -> list[SceneRequest]:
+def _wanted(runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job]) -> list[SceneRequest]:
     """What is needed for each scene; scenes with maps first."""
     shown: dict[str, list[Job]] = {}
     for index, _, scene, method in maps:
@@ -372,16 +379,20 @@ def _wanted(
         for scene in runs[index].scenes:
             if is_file(runs[index].folder.job(scene, method).counts):
                 counted_jobs.setdefault(scene, []).append((index, method))
-    asked = []
-    for scene in dict.fromkeys([*shown, *counted_jobs]):
-        of_maps, of_errors = shown.get(scene, []), counted_jobs.get(scene, [])
-        jobs = dict.fromkeys([*of_maps, *of_errors])
-        # the cost of an error depends on the counts of every scene
-        counts = [page_cache.state_of_counts(runs[index], method) for index, method in of_errors]
-        states = [[index, *page_cache.state_of_scene(runs[index], scene, method)] for index, method in jobs]
-        place = page_cache.piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *options])
-        asked.append(SceneRequest(scene, tuple(of_maps), tuple(of_errors), place))
-    return asked
+    scenes = dict.fromkeys([*shown, *counted_jobs])
+    return [SceneRequest(scene, tuple(shown.get(scene, ())), tuple(counted_jobs.get(scene, ()))) for scene in scenes]
+
+
+def _errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, JobCounts | str]) -> dict[str, Any]:
+    """The errors of a method in the page's form; a text in place of errors becomes their ``reason``."""
+    reasons = [explained] if isinstance(explained, str) else [one for one in of_scenes.values() if isinstance(one, str)]
+    try:
+        if not isinstance(explained, str) and not reasons:
+            corrected = {scene: one for scene, one in of_scenes.items() if not isinstance(one, str)}
+            return {**attribution_of(explained, corrected).to_json(), "reason": None}
+    except Su3dError as error:
+        reasons = [str(error)]
+    return {"method": method, "protocols": [], "remarks": [], "reason": reasons[0]}
 
 
 def _all_made(batch: Batch, report: Report) -> list[SceneContent]:
@@ -397,11 +408,11 @@ def _all_made(batch: Batch, report: Report) -> list[SceneContent]:
 
 def _lost(batch: Batch, cause: str) -> list[SceneContent]:
     scenes = printable(", ".join(asked.scene for asked in batch.scenes), 200)
-    raise DataError(f"{scenes}: {cause}; finished scenes are cached")
+    raise DataError(f"{scenes}: {cause}")
 
 
 def _make(batch: Batch, report: Report) -> list[SceneContent]:
-    """The scenes of ``batch``, each cached as soon as it is finished."""
+    """The scenes of ``batch``."""
     runs = [read_run(folder) for folder in batch.folders]
     spaces = Spaces(batch.options.queries)
     explained = cache(lambda index, method: explained_of(runs[index], method))
@@ -437,7 +448,6 @@ def _make_scene(
                 gallery.add(index, of_job, evaluated)
         except Su3dError as error:
             made.errors[index, method] = str(error)
-            gallery.lacks = True
     if asked.explained and batch.options.with_gallery:
         report_activity("photos of errors")
         try:
@@ -448,7 +458,5 @@ def _make_scene(
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
         made.page = page_scene(asked.scene, maps, spaces, data, batch.max_points, report_activity, seen)
-    if made.is_whole:
-        asked.place.save(made, runs)
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))
     return made

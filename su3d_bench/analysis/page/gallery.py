@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -151,11 +151,6 @@ class SceneGallery:
     scene: str
     of_methods: tuple[Cards, ...]
     photos: tuple[str, ...]
-    is_whole: bool
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON values for a page."""
-        return {name: value for name, value in asdict(self).items() if name != "is_whole"}
 
 
 def summary_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
@@ -194,7 +189,6 @@ class GalleryOfScene:
         self._scene, self._max_photos = scene, max_photos
         self._cards: list[tuple[Cards, list[ErrorView]]] = []
         self._fed: list[int] = []
-        self.lacks = False  # whether a method's errors or frames are missing
 
     def add(self, index: int, explained: Explained, evaluated: Mapping[str, EvaluatedScene]) -> None:
         """Add the errors of the method of ``explained``, from run ``index``, under each protocol."""
@@ -218,12 +212,11 @@ class GalleryOfScene:
         places = sorted((k, of) for of, (_, seen) in enumerate(self._cards) for k in range(len(seen)))
         places = places[: self._max_photos]
         taken: Sequence[tuple[int, str] | str] = [str(dataset)] * len(places)
-        self.lacks |= isinstance(dataset, str)
         if places and not isinstance(dataset, str):
             try:
                 taken = _photos([self._cards[of][1][k] for k, of in places], dataset, data, self._fed)
             except Su3dError as error:
-                self.lacks, taken = True, [str(error)] * len(places)
+                taken = [str(error)] * len(places)
         cards, photos = [list(summary.cards) for summary, _ in self._cards], list[str]()
         for (k, of), photo in zip(places, taken, strict=True):
             if isinstance(photo, str):
@@ -232,7 +225,7 @@ class GalleryOfScene:
                 cards[of][k] = replace(cards[of][k], photo=len(photos), frame=photo[0], why=None)
                 photos.append(photo[1])
         of_methods = tuple(replace(one, cards=tuple(own)) for (one, _), own in zip(self._cards, cards, strict=True))
-        return SceneGallery(printable(self._scene, 200), of_methods, tuple(photos), not self.lacks)
+        return SceneGallery(printable(self._scene, 200), of_methods, tuple(photos))
 
 
 def _card(error: SingleError, scene: EvaluatedScene, metrics: Sequence[str], ids: Sequence[int]) -> Card:

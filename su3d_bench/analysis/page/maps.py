@@ -108,11 +108,6 @@ class PageScene:
     truths: tuple[str, ...]
     remarks: tuple[str, ...]
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether nothing is missing, so that the result can be cached."""
-        return not self.remarks and all(page_map.reason is None for page_map in self.maps)
-
     def listed(self) -> dict[str, Any]:
         """The scene in the page's format, without its maps."""
         about = {"scene": self.scene, "thumbnails": dict(self.thumbnails)}

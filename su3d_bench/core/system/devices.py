@@ -22,7 +22,6 @@ LARGEST_BATCH = 256
 # float16 has its own units from compute capability 7.0 (Volta) on; before, half is not faster or not supported.
 HALF_CAPABILITY = (7, 0)
 EXTRA_PACKAGES = {"torch", "transformers", "safetensors", "onnx", "tokenizers", "openai", "huggingface_hub"}
-INSTALLED_AS = {"open_clip": "open_clip_torch", "ram": "git+https://github.com/xinyu1205/recognize-anything"}
 _log = logging.getLogger(__name__)
 
 
@@ -43,7 +42,7 @@ def require_installed(package: str, needed_by: str) -> None:
 
 
 def _not_installed(package: str, needed_by: str) -> ModelMissing:
-    command = INSTALLED_AS.get(package, "'su3d-bench[models]'" if package in EXTRA_PACKAGES else package)
+    command = "'su3d-bench[models]'" if package in EXTRA_PACKAGES else package
     return ModelMissing(f"{needed_by} needs the package '{package}': pip install {command}")
 
 

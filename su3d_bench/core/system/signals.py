@@ -57,7 +57,7 @@ def ending_in_order() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        if ended and not isinstance(interrupt, Terminated):  # Ray treats what a handler raises as Ctrl-C
+        if ended and not isinstance(interrupt, Terminated):  # some libraries raise Ctrl-C for what a handler raises
             raise Terminated(ended) from interrupt
         raise
     finally:
@@ -72,20 +72,6 @@ def is_interrupt(error: BaseException) -> bool:
     """
     is_handled = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
     return isinstance(error, Terminated) or (isinstance(error, KeyboardInterrupt) and not is_handled)
-
-
-@contextmanager
-def restored_handlers() -> Iterator[None]:
-    """Restore the signal handlers of ``ENDING`` after the block, in case a library replaces them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.getsignal(number) for number in ENDING}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _detach_from_terminals() -> None:

@@ -1,4 +1,4 @@
-"""The project's own encoder, run by ONNX Runtime without download, GPU or torch; on a GPU it is run by torch.
+"""The project's own encoder, run by ONNX Runtime on the CPU, without download, GPU or torch.
 
 Its training and its measured accuracy are in ``model_card.md`` next to the weights.
 """
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import ModelMissing
-from su3d_bench.core.system.devices import require
+from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.embedded.lexicon import DIM, TOKENIZER_VERSION, token_ids, unknown_words
@@ -55,8 +55,7 @@ class EmbeddedEncoder:
 
     Every text runs through the network alone and on one thread, so that a feature never depends on the rest of the
     batch or on the number of cores. Images run in batches if a test at first use shows that this changes no bit,
-    otherwise one by one. On a ``device`` other than ``cpu`` torch runs the towers, images always in batches, and
-    features differ from those of the CPU by rounding.
+    otherwise one by one. ``device``: where its features are compared; the towers always run on the CPU.
     """
 
     name = "su3d-embedded"
@@ -68,23 +67,14 @@ class EmbeddedEncoder:
         "trained on"
     )
 
-    def __init__(self, folder: Path | None = None, device: str = "cpu") -> None:
+    def __init__(self, folder: Path | None = None, device: str = CPU) -> None:
         self._folder = Path(__file__).parent / "weights" if folder is None else folder
         self.device = device
 
     @cached_property
     def digest(self) -> str:
-        """A digest of the weights of both towers, the preprocessing, the tokenizer and the kind of device."""
-        return self._digest_on(self.device.partition(":")[0])
-
-    def is_same_space(self, digest: str) -> bool:
-        """Whether ``digest`` is of the same weights and preprocessing, possibly on another device."""
-        return digest in (self._digest_on("cpu"), self._digest_on("cuda"))
-
-    def _digest_on(self, kind: str) -> str:
-        versions = f"{PREPROCESSING_VERSION}/{TOKENIZER_VERSION}/{IMAGE_SIZE}/{DIM}"
-        versions += "" if kind == "cpu" else f"/torch on {kind}"
-        content = hashlib.sha256(versions.encode())
+        """A digest of the weights of both towers, the preprocessing and the tokenizer."""
+        content = hashlib.sha256(f"{PREPROCESSING_VERSION}/{TOKENIZER_VERSION}/{IMAGE_SIZE}/{DIM}".encode())
         for name in (IMAGE_FILE, TEXT_FILE):
             content.update(hashlib.sha256(file_bytes(self._path(name))).digest())
         return content.hexdigest()
@@ -112,8 +102,6 @@ class EmbeddedEncoder:
     @cached_property
     def _batch(self) -> int:
         """The batch size of images: 1 if the kernels on this machine round differently in a batch."""
-        if self.device != "cpu":
-            return BATCH
         noise = np.random.default_rng(0)
         pixels = noise.integers(0, 256, (N_TRIED, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         log_sizes = noise.uniform(-1, 1, (N_TRIED, 2)).astype(np.float32)
@@ -135,20 +123,11 @@ class EmbeddedEncoder:
 
     @cached_property
     def _image_tower(self) -> Any:
-        return self._tower(IMAGE_FILE)
+        return open_session(self._path(IMAGE_FILE))
 
     @cached_property
     def _text_tower(self) -> Any:
-        return self._tower(TEXT_FILE)
-
-    def _tower(self, name: str) -> Any:
-        path = self._path(name)
-        if self.device == "cpu":
-            return open_session(path)
-        require("torch", f"device '{self.device}'")
-        from su3d_bench.perception.embedded.torch_towers import TorchTower
-
-        return TorchTower(path, is_image=name == IMAGE_FILE, device=self.device)
+        return open_session(self._path(TEXT_FILE))
 
     def _path(self, name: str) -> Path:
         path = self._folder / name

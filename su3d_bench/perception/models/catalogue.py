@@ -12,7 +12,7 @@ from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.system.files import file_text, parse_toml
 
 Kind = Literal["encoder", "segmenter", "detector", "tagger"]
-FormName = Literal["transformers", "open_clip", "original", "onnx"]
+FormName = Literal["transformers", "original", "onnx"]
 
 ONNX_MANIFEST = "manifest.json"
 
@@ -21,8 +21,8 @@ ONNX_MANIFEST = "manifest.json"
 class ModelForm:
     """One set of files of a model; the first of ``files`` is the weights.
 
-    ``repository`` is its name on the Hugging Face hub, ``source`` the address for a manual download; ``architecture``
-    its name in open_clip; ``sha256`` by file name; ``is_read`` false: only recognised, not loaded.
+    ``repository`` is its name on the Hugging Face hub, ``source`` the address for a manual download; ``sha256`` by file
+    name; ``is_read`` false: only recognised, not loaded.
     """
 
     form: FormName
@@ -30,7 +30,6 @@ class ModelForm:
     source: str
     size_mb: int
     repository: str | None = None
-    architecture: str | None = None
     sha256: Mapping[str, str] = field(default_factory=dict, hash=False)
     is_read: bool = True
 

@@ -11,11 +11,9 @@ from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE
 from su3d_bench.perception.models.catalogue import MODELS, Kind
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig
-from su3d_bench.perception.models.onnx import Provider
 
 EMBEDDED = "embedded"
 Precision = Literal["auto", "float32", "float16", "bfloat16"]
-Runtime = Literal["torch", "open_clip", "onnx"]
 
 
 def _one_of(kind: Kind, *more: str) -> AfterValidator:
@@ -35,10 +33,9 @@ class ModelsConfig(BaseModel):
 
     ``device``: ``cpu``, ``cuda`` (the GPUs in turn, one per job) or ``cuda:1``. ``precision`` ``auto``: float16 on a
     GPU that supports it, otherwise float32. ``batch`` 0: 1 on the CPU, so that no feature depends on the rest of its
-    batch, and as much as fits into memory on a GPU. ``encoder`` None: the profile's own. ``runtime``: the library that
-    runs the encoder; ``provider`` None: the one of ``device``, only for ``runtime`` ``onnx``. ``folder``: searched
-    instead of ``$SU3D_MODELS``; ``paths``: a model's folder or file by model name. ``transform``: ``original`` prepares
-    images as open_clip does, ``transformers`` as that library's image processor does.
+    batch, and as much as fits into memory on a GPU. ``encoder`` None: the profile's own. ``folder``: searched instead
+    of ``$SU3D_MODELS``; ``paths``: a model's folder or file by model name. ``transform``: ``original`` prepares images
+    as open_clip does, ``transformers`` as that library's image processor does.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -47,8 +44,6 @@ class ModelsConfig(BaseModel):
     precision: Precision = "auto"
     batch: int = Field(default=0, ge=0, le=4096)
     encoder: Annotated[str, _one_of("encoder", EMBEDDED)] | None = None
-    runtime: Runtime = "torch"
-    provider: Provider | None = None
     transform: Literal["original", "transformers"] = "original"
     folder: Path | None = None
     paths: dict[str, Path] = {}
@@ -68,26 +63,16 @@ class ModelsConfig(BaseModel):
             raise ValueError(f"'{unknown[0]}' is not a known model; known: {', '.join(MODELS)}")
         return paths
 
-    @model_validator(mode="after")
-    def _belong_together(self) -> ModelsConfig:
-        if self.provider is not None and self.runtime != "onnx":
-            raise ValueError("provider belongs to runtime 'onnx'")
-        if self.provider is not None and (self.provider == "cpu") != (self.device == "cpu"):
-            raise ValueError(f"provider '{self.provider}' does not run on device '{self.device}'")
-        if self.runtime == "onnx" and self.precision not in ("auto", "float32"):
-            raise ValueError(f"precision '{self.precision}': exported encoders are float32")
-        return self
 
-
-TaggerName = Literal["auto", "ram", "ram-onnx", "words"]
+TaggerName = Literal["auto", "ram-onnx", "words"]
 
 
 class PaperConfig(BaseModel):
     """Tags, boxes and masks; the defaults are OpenSU3D's.
 
-    ``tagger`` ``auto``: RAM++ from its package, otherwise exported, otherwise the most likely ``n_tags`` words of
+    ``tagger`` ``auto``: the exported RAM++, otherwise the most likely ``n_tags`` words of
     ``words``, a text file (our own list if not set). ``grounded`` and ``automatic`` apply to methods that request no
-    settings of their own. ``segmenter``: which SAM; ``sam_runtime`` ``onnx``: as exported by ``tools/export_onnx.py``.
+    settings of their own. ``segmenter``: which SAM.
     ``captions`` ``model``: names and captions of crops come from the vision model of ``perception.language``.
     """
 
@@ -97,13 +82,12 @@ class PaperConfig(BaseModel):
     words: Path | None = None
     n_tags: int = Field(default=20, ge=1, le=200)
     segmenter: Annotated[str, _one_of("segmenter")] = "sam-vit-h"
-    sam_runtime: Literal["torch", "onnx"] = "torch"
     grounded: GroundedConfig = GroundedConfig()
     automatic: AutomaticMaskConfig = AutomaticMaskConfig()
     captions: Literal["template", "model"] = "template"
 
     @model_validator(mode="after")
     def _words_are_used(self) -> PaperConfig:
-        if self.words is not None and self.tagger in ("ram", "ram-onnx"):
+        if self.words is not None and self.tagger == "ram-onnx":
             raise ValueError(f"words are for the tagger 'words', but '{self.tagger}' has its own list")
         return self

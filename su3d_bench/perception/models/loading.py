@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import CPU, device_for, precision_for, require, require_installed
-from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, FormName, ModelEntry, model_entry
-from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig, Runtime
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.models.encoders import encoder as encoders
-from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
-from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
-from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate, read_settings, read_weights
+from su3d_bench.perception.models.encoders.encoder import FoundationEncoder, Towers
+from su3d_bench.perception.models.encoders.texts import read_tokeniser
+from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
 from su3d_bench.perception.models.masks import grounded_sam
 from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
-from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
-from su3d_bench.perception.models.onnx import OnnxManifest, Provider, has_provider, open_session, wrong_files
+from su3d_bench.perception.models.masks.sam import Sam, load_sam
+from su3d_bench.perception.models.onnx import Provider, has_provider, open_session
 
 _log = logging.getLogger(__name__)
-RUNTIME_FORM: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
-PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
-    "torch": ("torch", "transformers"),
-    "open_clip": ("torch", "open_clip"),
-    "onnx": ("onnxruntime", "transformers"),
-}
+PACKAGES = ("torch", "transformers")
 
 
 def load_encoder(
@@ -53,31 +42,24 @@ def load_encoder(
     if name == EMBEDDED:
         from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
-        if config.runtime != "torch":
-            raise ConfigError(
-                f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; choose "
-                "perception.models.encoder or --profile paper"
-            )
         return EmbeddedEncoder(device=device_for(config.device, job_index))
     files = encoder_files(config, name)
-    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+    for package in PACKAGES:
         require(package, f"encoder '{name}'")
-    if config.runtime == "onnx":
-        return _onnx_encoder(config, files, cache, job_index)
     return _torch_encoder(config, files, cache, job_index)
 
 
 def check_encoder(config: ModelsConfig, name: str) -> None:
     """Raises the errors of ``load_encoder`` for packages and files of encoder ``name``; nothing is imported or read."""
     encoder_files(config, name)
-    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+    for package in PACKAGES:
         require_installed(package, f"encoder '{name}'")
 
 
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
-    """The files of encoder ``name`` in the form that the configured runtime reads."""
+    """The files of encoder ``name``."""
     model_entry(name, "encoder")
-    return locate(name, (RUNTIME_FORM[config.runtime],), path=config.paths.get(name), folder=config.folder)
+    return locate(name, ("transformers",), path=config.paths.get(name), folder=config.folder)
 
 
 def _torch_encoder(
@@ -85,61 +67,24 @@ def _torch_encoder(
 ) -> FoundationEncoder:
     device = device_for(config.device, job_index)
     precision = precision_for(config.precision, device)
-    load_towers = partial(_torch_towers, files, files.state, config.runtime, device, precision, config.batch)
+    load_towers = partial(_torch_towers, files, files.state, device, precision, config.batch)
 
     def identity() -> Mapping[str, Any]:
         kind = device.partition(":")[0]
-        return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
+        return {"runtime": "torch", "files": files.digests(), "precision": precision, "device": kind}
 
-    if config.runtime == "open_clip":
-        spec = encoders.open_clip_spec(files, config.transform)
-        tokeniser: Callable[[], Tokeniser] = partial(encoders.open_clip_tokeniser, files)
-    else:
-        spec = encoders.transformers_spec(files, config.transform)
-        tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
-
-
-def _onnx_encoder(
-    config: ModelsConfig, files: ModelFiles, cache: FrameCache | None, job_index: int
-) -> FoundationEncoder:
-    provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
-    device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
-    manifest = encoders.EncoderManifest.read(files.weights)
-    if manifest.name != files.entry.name:
-        raise ConfigError(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    spec = encoders.onnx_spec(files, config.transform)
-
-    def identity() -> Mapping[str, Any]:
-        return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
-
-    load_towers = partial(_onnx_towers, files, files.state, provider, device_index, config.batch)
-    device = CPU if provider == "cpu" else f"cuda:{device_index}"
-    tokeniser = _tokeniser_of(files, spec)
+    spec = encoders.transformers_spec(files, config.transform)
+    tokeniser = partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 # A worker creates a new encoder for each method and scene; the towers, which take gigabytes, are cached.
 @lru_cache(maxsize=1)
-def _torch_towers(
-    files: ModelFiles, state: object, runtime: Runtime, device: str, precision: str, batch: int
-) -> Towers:
-    if runtime == "open_clip":
-        return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
+def _torch_towers(files: ModelFiles, state: object, device: str, precision: str, batch: int) -> Towers:
     return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
 
 
-@lru_cache(maxsize=1)
-def _onnx_towers(files: ModelFiles, state: object, provider: Provider, device_index: int, batch: int) -> Towers:
-    return encoders.OnnxTowers(files, provider, device_index, batch)
-
-
-def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
-    return partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)
-
-
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
-PACKAGES = ("torch", "transformers")
 _SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
 
 
@@ -157,22 +102,10 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     # Numbers depend on the kind of device, not on which of several is used.
     digests = [content_key(device.partition(":")[0], precision)]
     digests += [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
-    if config.sam_runtime == "onnx":
-        provider: Provider = models.provider or ("cpu" if device == "cpu" else "cuda")
-        index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
-        digests.append(provider)
-
-        def network() -> SamNetwork:
-            return kept(sam, (provider, str(index)), lambda: load_onnx_sam(sam, provider, index))
-    else:
-
-        def network() -> SamNetwork:
-            return load_sam(sam, device, precision)
-
     return Networks(
         _tagger(config, models, encoder, device),
         lambda: load_grounding_dino(detector, device, precision),
-        lambda: Sam(network()),
+        lambda: Sam(load_sam(sam, device, precision)),
         content_key(*digests),
     )
 
@@ -189,10 +122,7 @@ def is_front_end_available(config: PaperConfig, models: ModelsConfig) -> bool:
 def check_front_end(config: PaperConfig, models: ModelsConfig) -> None:
     """Raises ``ModelMissing`` for the first missing package or file; nothing heavy is imported or read."""
     _check_networks(config, models)
-    if config.tagger == "ram":
-        require_installed("ram", "tagger 'ram'")
-        _locate(models, TAGGER, ("original",))
-    elif config.tagger == "ram-onnx":
+    if config.tagger == "ram-onnx":
         _locate(models, TAGGER, ("onnx",))
 
 
@@ -210,47 +140,37 @@ def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> Mod
 
 
 def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
-    return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+    return _locate(models, config.segmenter, _SAM_FORMS)
 
 
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The configured tagger, or with ``auto`` the first that is available."""
-    if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
-        with _skip_missing(config.tagger):
-            require("ram", "tagger 'ram'")
-            files = _locate(models, TAGGER, ("original",))
-            digests = [text for pair in sorted(files.digests().items()) for text in pair]
-            # RAM++'s own code mixes in float32, so it runs in float32 on every device.
-            load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
-            return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         with _skip_missing(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
             if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
             tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
-            provider, index = provider_for(models, device)
+            provider, index = provider_for(device)
             key = [] if provider == "cpu" else [provider]
             load = partial(open_session, files.weights, provider, index)
             return grounded_sam.OnnxRamTagger(load, tags, content_key(*key, *files.digests().values()))
     return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
-def provider_for(models: ModelsConfig, device: str) -> tuple[Provider, int]:
-    """The configured provider and GPU of exported models, otherwise that of ``device`` if onnxruntime has it."""
-    provider = models.provider or ("cpu" if device == CPU else "cuda")
-    if models.provider is None and not has_provider(provider):
+def provider_for(device: str) -> tuple[Provider, int]:
+    """The provider and GPU of the exported RAM++: those of ``device`` if onnxruntime has them, otherwise the CPU."""
+    if device == CPU:
+        return "cpu", 0
+    if not has_provider("cuda"):
         _log.info("exported RAM++ runs on the CPU: this onnxruntime has no CUDA provider")
-        provider = "cpu"
-    return provider, 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
+        return "cpu", 0
+    return "cuda", int(device.partition(":")[2] or 0)
 
 
 def _skip_missing(tagger: str) -> AbstractContextManager[None]:
     """Ignore a missing model for ``auto``; if it was requested by name, the error is raised."""
     return suppress(ModelMissing) if tagger == "auto" else nullcontext()
-
-
-WARM_TEXT = "a chair in a scene"
 
 
 @dataclass(frozen=True)
@@ -286,7 +206,7 @@ def problems_of(files: ModelFiles) -> list[str]:
     problems = files.wrong_digests()
     try:
         if files.form.form == "onnx":
-            return problems + _problems_of_export(files)
+            return problems + grounded_sam.wrong_tagger(files)
         if files.form.form == "transformers":
             if files.entry.kind == "encoder":
                 encoders.transformers_spec(files, "original")
@@ -299,102 +219,7 @@ def problems_of(files: ModelFiles) -> list[str]:
     return problems
 
 
-def _problems_of_export(files: ModelFiles) -> list[str]:
-    if files.entry.kind == "tagger":
-        return grounded_sam.wrong_tagger(files)
-    kind: type[OnnxManifest] = encoders.EncoderManifest if files.entry.kind == "encoder" else SamManifest
-    manifest = kind.read(files.weights)
-    wrong = wrong_files(manifest, files.folder)
-    if manifest.name != files.entry.name:
-        wrong.append(f"{files.folder}: contains '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    return wrong
-
-
 def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[str, str]]:
     """For a run's record: the SHA-256 of every file of the installed models ``names``, by model and file name."""
     states = [model_state(model_entry(name), config.paths.get(name), config.folder) for name in dict.fromkeys(names)]
     return {state.entry.name: state.files[0].digests() for state in states if state.files}
-
-
-@dataclass(frozen=True)
-class WarmUp:
-    """The cost of loading and running something once: ``stages_ms`` of the run, peak ``memory_mb``.
-
-    ``memory_of``: ``cuda:0`` for torch's memory there, ``process`` for the whole process in main memory.
-    """
-
-    what: str
-    load_s: float
-    run_s: float
-    stages_ms: dict[str, float]
-    memory_mb: float
-    memory_of: str
-    digest: str
-
-
-def warm_encoder(encoder: Encoder, device: str) -> WarmUp:
-    """Load the towers of ``encoder`` and run them on one image and one text."""
-    images = [warm_frame().rgb]
-
-    def load() -> None:
-        encoder.encode_images(images)
-        encoder.encode_texts([WARM_TEXT])
-
-    return _warmed(encoder.name, device, load, lambda _: encoder.encode_images(images), lambda: encoder.digest)
-
-
-def warm_perception(perception: Any, device: str) -> WarmUp:
-    """Run ``perception`` of a built profile on one synthetic frame twice: loading, then running."""
-    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))  # S_r of the paper
-    frame = warm_frame()
-
-    def run(timer: Timer) -> None:
-        perception.detect(frame, needs, timer)
-
-    return _warmed(perception.profile, device, lambda: run(Timer()), run, lambda: perception.digest)
-
-
-def _warmed(
-    what: str, device: str, load: Callable[[], object], run: Callable[[Timer], object], digest: Callable[[], str]
-) -> WarmUp:
-    if device != "cpu":
-        import torch
-
-        torch.cuda.reset_peak_memory_stats(device)
-    start = time.perf_counter()
-    load()
-    loaded = time.perf_counter()
-    timer = Timer()
-    run(timer)
-    run_s = time.perf_counter() - loaded
-    memory_mb, memory_of = _peak_memory(device)
-    stages = {name: round(ms, 3) for name, ms in timer.take().items()}
-    return WarmUp(what, loaded - start, run_s, stages, memory_mb, memory_of, digest())
-
-
-def warm_scene() -> SceneInfo:
-    """The scene of ``warm_frame``."""
-    return SceneInfo("warm", "frame", 1, 1, "camera")
-
-
-def warm_frame() -> Frame:
-    """A synthetic frame (480, 640): three coloured boxes in front of a wall."""
-    rgb = np.full((480, 640, 3), 205, np.uint8)
-    depth_m = np.full((480, 640), 3.0, np.float32)
-    for left, colour, distance_m in ((60, (190, 40, 40), 2.0), (260, (50, 140, 60), 2.3), (460, (40, 60, 180), 2.6)):
-        rgb[180:380, left : left + 120] = colour
-        depth_m[180:380, left : left + 120] = distance_m
-    intrinsics = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
-    return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics)
-
-
-def _peak_memory(device: str) -> tuple[float, str]:
-    if device != "cpu":
-        import torch
-
-        return torch.cuda.max_memory_allocated(device) / 1e6, device
-    import resource
-    import sys
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB on Linux, bytes on macOS
-    return peak / (1e6 if sys.platform == "darwin" else 1e3), "process"

@@ -1,21 +1,17 @@
-"""Models exported to ONNX: their ``manifest.json``, and deterministic sessions."""
+"""Deterministic sessions of ONNX Runtime."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
-
-from pydantic import BaseModel, ConfigDict, ValidationError
+from typing import Any, Literal
 
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.perception.models.files import bounded, file_sha256, read_settings
+from su3d_bench.perception.models.files import bounded
 
-Provider = Literal["cpu", "cuda", "tensorrt"]
+Provider = Literal["cpu", "cuda"]
 PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
 }
 
 
@@ -24,48 +20,6 @@ def has_provider(provider: Provider) -> bool:
     import onnxruntime
 
     return PROVIDERS[provider] in onnxruntime.get_available_providers()
-
-
-class OnnxManifest(BaseModel):
-    """The fields read from every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more fields.
-
-    Each kind has the ``FORMAT`` of its file, and the files that it ``REQUIRES``.
-    """
-
-    model_config = ConfigDict(strict=True, frozen=True)
-    FORMAT: ClassVar[str]
-    REQUIRES: ClassVar[tuple[str, ...]]
-
-    name: str
-    files: dict[str, str]
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """The manifest at ``path``; raises ``DataError`` for anything else, and if a required file is not listed."""
-        content = read_settings(path)
-        layout = content.get("format")
-        if layout != cls.FORMAT:
-            raise DataError(f"{path}: format is {str(layout)[:60]!r}; expected {cls.FORMAT!r}; export it again")
-        try:
-            manifest = cls.model_validate_json(json.dumps(content))
-        except ValidationError as error:
-            raise DataError(f"{path}: is not the manifest of an exported model ({bounded(error, 120)})") from error
-        if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
-            needed = " and ".join(cls.REQUIRES)
-            raise DataError(f"{path}: files must be names inside the folder, including {needed}; export it again")
-        return manifest
-
-
-def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
-    """One line per file of the exported model in ``folder`` that is missing or differs from the exported one."""
-    wrong = []
-    for name, digest in manifest.files.items():
-        path = folder / name
-        if not path.is_file():
-            wrong.append(f"{path}: is missing; export it again")
-        elif file_sha256(path) != digest:
-            wrong.append(f"{path}: does not match the manifest; export it again")
-    return wrong
 
 
 def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, n_threads: int = 1) -> Any:
@@ -110,12 +64,6 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 
 def _chain(provider: Provider, device_index: int) -> list[Any]:
-    on_device = {"device_id": device_index}
     # the default selects an algorithm by timing, which may differ from run to run
-    fixed = {**on_device, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
-    chains: dict[Provider, list[Any]] = {
-        "cpu": [],
-        "cuda": [(PROVIDERS["cuda"], fixed)],
-        "tensorrt": [(PROVIDERS["tensorrt"], on_device), (PROVIDERS["cuda"], on_device)],
-    }
-    return [*chains[provider], PROVIDERS["cpu"]]
+    fixed = {"device_id": device_index, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
+    return [*([(PROVIDERS["cuda"], fixed)] if provider == "cuda" else []), PROVIDERS["cpu"]]

@@ -1,12 +1,10 @@
-"""Tags of an image: RAM++ from its package or exported, and the words of a list most likely to an encoder."""
+"""Tags of an image: RAM++ as exported, and the words of a list most likely to an encoder."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,18 +12,14 @@ from tiny_models import blocks
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.models.catalogue import model_entry
-from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.grounded_sam import (
     ADDED_TAGS,
     BACKGROUND_TAGS,
     RAM_PX,
     STOP_WORDS,
     OnnxRamTagger,
-    RamTagger,
     WordTagger,
     chosen_tags,
-    load_ram,
     read_word_list,
 )
 
@@ -97,41 +91,3 @@ def test_exported_tagger_uses_names_of_its_list() -> None:
     assert shapes == [(1, 3, RAM_PX, RAM_PX)] and tagger.caveat is None
     with pytest.raises(DataError, match=r"returns \(1, 4\), but ram_tag_list.txt has 3 tags"):
         OnnxRamTagger(lambda: session, ("bed", "lamp", "room"), "digest").tags(RGB)
-
-
-def test_published_package_gets_its_weights_as_plain_tensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package ``ram`` with the published interface and a one-layer network replaces the real one."""
-    import torch
-
-    asked: list[dict[str, Any]] = []
-
-    class Network(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.tagging_head = torch.nn.Linear(3, 2)
-            self.register_buffer("relative_position_index", torch.arange(4))
-
-        def generate_tag(self, image: Any) -> tuple[list[str], list[str]]:
-            scores = self.tagging_head(image.mean(dim=(2, 3)))[0]
-            names = [name for name, score in zip(("bed", "coffee table"), scores, strict=True) if score > 0]
-            return [" | ".join(names)], ["..."]
-
-    models: Any = ModuleType("ram.models")
-
-    def ram_plus(**settings: Any) -> Network:
-        asked.append(settings)
-        return Network()
-
-    models.ram_plus = ram_plus
-    monkeypatch.setitem(sys.modules, "ram", ModuleType("ram"))
-    monkeypatch.setitem(sys.modules, "ram.models", models)
-    # An older name of the head, and a buffer of another window, as in the published file.
-    head = {"vision_multi.weight": torch.zeros(2, 3), "vision_multi.bias": torch.tensor([-1.0, 1.0])}
-    path, entry = tmp_path / "ram_plus_swin_large_14m.pth", model_entry("ram-plus", "tagger")
-    files = ModelFiles(entry, entry.form("original"), tmp_path, path)
-    torch.save({"model": {**head, "relative_position_index": torch.arange(9)}}, path)
-    assert RamTagger(lambda: load_ram(files, "cpu"), "cpu", "digest").tags(RGB) == ("coffee table",)
-    assert asked == [{"pretrained": "", "image_size": 384, "vit": "swin_l"}]
-    torch.save({"model": {"vision_multi.weight": torch.zeros(2, 3)}}, path)
-    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench models fetch"):
-        load_ram(files, "cpu")

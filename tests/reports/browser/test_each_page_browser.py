@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from chromium import needs_chromium
 from page_checks import CHECKS, complaints, unfold
-from places import SCENES
 from registry_bundles import painted_bundle
 from runs_page import STRUCK, browser_for_pages, finished_runs, page_of_runs
 from synthetic_sheets import made
@@ -50,13 +49,6 @@ def page_of_second_looks(folder: Path) -> Path:
     return page
 
 
-def page_of_audit(folder: Path) -> Path:
-    """The page of a question audit."""
-    words = ["query", "audit", "--scenes", f"{SCENES}/painted.py:Painted/a", "--n-questions", "6", "--quiet"]
-    assert main([*words, "--out", str(folder)]) == 0
-    return folder / "index.html"
-
-
 def site_of_registry(folder: Path) -> Path:
     """The site of ``registry build``: two bundles, one with stated training data; shared by all pages."""
     registry, site = folder.parent / "registry", folder.parent / "registry-site"
@@ -84,7 +76,6 @@ PAGES: Mapping[str, Callable[[Path], Path]] = {
     "tables": page_of_tables,
     "annotation sheet": page_of_annotation,
     "items to review": page_of_second_looks,
-    "audit": page_of_audit,
     "registry": page_of_registry,
     "registry method": page_of_method,
 }

@@ -9,7 +9,6 @@ import psutil
 import pytest
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.runs import clusters
 from su3d_bench.runs.executors import ENDING_S, ONE_THREAD, Event, Report, run_processes
 
 
@@ -82,11 +81,3 @@ def test_workers_use_one_thread_and_parent_settings_are_unchanged() -> None:
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     assert in_processes(["threads"]) == [" ".join("1" for _ in ONE_THREAD)]
     assert {name: os.environ.get(name) for name in ONE_THREAD} == before
-
-
-def test_ray_task_reports_being_terminated_without_failing() -> None:
-    def work(unit: str, report: Report) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-        signal.pause()
-
-    assert clusters._on_node(work, "a", {}) == (clusters.ENDED, "SIGTERM")

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.datasets.writing import Layout, finish_scene, plan_scenes, write_frames
+from su3d_bench.datasets import writing
+from su3d_bench.datasets.writing import Layout, plan_scenes
 
 
 def write_scene(
@@ -18,6 +19,4 @@ def write_scene(
 ) -> None:
     """Write one complete scene; nothing is done if it exists already."""
     for target in plan_scenes(layout, dataset, [scene], out):
-        write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
-        layout.write_truth(dataset, target)
-        finish_scene(layout, dataset, target)
+        writing.write_scene(layout, dataset, target, report)

@@ -1,18 +1,12 @@
-"""Encoders with two towers: CLIP and SigLIP through transformers, open_clip if it is installed, or exported.
-
-Preprocessing, batching, normalisation and caching are the same for all. The folder of an exported encoder contains
-``image.onnx``, ``text.onnx`` (and ``.data`` files next to large ones), the tokenizer's files and ``manifest.json`` with
-the spec and the SHA-256 of every file.
-"""
+"""Encoders with two towers: CLIP and SigLIP through transformers."""
 
 from __future__ import annotations
 
 import itertools
 import json
-import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -27,8 +21,7 @@ from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models import files as model_files
 from su3d_bench.perception.models.encoders.images import Convention, ImageTransform, read_transform
 from su3d_bench.perception.models.encoders.texts import TOKENS_VERSION, TokensKind
-from su3d_bench.perception.models.files import ModelFiles, bounded, read_settings
-from su3d_bench.perception.models.onnx import PROVIDERS, OnnxManifest, Provider, open_session, wrong_files
+from su3d_bench.perception.models.files import ModelFiles, read_settings
 
 ENCODER_VERSION = "1"
 # 65,536 features of 1024 numbers take 256 MB.
@@ -96,8 +89,6 @@ class FoundationEncoder:
         Features then differ only by rounding, and texts of one may be compared with images of the other.
         """
         known = dict(self._identity())
-        if "provider" in known:
-            return any(digest == self._digest_of(known | {"provider": name}) for name in PROVIDERS)
         kinds = itertools.product(("cpu", "cuda"), ("float32", "float16", "bfloat16"))
         return any(digest == self._digest_of(known | {"device": d, "precision": p}) for d, p in kinds)
 
@@ -176,41 +167,31 @@ def unit_rows(rows: Float32Array, where: str) -> Float32Array:
     return np.asarray(rows / lengths, np.float32)
 
 
-# ---- torch
+class TransformersTowers:
+    """``Towers`` of a transformers model on one device in one precision."""
 
-
-class TorchTowers:
-    """``Towers`` of a torch model on one device in one precision; subclasses set how images and texts are encoded.
-
-    ``n_values``: the approximate number of values per image in memory, which determines the first batch on a GPU.
-    """
-
-    encode_image: Callable[[Any], Any]
-    encode_text: Callable[[Any], Any]
-
-    def __init__(self, model: Any, device: str, precision: str, batch: int, n_values: int) -> None:
+    def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
         dtype = getattr(require("torch", f"device '{device}'"), precision)
         make_deterministic(device)
-        self._device, self._dtype = device, dtype
+        self._model, self._device, self._dtype = model, device, dtype
         model.to(device=device, dtype=dtype)
         n_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
-        self.batch = batch or first_batch(device, n_values * dtype.itemsize, n_bytes)
+        self.batch = batch or first_batch(device, _image_values(model) * dtype.itemsize, n_bytes)
 
     def image_features(self, pixels: Float32Array) -> Float32Array:
-        return self._features(self.encode_image, pixels, self._dtype)
+        return self._features(lambda values: self._model.get_image_features(pixel_values=values), pixels, self._dtype)
 
     def text_features(self, tokens: Int64Array) -> Float32Array:
-        return self._features(self.encode_text, tokens, None)
+        # No mask: in CLIP a token only sees those before it, and SigLIP was trained without one.
+        return self._features(lambda ids: self._model.get_text_features(input_ids=ids), tokens, None)
 
     def _features(self, encode: Callable[[Any], Any], values: NDArray[Any], dtype: Any) -> Float32Array:
         import torch
 
         with torch.inference_mode():
-            features = encode(torch.from_numpy(values).to(device=self._device, dtype=dtype))
+            features = encode(torch.from_numpy(values).to(device=self._device, dtype=dtype)).pooler_output
             return np.asarray(features.float().cpu().numpy(), np.float32)
 
-
-# ---- transformers
 
 _LIMITS = {
     "num_hidden_layers": 128,
@@ -283,120 +264,8 @@ def load_transformers(files: ModelFiles) -> Any:
     return model_files.load_pretrained(files, model_class, attn_implementation="sdpa").eval()
 
 
-class TransformersTowers(TorchTowers):
-    """The towers of a transformers model on one device in one precision."""
-
-    def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
-        super().__init__(model, device, precision, batch, _image_values(model))
-        self.encode_image = lambda pixels: model.get_image_features(pixel_values=pixels).pooler_output
-        # No mask: in CLIP a token only sees those before it, and SigLIP was trained without one.
-        self.encode_text = lambda ids: model.get_text_features(input_ids=ids).pooler_output
-
-
 def _image_values(model: Any) -> int:
     """The approximate number of values per image in memory: four times the widest layer, plus the attention."""
     vision = model.config.vision_config
     n_tokens = (vision.image_size // vision.patch_size) ** 2 + 1
     return int(4 * n_tokens * vision.intermediate_size + vision.num_attention_heads * n_tokens**2)
-
-
-# ---- open_clip
-
-OPEN_CLIP_TOKENS, OPEN_CLIP_WORDS = 77, 49408
-
-
-def require_open_clip(name: str) -> Any:
-    """The module open_clip; its import needs a torchvision that matches torch."""
-    try:
-        return require("open_clip", f"encoder '{name}' with perception.models.runtime 'open_clip'")
-    except (RuntimeError, AttributeError) as error:
-        raise DataError(
-            f"open_clip cannot be imported ({bounded(error, 80)}); install a torchvision that matches torch, or use "
-            "perception.models.runtime = 'torch'"
-        ) from error
-
-
-def open_clip_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """The spec of the architecture in open_clip."""
-    open_clip = require_open_clip(files.entry.name)
-    config = open_clip.get_model_config(files.form.architecture)
-    if config is None:
-        raise DataError(f"open_clip {open_clip.__version__} has no '{files.form.architecture}'; install a newer one")
-    transform = ImageTransform(int(config["vision_cfg"]["image_size"]), convention=convention)
-    text = config["text_cfg"]
-    n_tokens, n_words = text.get("context_length", OPEN_CLIP_TOKENS), text.get("vocab_size", OPEN_CLIP_WORDS)
-    return EncoderSpec(int(config["embed_dim"]), n_tokens, n_words, "clip", 0, transform)
-
-
-def load_open_clip(files: ModelFiles) -> Any:
-    """The model in evaluation mode and float32 on the CPU, with every weight from the file."""
-    open_clip = require_open_clip(files.entry.name)
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # hides the warning about random weights, which are replaced below
-    try:
-        model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
-    finally:
-        logging.disable(before)
-    try:
-        model.load_state_dict(model_files.read_weights(files.weights), strict=True)
-    except RuntimeError as error:
-        raise DataError(f"{files.weights}: not a {files.form.architecture}: {bounded(error)}") from error
-    return model.eval()
-
-
-def open_clip_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:
-    """open_clip's own tokenizer, whose vocabulary is in the package."""
-    tokenizer = require_open_clip(files.entry.name).get_tokenizer(files.form.architecture)
-
-    def tokens(texts: Sequence[str]) -> Int64Array:
-        if not texts:
-            return np.zeros((0, OPEN_CLIP_TOKENS), np.int64)
-        return np.asarray(tokenizer(list(texts)).numpy(), np.int64)
-
-    return tokens
-
-
-class OpenClipTowers(TorchTowers):
-    """The towers of an open_clip model on one device in one precision."""
-
-    def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
-        # 30 MB per image in float32: about four times ViT-H-14's widest layer
-        super().__init__(model, device, precision, batch, 7_500_000)
-        self.encode_image, self.encode_text = model.encode_image, model.encode_text
-
-
-# ---- ONNX
-
-IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"
-GPU_BATCH = 32
-
-
-class EncoderManifest(OnnxManifest):
-    """The manifest of an exported encoder."""
-
-    FORMAT = "su3d-bench onnx encoder 1"
-    REQUIRES = (IMAGE_FILE, TEXT_FILE)
-
-    spec: EncoderSpec
-
-
-def onnx_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
-    """The spec in the manifest, with images prepared according to ``convention``."""
-    spec = EncoderManifest.read(files.weights).spec
-    return replace(spec, transform=replace(spec.transform, convention=convention))
-
-
-class OnnxTowers:
-    """The towers of an exported encoder, each loaded at its first use."""
-
-    def __init__(self, files: ModelFiles, provider: Provider, device_index: int, batch: int) -> None:
-        if wrong := wrong_files(EncoderManifest.read(files.weights), files.folder):
-            raise DataError(wrong[0])
-        self._session = cache(lambda name: open_session(files.folder / name, provider, device_index))
-        self.batch = batch or (1 if provider == "cpu" else GPU_BATCH)
-
-    def image_features(self, pixels: Float32Array) -> Float32Array:
-        return np.asarray(self._session(IMAGE_FILE).run(["features"], {"pixels": pixels})[0], np.float32)
-
-    def text_features(self, tokens: Int64Array) -> Float32Array:
-        return np.asarray(self._session(TEXT_FILE).run(["features"], {"tokens": tokens})[0], np.float32)

@@ -15,26 +15,28 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.cache import CropsOnDemand, LastFrameCache, content_key, mask_boxes
 from su3d_bench.perception.embedded.lexicon import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
-from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
+from su3d_bench.perception.models.files import (
+    ModelFiles,
+    checked,
+    file_sha256,
+    read_settings,
+)
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 
 RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
-# Tensors that the network computes itself from its window size; the authors' loader drops them too.
-RECOMPUTED_BUFFERS = ("relative_position_index", "attn_mask")
+RAM_FORMAT = "su3d-bench onnx tagger 1"  # of the manifest
 WORDS_CAVEAT = "tags: RAM++ is not installed; using the most probable words of a list by the encoder instead"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
@@ -64,27 +66,6 @@ class Tagger(Protocol):
     def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]: ...
 
 
-class RamTagger:
-    """RAM++ through its published package, ``ram``."""
-
-    name = "ram"
-    caveat: str | None = None
-
-    def __init__(self, load: Callable[[], Any], device: str, digest: str) -> None:
-        self._model = cache(load)
-        self._device = device
-        self.digest = content_key("ram", digest)
-
-    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
-        """The tags of ``rgb`` (H, W, 3) in the order of RAM++'s list."""
-        import torch
-
-        pixels = torch.from_numpy(ram_pixels(rgb, resample)[None]).to(self._device)
-        with torch.inference_mode():
-            english, _ = self._model().generate_tag(pixels)
-        return tuple(tag for tag in str(english[0]).split(" | ") if tag)
-
-
 class OnnxRamTagger:
     """Exported RAM++: ``image`` (1, 3, 384, 384) to its first output ``tag`` (1, T), 1 for present tags.
 
@@ -111,17 +92,29 @@ class OnnxRamTagger:
         return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
 
 
-class RamManifest(OnnxManifest):
-    """The manifest of an exported RAM++."""
-
-    FORMAT = "su3d-bench onnx tagger 1"
-    REQUIRES = (RAM_MODEL, RAM_TAG_LIST)
+def exported_files(manifest: Path) -> dict[str, str]:
+    """SHA-256 by file name, from the manifest of an exported RAM++; raises ``DataError`` for anything else."""
+    content = read_settings(manifest)
+    if (layout := content.get("format")) != RAM_FORMAT:
+        raise DataError(f"{manifest}: format is {str(layout)[:60]!r}; expected {RAM_FORMAT!r}; export it again")
+    files = checked(dict[str, str], content.get("files") or {}, f"{manifest}: files")
+    if any(Path(name).name != name for name in files) or not {RAM_MODEL, RAM_TAG_LIST} <= set(files):
+        needed = f"{RAM_MODEL} and {RAM_TAG_LIST}"
+        raise DataError(f"{manifest}: files must be names inside the folder, including {needed}; export it again")
+    return files
 
 
 def wrong_tagger(files: ModelFiles) -> list[str]:
-    """One line per invalid file of an exported RAM++; an export without a manifest cannot be checked."""
+    """One line per file of an exported RAM++ that is missing or differs from the exported one; an export without a
+    manifest cannot be checked."""
     path = files.folder / ONNX_MANIFEST
-    return wrong_files(RamManifest.read(path), files.folder) if is_file(path) else []
+    wrong = []
+    for name, digest in exported_files(path).items() if is_file(path) else ():
+        if not (place := files.folder / name).is_file():
+            wrong.append(f"{place}: is missing; export it again")
+        elif file_sha256(place) != digest:
+            wrong.append(f"{place}: does not match the manifest; export it again")
+    return wrong
 
 
 class WordTagger:
@@ -191,44 +184,6 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
         if len(word) > MAX_WORD_LENGTH or not word.isprintable():
             raise DataError(f"{path}: {word[:40]!r} is not a word; expected short printable texts")
     return words
-
-
-def load_ram(files: ModelFiles, device: str) -> Any:
-    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` if it is not installed."""
-    try:
-        models = require("ram.models", "tagger 'ram-plus'")
-    except ModelMissing as error:
-        raise ModelMissing(
-            "tagger 'ram-plus': its package is not installed; export it with tools/export_onnx.py, or "
-            "set perception.paper.tagger to words"
-        ) from error
-    make_deterministic(device)
-    try:
-        # Without a file: the package would unpickle it, but weights are only read as plain tensors.
-        model = models.ram_plus(pretrained="", image_size=RAM_PX, vit="swin_l")
-    except OSError as error:  # the package creates its tokenizer from bert-base-uncased
-        raise ModelMissing(
-            f"tagger 'ram-plus': its package cannot be set up ({bounded(error)}); it needs the tokenizer of "
-            "bert-base-uncased in the Hugging Face cache"
-        ) from error
-    fill_ram(model, read_weights(files.weights), files)
-    return model.eval().to(device)
-
-
-def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
-    """Load the weights into ``model`` under the names of the authors' loader; ``DataError`` if some do not fit."""
-    advice = what_to_fetch(files.entry, (files.form,))
-    named = {
-        name.replace("vision_multi", "tagging_head"): tensor
-        for name, tensor in tensors.items()
-        if not any(part in name for part in RECOMPUTED_BUFFERS)
-    }
-    try:
-        missing = model.load_state_dict(named, strict=False).missing_keys
-    except RuntimeError as error:
-        raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); {advice}") from error
-    if missing := [name for name in missing if not any(part in name for part in RECOMPUTED_BUFFERS)]:
-        raise DataError(f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; {advice}")
 
 
 # ---- named regions

@@ -1,7 +1,7 @@
 """Segment Anything: an image is embedded once, then masks are decoded from boxes and points in it.
 
-The network is separate from the geometry around it: ``TorchSam`` runs ``transformers``' SamModel, ``OnnxSam`` the same
-network exported. Prompts are in pixels of the image; masks have its size.
+The network (``TorchSam``: ``transformers``' SamModel) is separate from the geometry around it. Prompts are in pixels of
+the image; masks have its size.
 """
 
 from __future__ import annotations
@@ -10,10 +10,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from pydantic import Field
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.devices import Batches, require_transformers
@@ -21,7 +20,6 @@ from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.perception.models.encoders.images import normalised_bytes, resized, size_with_longest_side
 from su3d_bench.perception.models.files import ModelFiles, bounded, kept, load_class, on_device, read_weights
-from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
 
 MASK_THRESHOLD = 0.0  # on the network's logits
 OBJECT_POINT = 1
@@ -249,62 +247,3 @@ def _original_sam(files: ModelFiles) -> Any:
     transformers = require_transformers(f"segmenter '{files.entry.name}'")
     model = transformers.SamModel(sam_config(files.entry.name))
     return fill_sam(model, read_weights(files.weights), str(files.weights))
-
-
-# ---- exported to ONNX: a folder with encoder.onnx, decoder.onnx (and .data files for large ones) and manifest.json
-
-ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"
-# Labels of points in the exported decoder, as in the original's own export: 0 background, 1 object, and these.
-NO_POINT, TOP_LEFT, BOTTOM_RIGHT = -1, 2, 3
-
-
-class SamManifest(OnnxManifest):
-    """The manifest of an exported SAM; ``image_px`` is the side of its network's image."""
-
-    FORMAT = "su3d-bench onnx segmenter 1"
-    REQUIRES = (ENCODER_FILE, DECODER_FILE)
-
-    image_px: Annotated[int, Field(ge=16, le=4096)]
-
-
-class OnnxSam:
-    """``SamNetwork`` of the exported encoder and decoder; the following steps are computed in torch on the CPU."""
-
-    def __init__(self, encoder: Any, decoder: Any, image_px: int) -> None:
-        self._encoder = encoder
-        self._decoder = decoder
-        self.image_px = image_px
-
-    def embed(self, pixels: Float32Array) -> Any:
-        return self._encoder.run(["embedding"], {"pixels": pixels[None]})[0]
-
-    def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
-        import torch
-
-        points, labels = exported_points(prompts)
-        fed = {"embedding": embedding, "points": points, "labels": labels}
-        logits, predicted = (torch.from_numpy(part) for part in self._decoder.run(["logits", "iou"], fed))
-        chosen = slice(0, 1) if is_single else slice(1, None)
-        return logits[:, chosen], predicted[:, chosen]
-
-
-def exported_points(prompts: Prompts) -> tuple[Float32Array, Int64Array]:
-    """Points (B, P, 2) and labels (B, P) for the exported decoder: a box is given by its corners.
-
-    Points without a box are followed by a padding point, as in the network's training.
-    """
-    if prompts.boxes is not None:
-        labels = np.tile(np.array([TOP_LEFT, BOTTOM_RIGHT], np.int64), (len(prompts), 1))
-        return prompts.boxes.reshape(-1, 2, 2).astype(np.float32), labels
-    assert prompts.points is not None and prompts.labels is not None
-    points = np.pad(prompts.points.astype(np.float32), ((0, 0), (0, 1), (0, 0)))
-    return points, np.pad(prompts.labels, ((0, 0), (0, 1)), constant_values=NO_POINT)
-
-
-def load_onnx_sam(files: ModelFiles, provider: Provider = "cpu", device_index: int = 0) -> OnnxSam:
-    """An exported SAM ready to run; raises ``DataError`` if a file differs from the exported one."""
-    manifest = SamManifest.read(files.weights)
-    if wrong := wrong_files(manifest, files.folder):
-        raise DataError(wrong[0])
-    sessions = [open_session(files.folder / name, provider, device_index) for name in (ENCODER_FILE, DECODER_FILE)]
-    return OnnxSam(sessions[0], sessions[1], manifest.image_px)

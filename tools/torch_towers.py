@@ -1,61 +1,17 @@
-"""The towers of the embedded encoder in torch: used for training, and to run the ONNX files' weights on a GPU."""
+"""The towers of the embedded encoder in torch, for training."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import pairwise
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from su3d_bench.core.system.devices import make_deterministic, require
-from su3d_bench.core.types import Float32Array
 from su3d_bench.perception.embedded.lexicon import DIM, N_ROWS, PADDING
 
 WORD_DIM = 64
 TEXT_DIM = 128
-
-
-class TorchTower:
-    """One tower on ``device``, with the interface of the ONNX Runtime session that it replaces."""
-
-    def __init__(self, path: Path, *, is_image: bool, device: str) -> None:
-        make_deterministic(device)
-        self._device = device
-        self._names = ("pixels", "log_size") if is_image else ("ids",)
-        tower = ImageTower() if is_image else TextTower()
-        self._tower = with_weights(tower.eval(), path, device).to(device)
-
-    def run(self, _outputs: None, inputs: Mapping[str, Any]) -> list[Float32Array]:
-        """The features (N, 128), as the only output."""
-        with torch.inference_mode():
-            tensors = [torch.from_numpy(np.ascontiguousarray(inputs[name])).to(self._device) for name in self._names]
-            return [self._tower(*tensors).cpu().numpy()]
-
-
-def with_weights(tower: nn.Module, path: Path, device: str) -> nn.Module:
-    """``tower`` with the weights of the file at ``path``, in which convolutions include their normalisation."""
-    onnx = require("onnx", f"the embedded encoder on device '{device}'")
-    for layers in [module for module in tower.modules() if isinstance(module, nn.Sequential)]:
-        for k, (layer, after) in enumerate(pairwise(list(layers))):
-            if isinstance(layer, nn.Conv2d) and isinstance(after, nn.BatchNorm2d):
-                layers[k], layers[k + 1] = fuse_conv_bn_eval(layer, after), nn.Identity()
-    graph = onnx.load(str(path)).graph
-    stored = {weight.name: torch.tensor(onnx.numpy_helper.to_array(weight)) for weight in graph.initializer}
-    names = [name for name, layer in tower.named_modules() if isinstance(layer, nn.Conv1d | nn.Conv2d)]
-    # Normalised convolutions have lost their names in the file; nodes are in execution order.
-    nodes = [node for node in graph.node if node.op_type == "Conv"]
-    state = {name: value for name, value in stored.items() if name in tower.state_dict()}
-    for name, node in zip(names, nodes, strict=True):
-        state[f"{name}.weight"], state[f"{name}.bias"] = (stored[key] for key in node.input[1:3])
-    missing = [name for name in tower.load_state_dict(state, strict=False).missing_keys if "num_batches" not in name]
-    assert not missing, missing
-    return tower
 
 
 def _convolution(n_in: int, n_out: int, stride: int = 1, size: int = 3) -> nn.Sequential:
