@@ -90,7 +90,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 
 def execute(plan: Plan, arguments: argparse.Namespace) -> int:
-    """Run the plan, or with ``--dry-run`` print its jobs."""
+    """Run the plan, or with ``--dry-run`` print its estimated cost."""
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.store.caches import cache_warning
 
@@ -132,14 +132,17 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
 
 
 def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
-    from su3d_bench.runs.advice import planned_jobs
+    from su3d_bench.runs.advice import estimate
 
-    rows = planned_jobs(plan)
+    rows = estimate(plan)
     lines = []
     for row in rows:
-        state = "already done" if row.is_done else counted(row.n_updates, "update")
+        state = "already done" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
         lines.append(f"{row.scene:<24} {row.method:<12} {row.remark or state}")
-    lines.append(f"{counted(plan.n_workers, 'job')} in parallel; folder {plan.folder.path}")
+    minutes = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers / 60
+    source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
+    n_jobs = counted(plan.n_workers, "job")
+    lines.append(f"about {minutes:.1f} minutes with {n_jobs} ({source}); folder {plan.folder.path}")
     lines += [f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.config.profile}" for job in plan.jobs[:1]]
     value = {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": [asdict(row) for row in rows]}
     output.answer_either(arguments, value, *lines)

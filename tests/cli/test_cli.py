@@ -232,8 +232,8 @@ def test_scenes_may_be_expanded_by_the_shell(tmp_path: Path, capsys: pytest.Capt
 def test_dry_run_shows_the_plan_and_does_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--dry-run"]) == 0
     text = capsys.readouterr().out
-    assert text.count(" 6 updates\n") == 4
-    assert "in parallel; folder" in text
+    assert text.count("6 updates, about") == 4
+    assert "minutes with" in text
     assert "protocols: rooms-semantic; profile auto" in text
     assert not Path("runs").exists()
 
@@ -243,7 +243,7 @@ def test_dry_run_on_a_finished_run_marks_finished_jobs(capsys: pytest.CaptureFix
     capsys.readouterr()
     assert main([*RUN, "--scenes", f"{PAINTED}/[ab]", "--extend", "--out", "runs/x", "--dry-run", "--json"]) == 0
     jobs = json.loads(capsys.readouterr().out)["jobs"]
-    assert [one["is_done"] for one in jobs] == [True, False]
+    assert [(one["is_done"], one["is_measured"]) for one in jobs] == [(True, True), (False, True)]
 
 
 def test_folder_name_depends_only_on_the_request() -> None:
