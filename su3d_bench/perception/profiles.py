@@ -28,11 +28,11 @@ from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.lexicon import Namer, NamingConfig
 from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 from su3d_bench.perception.language.chat import LanguageConfig
-from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.oracle import OracleConfig, OraclePerception
 from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerception
 from su3d_bench.perception.stored_masks import LabelImages
+from su3d_bench.perception.unit_costs import gpu_memory_gb
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
 # Replies of vision models, below the cache's folder, so that a rerun sends no request twice.
@@ -140,9 +140,8 @@ def models_of(profile: str, config: PerceptionConfig) -> list[str]:
 
 
 # While one process builds its map on the CPU, another uses the GPU. Kernels of different processes take turns, so a
-# third adds memory and hardly any speed: networks take most of an update's time (docs/running/gpu.md).
+# third adds memory and hardly any speed: networks take most of an update's time (see unit_costs.toml).
 MAX_PROCESSES_PER_GPU = 2
-MB_PER_PROCESS = 4000  # assumed: CUDA context, images (SAM's attention at 1024 px) and batches of CLIP crops
 
 
 def default_jobs(profile: str, config: PerceptionConfig) -> int:
@@ -151,8 +150,7 @@ def default_jobs(profile: str, config: PerceptionConfig) -> int:
     n_cores = os.cpu_count() or 1
     models = models_of(profile, config)
     memory = gpu_memory_bytes(config.models.device) if models else []
-    entries = [MODELS[name] for name in models]  # in float16; RAM++ always runs in float32
-    need = 1e6 * (MB_PER_PROCESS + sum(one.memory_mb(4 if one.kind == "tagger" else 2) for one in entries))
+    need = 1e9 * gpu_memory_gb(models)
     return min(n_cores, sum(max(1, min(MAX_PROCESSES_PER_GPU, int(total / need))) for total in memory) or n_cores)
 
 
