@@ -59,7 +59,7 @@ class ImageTower(nn.Module):
     def forward(self, pixels: Tensor, log_size: Tensor) -> Tensor:
         image = pixels.permute(0, 3, 1, 2).float() / 64.0 - 2.0
         planes = log_size[:, :, None, None] + torch.zeros_like(image[:, :2])
-        stacked = torch.cat([image, planes], dim=1).contiguous(memory_format=torch.channels_last)
+        stacked = torch.cat([image, planes], dim=1).contiguous()
         with torch.autocast("cpu", torch.bfloat16, enabled=self.training):
             x = self.body(stacked)
         x = x.float()

@@ -369,8 +369,8 @@ def _write_card(
         "largest_difference_from_torch": difference,
     }
     (order.out / CARD_JSON).write_text(json.dumps(card, indent=1) + "\n")
-    header = "# The classes that the encoder was trained on.\n"
-    (order.out / "training_classes.txt").write_text(header + "".join(f"{name}\n" for name in trained_on[0]))
+    header = "# The classes that the encoder was trained on, which are the names that regions can get.\n"
+    (order.out / "vocabulary.txt").write_text(header + "".join(f"{name}\n" for name in trained_on[0]))
     template = file_text(Path(__file__).parent / "model_card.md.j2")
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     text = environment.from_string(template).render(card, program=PROGRAM, card_json=CARD_JSON)

@@ -32,7 +32,7 @@ from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import Renderer
 from su3d_bench.datasets.procedural.rendering.sampled import SampledRenderer
 
-LIGHT_M, TRAINING_LIGHT_M = 0.06, 0.15  # between points at which light is computed; coarser where speed counts more
+LIGHT_M, TRAINING_LIGHT_M = 0.1, 0.15  # between points at which light is computed; coarser where speed counts more
 METERED_WIDTH = 80  # of the images from which the exposure follows: a mean needs no more
 N_NAMED = 24  # homes for tuning, and as many for testing
 SERIES = ("tuning", "test", "seed", "training")
@@ -72,6 +72,8 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
 
 class BuiltHome(BuiltScene):
     """A furnished home."""
+
+    scan_stride = 4  # between these frames the camera moves by centimetres
 
     def __init__(self, scene: str, options: HomeOptions, folder: Path | None) -> None:
         super().__init__(scene, options, folder)

@@ -79,6 +79,7 @@ class BuiltScene(ABC):
 
     classes: Mapping[str, Described]
     merged_m: float = 1e-4  # size of the cells in which vertices of the scan are merged
+    scan_stride: int = 1  # every how many frames are checked for what they see
 
     def __init__(self, scene: str, options: Any, folder: Path | None) -> None:
         self.scene, self.options, self.folder = scene, options, folder
@@ -148,7 +149,8 @@ class BuiltScene(ABC):
     @property
     def scan(self) -> SceneScan:
         """The surface seen on the trajectory, recomputed."""
-        return scan_scene(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m, self.merged_m)
+        poses = self.trajectory[:: self.scan_stride]
+        return scan_scene(self.patches, self.mesh, poses, self.options.mesh_spacing_m, self.merged_m)
 
     def _kept_in(self, what: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"

@@ -167,11 +167,11 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
 
 def _score_of(run: FinishedRun, arguments: argparse.Namespace) -> tuple[str, str]:
     """The protocol and metric of the score; ``ConfigError`` if the run does not have them."""
-    protocol = arguments.protocol or next(iter(run.protocols), None)
+    protocol = str(arguments.protocol or next(iter(run.protocols), ""))
     if protocol not in run.protocols:
         raise ConfigError(f"{run.name}: not scored under {protocol}; it has {', '.join(run.protocols) or 'no scores'}")
     headline = run.rules(protocol).headline
-    metric = arguments.metric or headline[0]
+    metric = str(arguments.metric or headline[0])
     if metric not in headline:
         raise ConfigError(f"--metric {metric}: {protocol} has {', '.join(headline)}")
     return protocol, metric

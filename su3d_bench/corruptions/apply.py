@@ -147,7 +147,7 @@ class CorruptedPerception:
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         """The detections of a frame."""
-        found = self._perception.detect(self._seen(frame), needs, timer)
+        found: Detections = self._perception.detect(self._seen(frame), needs, timer)
         for condition in self._corruption.at("detections"):
             found = self._corruption.call(condition, frame.index, found)
         return found

@@ -161,17 +161,22 @@ SIZES = ("n_points", "n_instances", "map_bytes")
 
 
 class MethodFeed:
-    """One method on one scene; ``maps`` has, for each map written, the number of updates before it and its cost."""
+    """One method on one scene; ``maps`` has, for each map written, the number of updates before it and its cost.
+
+    ``skips_empty``: a frame without depth is no error but an update without effect, as when a corruption took it all.
+    """
 
     def __init__(
-        self, scene: str, method: interfaces.Method, perception: Perception, report: Report, clock: MethodClock
-    ) -> None:
+        self, scene: str, method: interfaces.Method, perception: Perception, report: Report, clock: MethodClock,
+        *, skips_empty: bool = False,
+    ) -> None:  # fmt: skip
         self.maps: list[dict[str, float | int]] = []
         self._clock = clock
         self._scene = scene
         self._method = method
         self._perception = perception
         self._report = report
+        self._skips_empty = skips_empty
         self._timer = Timer()
         self._rows: list[Row] = []
         self._calibrations: list[float] = []
@@ -204,7 +209,12 @@ class MethodFeed:
         with timer.stage("decode"):
             frame = frames.next_frame()
         if not (frame.depth_m > 0).any():
-            raise DataError(f"{self._scene} frame {frame.index}: depth is empty (no pixel is above 0 m)")
+            if not self._skips_empty:
+                raise DataError(f"{self._scene} frame {frame.index}: depth is empty (no pixel is above 0 m)")
+            timer.take()
+            elapsed_ms = (time.perf_counter() - start) * 1e3
+            empty: Row = {"update": update, "frame": frame.index, "n_detections": 0, "rss_bytes": memory_bytes()}
+            return empty | {"method_ms": 0.0, "total_ms": round(elapsed_ms, 3)}
         detections = (
             no_detections(frame, method.needs)
             if method.needs.masks == "none"

@@ -284,8 +284,9 @@ class _Scene:
         self.report_activity(part, self.opening)
         start_memory_watch()
         feeding = frame_loop.MethodFeed(
-            self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)), clock
-        )
+            self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)),
+            clock, skips_empty=bool(part.corruption),
+        )  # fmt: skip
         try:
             has_surface = isinstance(self.dataset, interfaces.HasSurface)
             read_surface = partial(self.dataset.surface, self.job.scene_name) if has_surface else None

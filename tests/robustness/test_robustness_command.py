@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from su3d_bench.cli.main import main
+from su3d_bench.corruptions.table import CORRUPTIONS
 
 SMALL = "--set rooms.width=160 rooms.height=120 rooms.n_frames=40 --stride 10 --profile oracle --jobs 1"
 ROOM = f"rooms/bathroom0 {SMALL} --protocols rooms-instance"
-CORRUPTIONS = "depth/holes pose/jitter-translation masks/eroded names/distractors time/lost-bursts light/exposure"
+NAMES = "depth/holes pose/jitter-translation masks/eroded names/distractors time/lost-bursts light/exposure"
 
 
 def prediction(run: str, name: str) -> bytes:
@@ -21,14 +23,14 @@ def prediction(run: str, name: str) -> bytes:
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sweep") / "run"
-    words = f"robustness run {ROOM} --corruptions {CORRUPTIONS} --severities 0 4 --out {folder}"
+    words = f"robustness run {ROOM} --corruptions {NAMES} --severities 0 4 --out {folder}"
     assert main(words.split()) == 0
     return folder
 
 
 def test_severity_0_is_the_clean_run_byte_for_byte(sweep: Path) -> None:
     clean = prediction(str(sweep), "opensu3d")
-    for name in CORRUPTIONS.replace("/", "-").split():
+    for name in NAMES.replace("/", "-").split():
         assert prediction(str(sweep), f"opensu3d~{name}-0") == clean
     for name in ("depth-holes", "pose-jitter-translation", "masks-eroded", "time-lost-bursts"):
         assert prediction(str(sweep), f"opensu3d~{name}-4") != clean
@@ -67,6 +69,13 @@ def test_tolerance_is_between_the_severities_that_keep_and_lose(
     (found,) = json.loads(capsys.readouterr().out)
     assert 0 < found["severity"] < 5
     assert found["corruption"] == "masks/eroded"
+
+
+def test_update_that_loses_all_depth_has_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = CORRUPTIONS["depth/holes"]
+    monkeypatch.setitem(CORRUPTIONS, row.address, replace(row, values=(1.0, 1.0, 1.0, 1.0, 1.0)))
+    words = f"robustness run {ROOM} --only depth/holes/1 --methods conceptgraphs opensu3d --out {tmp_path / 'run'}"
+    assert main(words.split()) == 0
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ class Window:
 
 def lit_mesh(
     patches: base.Patches, lights: Sequence[Light], sun: Sun | None, windows: Sequence[Window], exposure: float,
-    spacing_m: float = 0.06,
+    spacing_m: float = 0.1,
 ) -> base.SceneMesh:  # fmt: skip
     """The render mesh of a home; light is scaled so that its 70th percentile is ``exposure``."""
     from su3d_bench.datasets.procedural.rendering.sampled_kernels import wear_off

@@ -67,6 +67,12 @@ def noise3(x, y, z, seed):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def noise_at(x, y, z, foot):  # type: ignore[no-untyped-def]
+    """Smooth noise in 0..1: that of the frozen rooms, drawn with ``foot`` 0, otherwise the faster one."""
+    return noise3(x, y, z, 1) if foot > 0 else noise(x, y, z)
+
+
+@inlined
 def rough(x, y, seed):  # type: ignore[no-untyped-def]
     """Two octaves of noise in a plane, 0..1 with mean 0.5."""
     return 0.64 * noise2(x, y, seed) + 0.36 * noise2(2.7 * x, 2.7 * y, seed + 5)

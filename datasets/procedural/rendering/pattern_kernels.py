@@ -11,7 +11,7 @@ from typing import Any
 
 from su3d_bench.core.compiled import njit
 from su3d_bench.datasets.procedural.rendering.home_patterns import home_colour
-from su3d_bench.datasets.procedural.rendering.noise_kernels import hash01, noise, noise3
+from su3d_bench.datasets.procedural.rendering.noise_kernels import hash01, noise, noise3, noise_at
 
 inlined: Any = njit(cache=True, inline="never")
 
@@ -26,11 +26,7 @@ def _wood(x, y, z, scale, axis, seed, foot):  # type: ignore[no-untyped-def]
         x, y = y, x
     elif axis == 2:
         x, z = z, x
-    if foot > 0:
-        wander = 3.6 * noise3(x * 1.9 + seed, y * 7.0, z * 7.0, 1)
-    else:
-        wander = 3.6 * noise(x * 1.9 + seed, y * 7.0, z * 7.0)
-    rings = (y + z * 1.3) / (2.2 * scale) + wander
+    rings = (y + z * 1.3) / (2.2 * scale) + 3.6 * noise_at(x * 1.9 + seed, y * 7.0, z * 7.0, foot)
     grain = 0.5 + 0.5 * math.sin(6.2832 * rings)
     fibre = 0.5
     if foot == 0:
@@ -228,7 +224,7 @@ def _clock(u, v):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
+def _wall(x, z, scale, style, seed, foot):  # type: ignore[no-untyped-def]
     """Share of the second colour; -1 on the skirting board."""
     if z < 0.085 and style != 2:
         return -1.0
@@ -242,7 +238,7 @@ def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
     if style == 3 and z < 0.95:
         s = x / 0.45 - math.floor(x / 0.45)
         return 0.55 if s < 0.03 or z > 0.91 else 0.3
-    return 0.12 * noise(x * 3.0 + seed, z * 3.0, seed)
+    return 0.12 * noise_at(x * 3.0 + seed, z * 3.0, seed, foot)
 
 
 @inlined
@@ -256,22 +252,22 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
     ar, ag, ab, br, bg, bb = row[1], row[2], row[3], row[4], row[5], row[6]
     tone = 1.0
     if kind == 0:
-        share = 0.5 * noise(x * 25.0 + seed, y * 25.0, z * 25.0)
+        share = 0.5 * noise_at(x * 25.0 + seed, y * 25.0, z * 25.0, foot)
     elif kind == 1:
         share = _wood(x, y, z, scale, axis, seed, foot)
     elif kind == 2 or (5 <= kind <= 7) or kind == 22:
         share = 0.0 if kind == 2 else _pattern(kind, u, v, scale, axis, seed)
         thread = 0.5 + 0.25 * (math.sin(u * 1300.0) + math.sin(v * 1300.0))
-        tone = 0.88 + 0.1 * thread + 0.1 * (noise(x * 40.0, y * 40.0, z * 40.0) - 0.5)
+        tone = 0.88 + 0.1 * thread + 0.1 * (noise_at(x * 40.0, y * 40.0, z * 40.0, foot) - 0.5)
     elif kind == 3:
         share = _tiles(u, v, scale, seed)
     elif kind == 4:
-        n = noise(x / scale, y / scale, z / scale)
-        share = 1.0 if n > 0.68 else 0.35 * noise(x * 30.0, y * 30.0, z * 30.0)
+        n = noise_at(x / scale, y / scale, z / scale, foot)
+        share = 1.0 if n > 0.68 else 0.35 * noise_at(x * 30.0, y * 30.0, z * 30.0, foot)
         if n < 0.25:
             tone = 1.3
     elif kind == 8:
-        share = 0.6 * noise(x * 25.0 + seed, y * 25.0, z * 500.0)
+        share = 0.6 * noise_at(x * 25.0 + seed, y * 25.0, z * 500.0, foot)
     elif kind == 9 or kind == 11 or kind == 16:
         fu, fv = (u - row[11]) / (row[12] - row[11]), (v - row[13]) / (row[14] - row[13])
         if kind == 9:
@@ -280,9 +276,9 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
             return _screen(fu, fv, scale, ar, ag, ab, br, bg, bb, seed)
         hill = 0.3 + 0.06 * math.sin(7 * fu + seed) + 0.03 * math.sin(23 * fu + seed)
         if fv < hill:
-            n = 0.75 + 0.4 * noise(fu * 40.0, fv * 40.0, seed)
+            n = 0.75 + 0.4 * noise_at(fu * 40.0, fv * 40.0, seed, foot)
             return 0.16 * n, 0.34 * n, 0.13 * n
-        share = min(1.0, max(0.0, 1.6 * noise(fu * 4.0 + seed, fv * 7.0, seed) - 0.5) + 0.5 * (1 - fv))
+        share = min(1.0, max(0.0, 1.6 * noise_at(fu * 4.0 + seed, fv * 7.0, seed, foot) - 0.5) + 0.5 * (1 - fv))
     elif kind == 10:
         share = _keys(u, v, scale)
     elif kind == 12:
@@ -291,23 +287,25 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
         a, b = math.floor(u / scale), math.floor(v / scale)
         over = (int(a) + int(b)) % 2 == 0
         f = (v / scale - b) if over else (u / scale - a)
-        share = 0.85 * (2 * f - 1) ** 2 + 0.15 * noise(x * 200.0, y * 200.0, z * 200.0)
+        share = 0.85 * (2 * f - 1) ** 2 + 0.15 * noise_at(x * 200.0, y * 200.0, z * 200.0, foot)
     elif kind == 14:
-        share = 0.7 * noise(x * 60.0, y * 60.0, z * 60.0) * noise(x * 9.0, y * 9.0, z * 9.0)
+        share = 0.7 * noise_at(x * 60.0, y * 60.0, z * 60.0, foot) * noise_at(x * 9.0, y * 9.0, z * 9.0, foot)
     elif kind == 15:
-        share = noise(x / scale, y / scale, z / scale) * 0.7 + 0.3 * noise(x * 300.0, y * 300.0, z * 300.0)
+        share = noise_at(x / scale, y / scale, z / scale, foot) * 0.7 + 0.3 * noise_at(
+            x * 300.0, y * 300.0, z * 300.0, foot
+        )
     elif kind == 17:
         cu, cv = 0.5 * (row[11] + row[12]), 0.5 * (row[13] + row[14])
         share = _clock((u - cu) / (0.5 * (row[12] - row[11])), (v - cv) / (0.5 * (row[14] - row[13])))
     elif kind == 18:
         share = _rug((x - row[11]) / (row[12] - row[11]), (y - row[13]) / (row[14] - row[13]), scale, seed)
-        tone = 0.8 + 0.35 * noise(x * 180.0, y * 180.0, 1.5)
+        tone = 0.8 + 0.35 * noise_at(x * 180.0, y * 180.0, 1.5, foot)
     elif kind == 19:
-        w = noise(x * 4.0 + seed, y * 4.0, z * 4.0) * 5.0 + (x + y + z) * 6.0
+        w = noise_at(x * 4.0 + seed, y * 4.0, z * 4.0, foot) * 5.0 + (x + y + z) * 6.0
         share = max(0.0, 1.0 - 5.0 * abs(w - math.floor(w) - 0.5)) * 0.8
     elif kind == 20:
         share = 0.5 + 0.5 * math.sin(u * 600.0)
-        tone = 0.94 + 0.12 * noise(x * 12.0, y * 12.0, z * 12.0)
+        tone = 0.94 + 0.12 * noise_at(x * 12.0, y * 12.0, z * 12.0, foot)
     elif kind == 21:
         s = (z if axis == 0 else x) / scale + 0.1 * (seed % 3)
         s -= math.floor(s)
@@ -316,8 +314,8 @@ def surface_colour(kind, x, y, z, u, v, row, scale, axis, seed, foot=0.0):  # ty
         s = z * 18.0
         share = 1.0 if s - math.floor(s) < 0.16 else 0.0
     else:
-        share = _wall(x, z, scale, axis, seed)
+        share = _wall(x, z, scale, axis, seed, foot)
         if share < 0:
             return 0.72, 0.71, 0.68
-        tone = 0.98 + 0.04 * noise(x * 60.0, y * 60.0, z * 60.0)
+        tone = 0.98 + 0.04 * noise_at(x * 60.0, y * 60.0, z * 60.0, foot)
     return (ar + (br - ar) * share) * tone, (ag + (bg - ag) * share) * tone, (ab + (bb - ab) * share) * tone

@@ -35,10 +35,10 @@ class Renderer:
         self.width, self.height = width, height
         self._mesh = mesh
         self._scene: Any = caster(mesh.vertices, mesh.triangles) if like is None else like._scene
-        focal_inverse = np.linalg.inv(camera_intrinsics(width, height))
+        self._focal_inverse = np.linalg.inv(camera_intrinsics(width, height))
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(width * height)], axis=1, dtype=np.float64)
-        self._directions = pixels @ focal_inverse.T  # camera z is 1: the distance along a ray is the depth
+        self._directions = pixels @ self._focal_inverse.T  # camera z is 1: the distance along a ray is the depth
 
     def render(self, camera_to_world: Float64Array) -> RenderedFrame:
         from su3d_bench.datasets.procedural.rendering.shade_kernels import shade

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.rendering.render import FOCAL_PER_WIDTH, RenderedFrame, Renderer
 from su3d_bench.numerics.open3d_core import compiled_open3d
 
 MAX_CONTINUATIONS = 4  # of a ray, through the two sides of two panes, or a mirror in them
+BORDER_SHIFT = 0.25  # of a sample along its border, in pixels
 SHOULDER = 0.55  # linear light from which brightness is compressed, so that sunlit surfaces keep their colour
 
 
@@ -45,7 +46,7 @@ class SampledRenderer(Renderer):
 
     def render(self, camera_to_world: Float64Array, gain: float = 1.0) -> RenderedFrame:
         """``gain`` multiplies linear light before it is encoded, as exposure does."""
-        from su3d_bench.datasets.procedural.rendering.sampled_kernels import SAMPLES, encode, mark_edges
+        from su3d_bench.datasets.procedural.rendering.sampled_kernels import encode, mark_edges
 
         mesh, n = self._mesh, self.width * self.height
         rays, t, triangle, uv = self._cast(camera_to_world, self._directions)
@@ -55,12 +56,7 @@ class SampledRenderer(Renderer):
         step = camera_to_world[:3, :2].T / (FOCAL_PER_WIDTH * self.width)
         colour = self._shaded((rays, t, triangle, uv), is_edge, step.astype(np.float32))
         edge = np.flatnonzero(is_edge)
-        offsets = np.zeros((len(SAMPLES), 3))
-        offsets[:, :2] = SAMPLES / (FOCAL_PER_WIDTH * self.width)
-        directions = (self._directions[edge, None] + offsets).reshape(-1, 3)
-        hits = self._cast(camera_to_world, directions)
-        sharp = self._shaded(hits, np.zeros(len(directions), np.bool_), np.zeros((2, 3), np.float32))
-        colour[edge] = sharp.reshape(-1, len(SAMPLES), 3).mean(axis=1)
+        colour[edge] = self._border_means(camera_to_world, edge)
         rgb = np.empty((n, 3), np.uint8)
         self._in_threads(encode, n, colour, np.float32(gain), self._codes, rgb)
         hit = np.isfinite(t)
@@ -68,6 +64,28 @@ class SampledRenderer(Renderer):
         shape = (self.height, self.width)
         depth, instance = np.where(hit, t, np.float32(0)), np.where(hit, ids, np.int32(0))
         return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
+
+    def _border_means(self, camera_to_world: Float64Array, pixels: Int64Array) -> Float32Array:
+        """Linear light (P, 3) of ``pixels`` (P,): the mean of one sample on each border, shared with the pixel beyond.
+
+        Samples of a pixel form a rotated square, mirrored in the next pixel (FLIPQUAD, Akenine-Moeller, Stroem 2003).
+        """
+        shape = (2, self.height + 1, self.width + 1)  # left and top borders
+        row, column = np.divmod(pixels, self.width)
+        wanted = np.zeros(shape, np.bool_)
+        ends = [(0, row, column), (0, row, column + 1), (1, row, column), (1, row + 1, column)]
+        for end in ends:
+            wanted[end] = True
+        border, row, column = np.nonzero(wanted)
+        shift = np.where((row + column) % 2 == 0, BORDER_SHIFT, -BORDER_SHIFT)
+        u, v = column - np.where(border == 0, 0.5, shift), row + np.where(border == 0, shift, -0.5)
+        directions = np.stack([u, v, np.ones(len(u))], axis=1) @ self._focal_inverse.T
+        n = len(directions)
+        hits = self._cast(camera_to_world, directions)
+        sample = self._shaded(hits, np.zeros(n, np.bool_), np.zeros((2, 3), np.float32))
+        number = np.empty(shape, np.int32)
+        number[wanted] = np.arange(n, dtype=np.int32)
+        return np.asarray(sum(sample[number[end]] for end in ends) / np.float32(4), np.float32)
 
     def _shaded(self, hits: Any, skip: Any, step: Float32Array, level: int = 0) -> Float32Array:
         """Linear light (N, 3) along the rays that gave ``hits``, with what mirrors and glass show."""

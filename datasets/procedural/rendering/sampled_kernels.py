@@ -21,7 +21,7 @@ inlined: Any = njit(cache=True, inline="never")
 
 SAMPLES = np.array([[-0.375, -0.125], [0.375, 0.125], [0.125, -0.375], [-0.125, 0.375]])  # rotated grid, in pixels
 ALIKE = 0.03  # two of the four samples suffice if they differ less, in linear light
-PLAIN, STAINS = int(Texture.PLAIN), int(Texture.STAINS)  # smooth at the scale of a pixel: one sample
+PLAIN, WALL, STAINS = (int(kind) for kind in (Texture.PLAIN, Texture.WALL, Texture.STAINS))
 SMOOTH_COSINE = 0.92  # between the facets of a curved surface
 
 
@@ -83,7 +83,9 @@ def shade_rays(start, stop, rays, t, triangle, uv, skip, across, down, pixel, is
         kind, n = int(row[0]), 1
         foot = far * length * pixel * length / max(abs(facing), 0.1 * length)
         gux, guy, guz, gvx, gvy, gvz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        if is_filtered and kind != PLAIN and not (kind == STAINS and z > 0.1 + foot):
+        # One sample where the texture is smooth at the scale of a pixel.
+        is_smooth = kind == PLAIN or (z > 0.1 + foot and (kind == STAINS or (kind == WALL and row[10] == 0)))
+        if is_filtered and not is_smooth:
             n = 4
             gux, guy, guz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, across, texture)
             gvx, gvy, gvz = _step(vertices, i0, i1, i2, nx, ny, nz, dx, dy, dz, facing, far, down, texture)

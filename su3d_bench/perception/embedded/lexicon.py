@@ -134,12 +134,9 @@ class NamingConfig(BaseModel):
 
 
 def vocabulary() -> tuple[str, ...]:
-    """The class names for regions, in the order of the list file."""
-    return _weights_file("vocabulary.txt")
-
-
-def _weights_file(name: str) -> tuple[str, ...]:
-    return listed_words(files("su3d_bench.perception.embedded.weights").joinpath(name).read_text(encoding="utf-8"))
+    """The class names that regions can get: the classes that the encoder was trained on, in the order of the file."""
+    weights = files("su3d_bench.perception.embedded.weights")
+    return listed_words(weights.joinpath("vocabulary.txt").read_text(encoding="utf-8"))
 
 
 def listed_words(text: str) -> tuple[str, ...]:
@@ -243,7 +240,7 @@ def class_words(class_name: str) -> tuple[str, ...]:
 @cache
 def trained_words() -> frozenset[str]:
     """All words that training captions may contain, as tokenized."""
-    names = frozenset(_weights_file("training_classes.txt"))
+    names = frozenset(vocabulary())
     texts = [*CLASS_TEMPLATES, *ANYTHING, *(word for name in names for word in class_words(name))]
     texts += [text for table in (GROUPS, AFFORDANCES) for text, own in table.items() if not names.isdisjoint(own)]
     texts += ["room", *(name for name, _ in COLOURS), *MATERIALS]
