@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, output_path
+from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, index, output_path
 from su3d_bench.cli.run import add_run_options, execute, plan_of
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,6 +28,13 @@ def add_parser(verbs: Verbs) -> None:
     group = add_group(verbs, "robustness", add_parser)
     parser = add_verb(group, "list", call_list)
     parser.shared("--format")
+    parser = add_verb(group, "show", call_show, data=True)
+    parser.option("scene SCENE", "scene, such as homes/tuning0")
+    _add_corruptions(parser)
+    parser.option("--severities N...", "severities to draw (default: 0 to 5)", type=int, default=list(range(6)))
+    parser.option("--frame N", "frame to draw (default: the middle one)", type=index)
+    parser.option("--out FILE.png", "picture to write", type=output_path, required=True)
+    parser.shared("--set")
     parser = add_verb(group, "run", call_run, resumes=True, data=True)
     _add_methods(parser)
     parser.option("--severities N...", "severities to use (default: 1 3 5)", type=int, default=[1, 3, 5])
@@ -49,6 +56,10 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_methods(parser: Parser) -> None:
     parser.option("--methods METHOD...", "methods to use (variants, file.py:Class or all; default: opensu3d)")
+    _add_corruptions(parser)
+
+
+def _add_corruptions(parser: Parser) -> None:
     parser.option(
         "--corruptions NAME...", "families, corruptions or pairs to use, such as depth pose/drift (default: all)",
         default=[],
@@ -77,6 +88,31 @@ def call_list(arguments: argparse.Namespace) -> None:
         for name, row in CORRUPTIONS.items()
     ]
     output.answer_tables(arguments, value, [text_table("corruptions", rows)])
+
+
+def call_show(arguments: argparse.Namespace) -> None:
+    """Draw what corruptions do to a frame, the trajectory, perfect masks and class names of a scene.
+
+    su3d-bench robustness show homes/tuning0 --corruptions depth pose --out depth.png
+    su3d-bench robustness show replica/room0 --corruptions light/motion-blur --frame 120 --out blur.png
+    """
+    from su3d_bench.cli.scenes import chosen_scenes
+    from su3d_bench.core.files.atomic import write_bytes
+    from su3d_bench.formats.images import png_bytes
+    from su3d_bench.robustness.pictures import clean_inputs, sheet, tiles
+    from su3d_bench.robustness.sweep import conditions_of
+
+    conditions = conditions_of(arguments.corruptions, arguments.severities[:1], [])
+    dataset, scene = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)[0]
+    inputs = clean_inputs(dataset, scene, arguments.frame)
+    pictures = {}
+    for (condition,) in (one for one in conditions if len(one) == 1):
+        pictures |= tiles(condition.corruption, inputs, arguments.severities)
+    if not pictures:
+        raise DataError(f"{inputs.scene}: has no ground-truth masks or class names; choose other --corruptions")
+    write_bytes(arguments.out, png_bytes(sheet(pictures, len(arguments.severities))))
+    line = f"{arguments.out}: {counted(len(pictures), 'picture')}"
+    output.answer_either(arguments, {"picture": str(arguments.out), "n_pictures": len(pictures)}, line)
 
 
 def call_run(arguments: argparse.Namespace) -> int:

@@ -131,7 +131,7 @@ def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any]
     )
 
 
-def _poses(dataset: Any, scene: str) -> Float64Array:
+def poses_of(dataset: Any, scene: str) -> Float64Array:
     """The poses (N, 4, 4) of all frames."""
     if isinstance(dataset, interfaces.ProvidesPoses):
         return dataset.poses(scene)
@@ -214,7 +214,7 @@ class _Scene:
             name = self.job.scene_name
             self._corruptions[part.name] = SceneCorruption(
                 parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
-                partial(self.dataset.frames, name, 1), partial(_poses, self.dataset, name),
+                partial(self.dataset.frames, name, 1), partial(poses_of, self.dataset, name),
             )  # fmt: skip
         return self._corruptions.get(part.name)
 

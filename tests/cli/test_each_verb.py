@@ -23,6 +23,23 @@ RUN = (
 CASES: dict[str, tuple[str, int, str]] = {
     "run": (f"{RUN} --out out", 0, "| opensu3d"),
     "ablate": (f"--vary m=1,2 --scenes rooms/bathroom0 --limit 2 {SMALL} --out sweep", 0, "sweep/metrics.json"),
+    "robustness list": ("", 0, "depth/holes"),
+    "robustness show": (
+        "rooms/bathroom0 --set rooms.width=160 rooms.height=120 rooms.n_frames=8 --corruptions names --out show.png",
+        0,
+        "show.png",
+    ),
+    "robustness run": (
+        f"--scenes rooms/bathroom0 --limit 2 {SMALL} --only depth/holes/4 --out robust",
+        0,
+        "robust/metrics.json",
+    ),
+    "robustness report": ("robust --figure robust.png", 0, "robust.png"),
+    "robustness tolerance": (
+        f"--scenes rooms/bathroom0 --limit 2 {SMALL} --corruptions depth/scale --out tolerance",
+        0,
+        "depth/scale",
+    ),
     "evaluate": (
         "out/scenes/rooms.bathroom0/opensu3d --dataset rooms --protocols rooms-instance --out evaluated",
         0,

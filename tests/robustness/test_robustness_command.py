@@ -71,6 +71,16 @@ def test_tolerance_is_between_the_severities_that_keep_and_lose(
     assert found["corruption"] == "masks/eroded"
 
 
+def test_show_draws_every_stage_at_every_severity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    room = "rooms/bathroom0 --set rooms.width=160 rooms.height=120 rooms.n_frames=40"
+    names = "depth/scale pose/jumps time/reordered masks/split names/typos calibration/focal"
+    words = f"robustness show {room} --corruptions {names} --out {tmp_path / 'show.png'} --json"
+    capsys.readouterr()
+    assert main(words.split()) == 0
+    assert json.loads(capsys.readouterr().out)["n_pictures"] == 36
+    assert (tmp_path / "show.png").read_bytes()[:4] == b"\x89PNG"
+
+
 def test_update_that_loses_all_depth_has_no_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = CORRUPTIONS["depth/holes"]
     monkeypatch.setitem(CORRUPTIONS, row.address, replace(row, values=(1.0, 1.0, 1.0, 1.0, 1.0)))
@@ -86,6 +96,7 @@ def test_update_that_loses_all_depth_has_no_effect(tmp_path: Path, monkeypatch: 
         ("run rooms/bathroom0 --severities 7", "expected 0 to 5"),
         ("tolerance rooms/bathroom0 --share 2 --out out", "must be above 0 and below 1"),
         ("tolerance rooms/bathroom0", "name the run folder with --out"),
+        ("show rooms/bathroom0 --set rooms.n_frames=40 --frame 40 --out show.png", "has frames 0 to 39"),
         ("report none", "none"),
     ],
 )
