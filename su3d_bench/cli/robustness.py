@@ -31,7 +31,7 @@ def add_parser(verbs: Verbs) -> None:
     parser = add_verb(group, "show", call_show, data=True)
     parser.option("scene SCENE", "scene, such as homes/tuning0")
     _add_corruptions(parser)
-    parser.option("--severities N...", "severities to draw (default: 0 to 5)", type=int, default=list(range(6)))
+    parser.option("--severities N...", "severities to use (default: 0 to 5)", type=int, default=list(range(6)))
     parser.option("--frame N", "frame to draw (default: the middle one)", type=index)
     parser.option("--out FILE.png", "picture to write", type=output_path, required=True)
     parser.shared("--set")
@@ -67,7 +67,7 @@ def _add_corruptions(parser: Parser) -> None:
 
 
 def _add_metric(parser: Parser) -> None:
-    parser.option("--protocol PROTOCOL", "protocol of the score (default: the first of the run)")
+    parser.option("--protocol PROTOCOL", "protocol to use (default: the first of the run)")
     parser.option("--metric METRIC", "metric of the score (default: the first of the protocol)")
 
 

@@ -92,7 +92,7 @@ def test_scan_lies_on_the_mesh_and_frames_on_the_scan(homes: Homes, truth: Groun
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
     points = truth.points[::50].astype(np.float32)
-    assert scene.compute_distance(o3d.core.Tensor(points)).numpy().max() < 1e-4
+    assert scene.compute_distance(o3d.core.Tensor(points)).numpy().max() < 5e-4  # m
     frame = homes.frame(SCENE, 7)
     seen = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, frame.depth_m > 0)
     assert np.percentile(scene.compute_distance(o3d.core.Tensor(seen.astype(np.float32))).numpy(), 99) < 1e-3
