@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from su3d_bench.analysis.sides import Numbers
+    from su3d_bench.core.types import UInt8Array
     from su3d_bench.robustness.sweep import Cell
     from su3d_bench.runs.finished import FinishedRun
 
@@ -105,7 +106,7 @@ def call_show(arguments: argparse.Namespace) -> None:
     conditions = conditions_of(arguments.corruptions, arguments.severities[:1], [])
     dataset, scene = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)[0]
     inputs = clean_inputs(dataset, scene, arguments.frame)
-    pictures = {}
+    pictures: dict[str, UInt8Array] = {}
     for (condition,) in (one for one in conditions if len(one) == 1):
         pictures |= tiles(condition.corruption, inputs, arguments.severities)
     if not pictures:
