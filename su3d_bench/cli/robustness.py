@@ -123,11 +123,16 @@ def call_run(arguments: argparse.Namespace) -> int:
     su3d-bench robustness run homes/tuning0 --only depth/holes/4 --out runs/one
     """
     from su3d_bench.robustness.sweep import conditions_of, methods_of
+    from su3d_bench.runs.advice import estimate
 
     conditions = conditions_of(arguments.corruptions, arguments.severities, arguments.only)
     arguments.methods = methods_of(arguments.methods or ["opensu3d"], conditions)
     arguments.pictures = bool(arguments.pictures)
-    return execute(plan_of(arguments), arguments)
+    plan = plan_of(arguments)
+    minutes = sum(row.seconds for row in estimate(plan) if not row.is_done) / plan.n_workers / 60
+    cells = f"{counted(len(plan.methods), 'cell')} on {counted(len(plan.jobs), 'scene')}"
+    output.remark(f"{cells}: about {minutes:.0f} minutes", quiet=arguments.quiet)
+    return execute(plan, arguments)
 
 
 def call_report(arguments: argparse.Namespace) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.corruptions.apply import MARK
 from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
@@ -40,7 +41,7 @@ class JobEstimate:
 def estimate(plan: Plan) -> list[JobEstimate]:
     """One estimate per scene and method, in the order of the plan; reads no frame."""
     methods, runs = plan.jobs[0].methods, plan.folder.path.parent
-    update_s = {part: recent_update_s(runs, part.name) for part in methods}
+    update_s = {part: recent_update_s(runs, part.name.partition(MARK)[0]) for part in methods}
     needs_frames = {part for part in methods if build_method(part).needs.frames}
     datasets = {part: build_dataset(part, root) for part, root in {(job.dataset, job.data_root) for job in plan.jobs}}
     going = {job.path for job in plan.removes}
