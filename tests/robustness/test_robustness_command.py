@@ -40,10 +40,10 @@ def test_severity_0_is_the_clean_run_byte_for_byte(sweep: Path) -> None:
 def test_cell_run_alone_equals_the_cell_of_the_sweep(
     sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for text in ("depth/holes/4", "time/lost-bursts/4"):
+    for text, more in (("depth/holes/4", ""), ("time/lost-bursts/4", "--scenes rooms/studio0 --jobs 2")):
         out = tmp_path / text.replace("/", "-")
-        assert main(f"robustness run {ROOM} --only {text} --out {out}".split()) == 0
-        assert "2 cells on 1 scene: about " in capsys.readouterr().err
+        assert main(f"robustness run {ROOM} --only {text} --out {out} {more}".split()) == 0
+        assert f"2 cells on {'2 scenes' if more else '1 scene'}: about " in capsys.readouterr().err
         name = f"opensu3d~{text.replace('/', '-')}"
         assert prediction(str(out), name) == prediction(str(sweep), name)
 
