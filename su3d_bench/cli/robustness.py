@@ -78,7 +78,7 @@ def call_list(arguments: argparse.Namespace) -> None:
     su3d-bench robustness list
     su3d-bench robustness list --format markdown
     """
-    from su3d_bench.corruptions.table import CORRUPTIONS
+    from su3d_bench.corruptions.apply import CORRUPTIONS
     from su3d_bench.formats.tables.table import text_table
 
     rows = [["corruption", "unit", "severities 1 to 5", "source"]]
@@ -141,8 +141,8 @@ def call_report(arguments: argparse.Namespace) -> None:
     su3d-bench robustness report runs/robust --format markdown --figure robust.png
     su3d-bench robustness report runs/robust --protocol homes-instance --metric AP50 --baseline conceptgraphs --json
     """
-    from su3d_bench.robustness.figure import draw_sweep
     from su3d_bench.robustness.measures import sweep_result
+    from su3d_bench.robustness.pictures import draw_sweep
     from su3d_bench.robustness.tables import sweep_tables
     from su3d_bench.runs.verify import read_checked
 
@@ -160,9 +160,8 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
     su3d-bench robustness tolerance --methods opensu3d --corruptions pose depth/scale --out runs/tolerance
     su3d-bench robustness tolerance --corruptions calibration --protocol homes-instance --metric AP50 --dry-run
     """
-    from su3d_bench.corruptions.apply import Condition
+    from su3d_bench.corruptions.apply import CORRUPTIONS, Condition
     from su3d_bench.corruptions.model import MAX_SEVERITY
-    from su3d_bench.corruptions.table import CORRUPTIONS
     from su3d_bench.robustness.sweep import conditions_of, methods_of
     from su3d_bench.robustness.tables import tolerance_table
     from su3d_bench.robustness.tolerance import find_tolerances, numbers_of

@@ -17,9 +17,12 @@ import numpy as np
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, PerceptionNeeds
+from su3d_bench.corruptions import calibration, depth, image, light, masks, names, poses, time
 from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, Stage, generator
-from su3d_bench.corruptions.table import CORRUPTIONS
 
+# A new corruption is a function and a row in the file of its family.
+FAMILIES = (calibration, depth, poses, time, light, image, masks, names)
+CORRUPTIONS: dict[str, Corruption] = {row.address: row for family in FAMILIES for row in family.ROWS}
 MARK = "~"  # between a method and its corruptions
 
 
@@ -59,27 +62,23 @@ def _condition(text: str) -> Condition:
 
 @dataclass(frozen=True)
 class SceneCorruption:
-    """The ``conditions`` of one scene. ``read_poses`` returns the clean poses (N, 4, 4) of all its frames.
+    """The ``conditions`` of one scene, whose clean ``frames`` are read at each access.
 
+    ``read_poses`` returns their poses (N, 4, 4); it is called only if needed, because it may read every frame.
     ``clean_cameras``: pose and intrinsics of the frames so far, before they were changed.
     """
 
     conditions: tuple[Condition, ...]
     scene: str
     seed: int
-    read_frames: Callable[[], Sequence[Frame]]
+    frames: Sequence[Frame]
     read_poses: Callable[[], Float64Array]
     clean_cameras: dict[int, tuple[Float64Array, Float64Array]] = field(default_factory=dict)
 
     @cached_property
-    def recording(self) -> tuple[Sequence[Frame], Float64Array]:
-        """Every frame and its clean pose."""
-        return self.read_frames(), self.read_poses()
-
-    @cached_property
     def poses(self) -> Float64Array:
         """The poses that the method gets."""
-        poses = self.recording[1]
+        poses = self.read_poses()
         for condition in self.at("poses"):
             poses = self.call(condition, 0, poses)
         return poses
@@ -91,14 +90,15 @@ class SceneCorruption:
     def call(self, condition: Condition, index: int, value: Any, *more: Any) -> Any:
         """What a corruption makes of ``value``; its random numbers are those of frame ``index``."""
         corruption = condition.corruption
-        rng = generator(corruption, self.seed, self.scene, 0 if corruption.per_scene else index)
+        rng = generator(corruption, self.seed, self.scene, index)
         return corruption.function(value, condition.value, rng, *more)
 
     def frame(self, frame: Frame) -> Frame:
         """The frame as the method gets it."""
         self.clean_cameras[frame.index] = frame.camera_to_world, frame.intrinsics
         for condition in self.at("frame"):
-            frame = self.call(condition, frame.index, frame, Recording(*self.recording, frame.index))
+            poses = self.read_poses() if condition.corruption.uses_poses else np.zeros((0, 4, 4))
+            frame = self.call(condition, frame.index, frame, Recording(self.frames, poses, frame.index))
         if self.at("poses"):
             frame = replace(frame, camera_to_world=self.poses[frame.index])
         return frame

@@ -68,7 +68,7 @@ def blobs(shape: tuple[int, ...], share: float, smoothing: float, rng: Generator
 def dark_holes(frame: Frame, min_luminance: float, rng: Generator, recording: Recording) -> Frame:
     """Depth without pixels whose luminance (0..1, linear light) is lower: black surfaces return too little light.
 
-    The colour image stands in for the material, which only rendered scenes know.
+    The colour image is used instead of the material, which is known only in rendered scenes.
     """
     lost = to_linear(frame.rgb) @ LUMINANCE < min_luminance
     return replace(frame, depth_m=np.where(lost, np.float32(0), frame.depth_m))

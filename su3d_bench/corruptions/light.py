@@ -52,6 +52,6 @@ ROWS: tuple[Corruption, ...] = (
     ),
     Corruption(
         "light", "motion-blur", "frame", motion_blur, "ms of exposure at 30 Hz", (5, 10, 15, 22, 33),
-        "ours: up to the whole interval between two frames, the longest exposure at that rate",
+        "ours: up to the whole interval between two frames, the longest exposure at that rate", uses_poses=True,
     ),
 )  # fmt: skip

@@ -56,7 +56,8 @@ class Corruption:
 
     ``values``: severities 1 to 5 in ``unit``, getting worse; ``neutral``: the value that changes nothing;
     ``source``: where the values come from, or "ours" with the reason; ``is_whole``: values are whole numbers;
-    ``per_scene``: every frame of a scene receives the same random numbers.
+    ``per_scene``: every frame of a scene receives the same random numbers; ``uses_poses``: it needs the recording's
+    poses, which are empty for others.
     """
 
     family: str
@@ -69,6 +70,7 @@ class Corruption:
     neutral: float = 0.0
     is_whole: bool = False
     per_scene: bool = False
+    uses_poses: bool = False
 
     @property
     def address(self) -> str:

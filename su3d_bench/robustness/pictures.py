@@ -1,10 +1,11 @@
-"""Pictures of corruptions of one scene: a row per corruption, a column per severity."""
+"""Pictures of what corruptions do to one scene, and the figure of a sweep: the score against the severity."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,9 @@ from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption, Recording, ge
 from su3d_bench.corruptions.sensors.depth import edges
 from su3d_bench.metrics.protocols.loading import headline_protocols, load_protocol
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
+from su3d_bench.reports.pictures.canvas import figure_style, write_figure
+from su3d_bench.reports.pictures.plots import figure_with_panels, style_of_line
+from su3d_bench.robustness.measures import MethodResult, SweepResult
 from su3d_bench.runs.scene import poses_of
 from su3d_bench.runs.scenes import cache_root
 
@@ -37,7 +41,7 @@ class CleanInputs:
 
 
 def clean_inputs(dataset: Any, scene: str, index: int | None) -> CleanInputs:
-    """The inputs of a scene at frame ``index``, by default the middle one; ``ConfigError`` if there is none."""
+    """The inputs of a scene at frame ``index``, by default the middle one; raises ``ConfigError``."""
     frames = dataset.frames(scene, 1)
     index = len(frames) // 2 if index is None else index
     if index >= len(frames):
@@ -165,3 +169,35 @@ def _names(names: tuple[str, ...], clean: tuple[str, ...]) -> UInt8Array:
     for k, line in enumerate(lines[:9]):
         _write(picture, line[:38], 8, 30 + 31 * k, 0.62)
     return picture
+
+
+PANEL_HEIGHT_IN = 2.2
+
+
+@figure_style()
+def draw_sweep(result: SweepResult, path: Path) -> None:
+    """Write the figure as the format of ``path``, ``.png`` or ``.pdf``."""
+    families = list(dict.fromkeys(family for method in result.methods for family in method.families))
+    figure, axes = figure_with_panels("17cm", *[PANEL_HEIGHT_IN] * len(families))
+    for family, panel in zip(families, axes, strict=True):
+        for index, method in enumerate(result.methods):
+            severities, values = _curve(method, family)
+            panel.plot(severities, values, label=method.method, markersize=4, **style_of_line(index))
+        panel.set_title(family)
+        panel.set_xlim(0, MAX_SEVERITY)
+        panel.set_ylim(0, 1.05 * 100 * max(method.clean for method in result.methods) or 1)
+        panel.set_xlabel("severity")
+        panel.set_ylabel(f"{result.metric}, %")
+    axes[0].legend(fontsize=7)
+    write_figure(figure, path)
+
+
+def _curve(method: MethodResult, family: str) -> tuple[list[float], list[float]]:
+    """The mean value over the corruptions of a family at each severity, from the clean one on, in per cent."""
+    values: dict[float, list[float]] = {0.0: [method.clean]}
+    for one in method.cells:
+        if one.cell.family == family:
+            severity = max(condition.severity for condition in one.cell.conditions)
+            values.setdefault(severity, []).append(one.difference.right)
+    severities = sorted(values)
+    return severities, [100 * float(np.mean(values[severity])) for severity in severities]

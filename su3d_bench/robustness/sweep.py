@@ -11,9 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from su3d_bench.core.errors import ConfigError, counted, suggest
-from su3d_bench.corruptions.apply import MARK, Condition, parse_conditions
+from su3d_bench.corruptions.apply import CORRUPTIONS, MARK, Condition, parse_conditions
 from su3d_bench.corruptions.model import MAX_SEVERITY
-from su3d_bench.corruptions.table import CORRUPTIONS
 
 MAX_METHODS = 2000
 

@@ -168,6 +168,11 @@ class _Scene:
                     return boxes
             raise
 
+    @cached_property
+    def poses(self) -> Float64Array:
+        """The poses (N, 4, 4) of all frames, before any corruption."""
+        return poses_of(self.dataset, self.job.scene_name)
+
     def report_activity(self, part: jobs.Part, activity: str) -> None:
         """Report the current activity while no frame is fed."""
         self.report(Event(self.job.scene, part.name, activity=activity))
@@ -214,7 +219,7 @@ class _Scene:
             name = self.job.scene_name
             self._corruptions[part.name] = SceneCorruption(
                 parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
-                partial(self.dataset.frames, name, 1), partial(poses_of, self.dataset, name),
+                self.dataset.frames(name, 1), lambda: self.poses,
             )  # fmt: skip
         return self._corruptions.get(part.name)
 

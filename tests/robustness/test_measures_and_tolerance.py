@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pytest
+from scored_room import ENCODER, ROOM
 
 from su3d_bench.analysis.sides import Numbers
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.maps import Instances
-from su3d_bench.corruptions.apply import parse_conditions
-from su3d_bench.corruptions.table import CORRUPTIONS
+from su3d_bench.corruptions.apply import CORRUPTIONS, parse_conditions
 from su3d_bench.metrics.matching.labelling import classes_of_prediction
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.robustness import measures
 from su3d_bench.robustness.sweep import Cell, cell_of, conditions_of, methods_of
 from su3d_bench.robustness.tolerance import find_tolerances
@@ -123,22 +122,10 @@ def test_family_means_weight_corruptions_equally_and_mce_is_relative_to_the_base
 
 
 def test_what_is_most_similar_to_a_distractor_has_no_class() -> None:
-    rules = load_protocol("rooms-instance").with_names(
-        [f"name {k}" for k in range(len(load_protocol("rooms-instance").classes))] + ["violin"]
-    )
-    texts = [*(rules.texts_of(entry.name)[0] for entry in rules.classes), rules.texts_of("violin")[0]]
-    assert texts[0].count("name 0") == 1
-
-    class OneHot:
-        name, dim, digest = "one-hot", len(texts), "one-hot"
-
-        def encode_images(self, images: Sequence[np.ndarray]) -> np.ndarray:
-            raise NotImplementedError
-
-        def encode_texts(self, wanted: Sequence[str]) -> np.ndarray:
-            return np.eye(len(texts), dtype=np.float32)[[texts.index(text) for text in wanted]]
-
-    features = np.eye(len(texts), dtype=np.float32)[[3, len(texts) - 1]]
+    names = [entry.name for entry in ROOM.classes]
+    rules = ROOM.with_names([*names, "violin"])
+    features = ENCODER.encode_texts([names[3], "violin"])
     masks = Instances.of(np.zeros((1, 3), np.float32), [[0], [0]], features=features)
-    found = classes_of_prediction(rules, masks, OneHot(), np.ones(len(rules.classes), bool))
-    assert found.tolist() == [3, -1]
+    is_present = np.ones(len(names), bool)
+    assert classes_of_prediction(rules, masks, ENCODER, is_present).tolist() == [3, -1]
+    assert -1 not in classes_of_prediction(ROOM, masks, ENCODER, is_present)

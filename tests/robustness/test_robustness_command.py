@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.cli.main import main
-from su3d_bench.corruptions.table import CORRUPTIONS
+from su3d_bench.corruptions.apply import CORRUPTIONS
 
 SMALL = "--set rooms.width=160 rooms.height=120 rooms.n_frames=40 --stride 10 --profile oracle --jobs 1"
 ROOM = f"rooms/bathroom0 {SMALL} --protocols rooms-instance"
