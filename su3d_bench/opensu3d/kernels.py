@@ -182,6 +182,9 @@ VOXELS = 512  # per block
 UNKNOWN = -2
 # The point that is dropped when a new one meets an occupied voxel: the scene's, the frame's, neither.
 SCENE, FRAME, ALL = 0, 1, 2
+# Columns of ``pairs``, one row per instance and block: the key (instance, block, 0), the number of the instance's points
+# in the block, its next row, and the number of its rows from this one on.
+N_POINTS, NEXT, N_ROWS = 3, 4, 5
 STEPS = (0, -1, 1, -2, 2)  # relative to the voxel of the query, nearest first
 
 
@@ -203,16 +206,45 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def insert(  # type: ignore[no-untyped-def]
-    new_points, new_ids, start, eps, density, placed, counts, ids, born, points, following, keys, heads, table
-):
-    """Insert new points from ``start`` on; stop when the blocks run out and return the point reached.
+def _tally(instance, block, n, tallies):  # type: ignore[no-untyped-def]
+    """Add ``n`` to the number of points of ``instance`` in ``block``; nothing if it is 0, no instance."""
+    counts, pairs, pair_table, first_pair = tallies
+    if instance == 0:
+        return
+    slot = slot_of(pair_table, pairs, instance, block, 0)
+    row = pair_table[slot]
+    if row == ABSENT:
+        row, following = counts[3], first_pair[instance]
+        pairs[row, 0], pairs[row, 1], pairs[row, 2], pairs[row, N_POINTS] = instance, block, 0, 0
+        pairs[row, NEXT], pairs[row, N_ROWS] = following, 1 + (pairs[following, N_ROWS] if following != ABSENT else 0)
+        pair_table[slot] = first_pair[instance] = row
+        counts[3] += 1
+    pairs[row, N_POINTS] += n
 
-    ``counts`` holds the number of points, of blocks and of all points inserted so far; ``placed`` receives the map
-    index of each inserted point (that of the point it replaced, if any), ABSENT for the others.
+
+@njit(cache=True)
+def copy_pairs(old, tallies):  # type: ignore[no-untyped-def]
+    """Add those of the pairs ``old`` that have points to ``tallies``."""
+    for row in range(len(old)):
+        if old[row, N_POINTS] > 0:
+            _tally(old[row, 0], old[row, 1], old[row, N_POINTS], tallies)
+
+
+@njit(cache=True)
+def insert(  # type: ignore[no-untyped-def]
+    new_points, new_ids, start, eps, density, placed, ids, born, tallies, points, following, keys, heads, table
+):
+    """Insert new points from ``start`` on; stop when the blocks or pairs run out and return the point reached.
+
+    ``placed`` receives the map index of each inserted point (that of the point it replaced, if any), ABSENT for the
+    others. ``tallies``: the numbers of points, of blocks, of all points inserted so far and of pairs; the pairs; their
+    hash table; the first pair of each instance.
     """
+    counts, pairs = tallies[0], tallies[1]
     bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
     for i in range(start, len(new_points)):
+        if counts[3] == len(pairs):
+            return i
         x, y, z = new_points[i, 0], new_points[i, 1], new_points[i, 2]
         vx, vy, vz = _voxel(x, eps), _voxel(y, eps), _voxel(z, eps)
         if block == ABSENT or vx >> 3 != bx or vy >> 3 != by or vz >> 3 != bz:
@@ -232,13 +264,17 @@ def insert(  # type: ignore[no-untyped-def]
         placed[i] = ABSENT
         born_as = counts[2]
         counts[2] += 1
+        old_id = ids[target] if target != ABSENT else 0
         if target == ABSENT:
             target = counts[0]
             following[target] = heads[block, local]
             heads[block, local] = target
             counts[0] += 1
-        elif density == FRAME or (new_ids[i] == 0 and ids[target] != 0):
+        elif density == FRAME or (new_ids[i] == 0 and old_id != 0):
             continue
+        if new_ids[i] != old_id:
+            _tally(old_id, block, -1, tallies)
+            _tally(new_ids[i], block, 1, tallies)
         points[target, 0], points[target, 1], points[target, 2] = x, y, z
         ids[target], born[target] = new_ids[i], born_as
         placed[i] = target
@@ -316,43 +352,57 @@ def nearest(queries, eps, answer, born, points, following, keys, heads, table): 
 
 
 @njit(cache=True)
-def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts):  # type: ignore[no-untyped-def]
+def _count_pair(pair, lower, upper, first, last, pairs, ids, points, following, keys, heads):  # type: ignore[no-untyped-def]
+    """Number of points of the pair in the closed box, which reaches from the block ``first`` to ``last``."""
+    instance, block, n = pairs[pair, 0], pairs[pair, 1], pairs[pair, N_POINTS]
+    x, y, z = keys[block, 0], keys[block, 1], keys[block, 2]
+    if first[0] < x < last[0] and first[1] < y < last[1] and first[2] < z < last[2]:
+        return n
+    if n == 0 or not (first[0] <= x <= last[0] and first[1] <= y <= last[1] and first[2] <= z <= last[2]):
+        return 0
+    n = 0
     for local in range(VOXELS):
         j = heads[block, local]
         while j != ABSENT:
-            row = row_of_id[ids[j]] if ids[j] < len(row_of_id) else ABSENT
-            if row != ABSENT:
+            if ids[j] == instance:
                 x, y, z = points[j, 0], points[j, 1], points[j, 2]
-                if lower[0] <= x <= upper[0] and lower[1] <= y <= upper[1] and lower[2] <= z <= upper[2]:
-                    counts[row] += 1
+                n += lower[0] <= x <= upper[0] and lower[1] <= y <= upper[1] and lower[2] <= z <= upper[2]
             j = following[j]
+    return n
 
 
 @njit(cache=True)
 def count_inside(  # type: ignore[no-untyped-def]
-    lower, upper, row_of_id, eps, n_blocks, counts, ids, points, following, keys, heads, table
+    lower, upper, wanted, eps, inside, ids, tallies, points, following, keys, heads, table
 ):
-    """Add the points of each id in the closed box to ``counts[row_of_id[id]]``; return the number of blocks visited.
+    """Add the points of each id of ``wanted`` in the closed box to ``inside``; return the number of blocks visited.
 
-    Iterates over the block coordinates of the box, or over all blocks if they are fewer.
+    Iterates over the blocks of the id, or over those of the box if they are fewer. Blocks between those of the box's
+    faces are inside with all points.
     """
+    _, pairs, pair_table, first_pair = tallies
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     for a in range(3):
         first[a], last[a] = _voxel(lower[a], eps) >> 3, _voxel(upper[a], eps) >> 3
-    span = last - first + 1
-    if float(span[0]) * float(span[1]) * float(span[2]) > n_blocks:
-        for block in range(n_blocks):
-            if (
-                first[0] <= keys[block, 0] <= last[0]
-                and first[1] <= keys[block, 1] <= last[1]
-                and first[2] <= keys[block, 2] <= last[2]
-            ):
-                _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts)
-        return n_blocks
-    for bx in range(first[0], last[0] + 1):
-        for by in range(first[1], last[1] + 1):
-            for bz in range(first[2], last[2] + 1):
-                block = table[slot_of(table, keys, bx, by, bz)]
-                if block != ABSENT:
-                    _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts)
-    return span[0] * span[1] * span[2]
+    span = (last - first + 1).astype(np.float64)
+    n_in_box = span[0] * span[1] * span[2]
+    visited = 0.0
+    for row in range(len(wanted)):
+        pair = first_pair[wanted[row]]
+        n_rows = pairs[pair, N_ROWS] if pair != ABSENT else 0
+        visited += min(n_rows, n_in_box)
+        if n_rows <= n_in_box:
+            while pair != ABSENT:
+                inside[row] += _count_pair(pair, lower, upper, first, last, pairs, ids, points, following, keys, heads)
+                pair = pairs[pair, NEXT]
+            continue
+        for bx in range(first[0], last[0] + 1):
+            for by in range(first[1], last[1] + 1):
+                for bz in range(first[2], last[2] + 1):
+                    block = table[slot_of(table, keys, bx, by, bz)]
+                    pair = pair_table[slot_of(pair_table, pairs, wanted[row], block, 0)]  # no pair has block ABSENT
+                    if pair != ABSENT:
+                        inside[row] += _count_pair(
+                            pair, lower, upper, first, last, pairs, ids, points, following, keys, heads
+                        )
+    return visited

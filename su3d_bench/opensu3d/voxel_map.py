@@ -38,7 +38,10 @@ class VoxelMap:
         self._keys = np.empty((1 << 6, 3), np.int64)
         self._heads = np.empty((1 << 6, 512), np.int32)
         self._table = np.full(1 << 8, -1, np.int32)
-        self._counts = np.zeros(3, np.int64)
+        self._counts = np.zeros(4, np.int64)
+        self._pairs = np.empty((1 << 6, 6), np.int64)
+        self._pair_table = np.full(1 << 8, -1, np.int32)
+        self._first_pair = np.full(1 << 8, -1, np.int32)
 
     def __len__(self) -> int:
         return int(self._counts[0])
@@ -52,6 +55,10 @@ class VoxelMap:
     def _arrays(self) -> tuple[NDArray[Any], ...]:
         """The arrays passed to every kernel."""
         return self._points, self._following, self._keys, self._heads, self._table
+
+    @property
+    def _tallies(self) -> tuple[NDArray[Any], ...]:
+        return self._counts, self._pairs, self._pair_table, self._first_pair
 
     @property
     def n_bytes(self) -> int:
@@ -97,7 +104,11 @@ class VoxelMap:
         return answer, sum(in_threads(look_up, len(queries)))
 
     def count_inside(self, lower: Float64Array, upper: Float64Array, wanted: Int32Array) -> Int64Array:
-        """Number of points of each wanted id inside the closed box from ``lower`` to ``upper``."""
+        """Number of points of each wanted id, above NO_INSTANCE, inside the closed box from ``lower`` to ``upper``.
+
+        The cost depends on the wanted instances and the box, not on the others: points are counted per instance and
+        block as they are inserted.
+        """
         return self.count_inside_counted(lower, upper, wanted)[0]
 
     def count_inside_counted(
@@ -106,14 +117,11 @@ class VoxelMap:
         """As ``count_inside``, with the number of blocks visited."""
         from su3d_bench.opensu3d import kernels as _kernels
 
-        counts = np.zeros(len(wanted), np.int64)
-        if len(wanted) == 0:
-            return counts, 0
-        row_of_id = np.full(int(wanted.max()) + 1, -1, np.int64)
-        row_of_id[wanted] = np.arange(len(wanted))
+        inside = np.zeros(len(wanted), np.int64)
+        self._reserve_ids(wanted)
         ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-        visited = _kernels.count_inside(*ends, row_of_id, self.eps, self.n_blocks, counts, self._ids, *self._arrays)
-        return counts, int(visited)
+        visited = _kernels.count_inside(*ends, wanted, self.eps, inside, self._ids, self._tallies, *self._arrays)
+        return inside, int(visited)
 
     def insert(self, points: Float64Array, ids: Int32Array) -> Int64Array:
         """Add points in order; return the map index of each, -1 if dropped.
@@ -125,15 +133,19 @@ class VoxelMap:
 
         points, ids = checked_points(points), np.ascontiguousarray(ids, np.int32)
         self._reserve_points(len(self) + len(points))
+        self._reserve_ids(ids)
         placed = np.empty(len(points), np.int64)
         density = {"scene": _kernels.SCENE, "frame": _kernels.FRAME, "all": _kernels.ALL}[self.density]
         done = 0
         while True:
-            of_points = placed, self._counts, self._ids, self._born
+            of_points = placed, self._ids, self._born, self._tallies
             done = _kernels.insert(points, ids, done, self.eps, density, *of_points, *self._arrays)
             if done == len(points):
                 return placed
-            self._double_blocks()
+            if self._counts[3] == len(self._pairs):
+                self._renew_pairs()
+            else:
+                self._double_blocks()
 
     def _reserve_points(self, n: int) -> None:
         capacity = doubled(len(self._ids), n)
@@ -143,6 +155,23 @@ class VoxelMap:
         self._ids = _grown(self._ids, capacity, len(self))
         self._born = _grown(self._born, capacity, len(self))
         self._following = _grown(self._following, capacity, len(self))
+
+    def _reserve_ids(self, ids: Int32Array) -> None:
+        capacity = doubled(len(self._first_pair), int(ids.max(initial=0)) + 1)
+        if capacity > len(self._first_pair):
+            self._first_pair = np.append(self._first_pair, np.full(capacity - len(self._first_pair), -1, np.int32))
+
+    def _renew_pairs(self) -> None:
+        """Remove pairs without points; double the capacity if more than half have points."""
+        from su3d_bench.opensu3d import kernels as _kernels
+
+        old = self._pairs
+        capacity = doubled(len(old), 2 * np.count_nonzero(old[:, _kernels.N_POINTS]))
+        self._pairs = np.empty((capacity, old.shape[1]), np.int64)
+        self._pair_table = np.full(4 * capacity, -1, np.int32)
+        self._first_pair[:] = -1
+        self._counts[3] = 0
+        _kernels.copy_pairs(old, self._tallies)
 
     def _double_blocks(self) -> None:
         from su3d_bench.opensu3d import kernels as _kernels
