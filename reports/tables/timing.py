@@ -13,6 +13,7 @@ from su3d_bench.numerics.statistics import Growth
 
 MIB = 2**20
 CACHE = "cache"
+SIZES = ("points", "instances", "frames")
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,14 @@ def timing_tables(
 
 def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) -> str:
     """Return one row per run, method and stage, in full precision."""
-    growth = [f"{name}_{part}" for name in ("points", "frames") for part in ("exponent", "low", "high", "words")]
+    growth = [f"{name}_{part}" for name in SIZES for part in ("exponent", "low", "high", "words")]
     head = ["run", "hardware", "method", "n_scenes", "stage", "n", "first_ms", "p50_ms", "p95_ms", "max_ms", "share"]
     rows: list[list[Any]] = [[*head, *growth]]
     for cost in summaries:
         for stage in cost.stages:
             numbers = [stage.n, stage.first, stage.p50, stage.p95, stage.worst, stage.share]
             grown: list[Any] = []
-            for each in (stage.against_points, stage.against_frames):
+            for each in (stage.against_points, stage.against_instances, stage.against_frames):
                 grown += [""] * 4 if each is None else [each.exponent, each.low, each.high, each.words]
             scenes = len(cost.scenes)
             rows.append([cost.run, hardware[cost.run], cost.method, scenes, stage.name, *numbers, *grown])
@@ -96,14 +97,14 @@ def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> It
 
 def _stages_table(summary: MethodSummary) -> Iterator[list[str]]:
     yield [
-        *("stage", "p50", "p95", "max", "first", "share", "exponent by map points", "exponent by updates"),
-        "growth with map size",
+        *("stage", "p50", "p95", "max", "first", "share"),
+        *("exponent by map points", "exponent by instances", "exponent by updates", "growth with map size"),
     ]
     for stage in summary.stages:
         growth = stage.against_points or stage.against_frames
         yield [
             *(stage.name, _ms(stage.p50), _ms(stage.p95), _ms(stage.worst), _ms(stage.first), percent(stage.share)),
-            *(_growth(stage.against_points), _growth(stage.against_frames)),
+            *map(_growth, (stage.against_points, stage.against_instances, stage.against_frames)),
             "too few updates" if growth is None else growth.words,
         ]
 

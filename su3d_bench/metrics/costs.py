@@ -70,8 +70,8 @@ def pooled(times: Sequence[UpdateTimes], stage: str, warm_up: int) -> Float64Arr
 class StageSummary:
     """One stage of a method over its updates, in ms; ``first`` is the mean of the updates before the steady ones.
 
-    ``share`` of the total time; ``against_points`` and ``against_frames``: growth with the size of the map and with the
-    number of updates so far, None if unknown.
+    ``share`` of the total time; ``against_points``, ``against_instances`` and ``against_frames``: growth with the
+    points and instances of the map and with the number of updates so far, None if unknown.
     """
 
     name: str
@@ -82,6 +82,7 @@ class StageSummary:
     worst: float
     share: float
     against_points: Growth | None
+    against_instances: Growth | None
     against_frames: Growth | None
 
 
@@ -138,7 +139,10 @@ class _Pool:
         self._times = times
         self.total_ms = pooled(times, TOTAL, 0)
         self._number = np.concatenate([np.arange(1.0, len(updates) + 1) for updates in times])
-        self._points = np.concatenate([updates.columns.get("n_points", np.zeros(len(updates))) for updates in times])
+        self._points, self._instances = (
+            np.concatenate([updates.columns.get(column, np.zeros(len(updates))) for updates in times])
+            for column in ("n_points", "n_instances")
+        )
         self._is_steady = self._number > warm_up
 
     def stage(self, name: str) -> StageSummary:
@@ -155,6 +159,7 @@ class _Pool:
             worst=float(worst),
             share=float(ms.sum()) / total if total else float("nan"),
             against_points=growth_exponent(self._points[self._is_steady], steady),
+            against_instances=growth_exponent(self._instances[self._is_steady], steady),
             against_frames=growth_exponent(self._number[self._is_steady], steady),
         )
 

@@ -182,8 +182,8 @@ VOXELS = 512  # per block
 UNKNOWN = -2
 # The point that is dropped when a new one meets an occupied voxel: the scene's, the frame's, neither.
 SCENE, FRAME, ALL = 0, 1, 2
-# Columns of ``pairs``, one row per instance and block: the key (instance, block, 0), the number of the instance's points
-# in the block, its next row, and the number of its rows from this one on.
+# Columns of ``pairs``, one row per instance and block: the key (instance, block, 0), the points of the instance in
+# the block, its next row, and the number of its rows from this one on.
 N_POINTS, NEXT, N_ROWS = 3, 4, 5
 STEPS = (0, -1, 1, -2, 2)  # relative to the voxel of the query, nearest first
 

@@ -92,9 +92,9 @@ def test_density_is_constant_and_memory_bounded_for_repeated_views(density: Dens
     rng = np.random.default_rng(0)
     filled = VoxelMap(EPS, density)
     n_bytes = []
-    for _ in range(60):
+    for view in range(60):
         points = rng.uniform(0, 0.4, (4000, 3)) * [1, 1, 0]
-        filled.insert(points, np.ones(len(points), np.int32))
+        filled.insert(points, np.full(len(points), view + 1, np.int32))
         n_bytes.append(filled.n_bytes)
     assert len(filled) <= 20 * 20
     assert n_bytes[1] == n_bytes[-1]  # the first view found an empty map
@@ -138,14 +138,40 @@ def test_oldest_of_equally_near_points_matches_wherever_it_is_stored() -> None:
 def test_points_inside_a_closed_box_are_counted_by_id(
     lattice_points: list[tuple[int, ...]], corner: tuple[int, ...], size: tuple[int, ...]
 ) -> None:
-    points = np.array(lattice_points, np.float64) * 0.016
-    ids = np.arange(len(points), dtype=np.int64) % 4 + 1
+    filled, placed = VoxelMap(EPS), np.array(lattice_points, np.float64) * 0.016
+    for nth in range(3):  # some points get another id, or none
+        filled.insert(placed[:: nth + 1], ((np.arange(len(placed)) + nth) % 5).astype(np.int32)[:: nth + 1])
+    points, ids = filled.points, filled.ids
     lower = np.array(corner) * 0.016
     upper = lower + np.array(size) * 0.016
     inside = ((points >= lower) & (points <= upper)).all(axis=1)
     wanted = np.array([4, 1, 3], np.int32)
-    counts = map_of(points, ids=ids).count_inside(lower, upper, wanted)
+    counts = filled.count_inside(lower, upper, wanted)
     assert counts.tolist() == [np.count_nonzero(inside & (ids == one)) for one in wanted]
+
+
+def test_counts_follow_points_that_change_their_instance() -> None:
+    """Along x the box from 0 to 0.34 m ends inside the blocks at 0 and 0.32 m and contains that at 0.16 m."""
+    filled, points = VoxelMap(EPS), np.full((5, 3), 0.01)
+    points[:, 0] = [0.01, 0.17, 0.19, 0.33, 0.35]
+    wanted, ends = np.array([1, 2], np.int32), (np.array([0.0, -0.2, -0.2]), np.array([0.34, 0.2, 0.2]))
+    counts = []
+    for rows, one in ((slice(5), 1), (slice(1, 2), 2), (slice(5), 0), (slice(2, 5), 2), (slice(1), 3)):
+        filled.insert(points[rows], np.full(len(points[rows]), one, np.int32))
+        counts.append(filled.count_inside(*ends, wanted).tolist())
+    assert counts == [[4, 0], [3, 1], [3, 1], [1, 3], [0, 3]]
+
+
+def test_counting_cost_is_independent_of_other_instances_in_the_box() -> None:
+    """A plate of 0.32 m is in four blocks, which are the ones visited among thousands of other instances' points."""
+    side = (np.arange(16) + 0.5) * EPS
+    plate = np.stack(np.meshgrid(side, side, [0.01]), axis=-1).reshape(-1, 3)
+    others = np.random.default_rng(2).uniform(-2, 2, (40_000, 3))
+    filled = VoxelMap(EPS)
+    filled.insert(others, np.arange(2, 40_002, dtype=np.int32))
+    filled.insert(plate, np.ones(256, np.int32))
+    counts, visited = filled.count_inside_counted(np.full(3, -2.0), np.full(3, 2.0), np.array([1], np.int32))
+    assert (counts.tolist(), visited) == ([256], 4)
 
 
 def test_matching_and_counting_cost_is_independent_of_map_size() -> None:

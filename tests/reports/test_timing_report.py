@@ -71,6 +71,14 @@ def test_map_time_excludes_reading_and_perception() -> None:
     np.testing.assert_array_equal(one.ms("map"), 2.0)
 
 
+def test_growth_is_fitted_against_points_and_against_instances() -> None:
+    sizes = np.arange(1.0, 41.0)
+    summary = summarise([times(sizes**1.5, n_points=1e4 * sizes**3, n_instances=sizes)], warm_up=0)
+    total = stages_of(summary)["total"]
+    assert (total.against_points.exponent, total.against_instances.exponent) == pytest.approx((0.5, 1.5))
+    assert stages_of(summarise([times(sizes, n_points=sizes)]))["total"].against_instances is None
+
+
 def test_run_records_sizes_memory_and_cost_of_every_map(run: Path) -> None:
     (first, second) = read_update_times(read_run(run), "collector")
     assert [first.scene, second.scene] == ["painted/a", "painted/b"]
@@ -97,7 +105,9 @@ def test_timing_report_prints_tables_and_writes_plots(
     shown = capsys.readouterr().out
     assert shown.count("| collector |") == 1 + 2 * 3
     assert "12 updates of 2 scenes" in shown
+    assert "| exponent by instances |" in shown
     rows = list(csv.DictReader((tmp_path / "timing.csv").open()))
+    assert {"points_exponent", "instances_exponent", "instances_low", "instances_high"} <= {*rows[0]}
     assert {"map", "total"} <= {row["stage"] for row in rows}
     assert all(int(row["n"]) == 10 and float(row["p50_ms"]) >= 0 for row in rows)
     assert (tmp_path / "timing.md").read_text().startswith(str(run))

@@ -73,7 +73,8 @@ function stageTimes(one) {
       ...['p50', 'p95', 'max', 'first'].map((key) => ({
         label: key, num: true, value: (row) => row[key], show: (row) => msText(row[key]) })),
       { label: 'Share', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` },
-      exponent('Exponent over map points', 'by_points'), exponent('Exponent over updates', 'by_updates'),
+      exponent('Exponent over map points', 'by_points'), exponent('Exponent over instances', 'by_instances'),
+      exponent('Exponent over updates', 'by_updates'),
       { label: 'Growth with map size', value: growthWords },
     ],
   });

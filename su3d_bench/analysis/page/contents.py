@@ -82,7 +82,8 @@ def summary_data(summary: MethodSummary) -> dict[str, Any]:
     stages = []
     for stage in summary.stages:
         times = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst, "share": stage.share}
-        growths = {"by_points": stage.against_points, "by_updates": stage.against_frames}
+        growths = {"by_points": stage.against_points, "by_instances": stage.against_instances}
+        growths["by_updates"] = stage.against_frames
         reported = {name: growth and {**asdict(growth), "words": growth.words} for name, growth in growths.items()}
         stages.append({"name": stage.name, **{name: _number(value) for name, value in times.items()}, **reported})
     return numbers | {"stages": stages}
