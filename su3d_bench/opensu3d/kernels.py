@@ -381,11 +381,9 @@ def count_inside(  # type: ignore[no-untyped-def]
     faces are inside with all points.
     """
     _, pairs, pair_table, first_pair = tallies
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
-    for a in range(3):
-        first[a], last[a] = _voxel(lower[a], eps) >> 3, _voxel(upper[a], eps) >> 3
-    span = (last - first + 1).astype(np.float64)
-    n_in_box = span[0] * span[1] * span[2]
+    first, last = np.floor(lower / eps).astype(np.int64) >> 3, np.floor(upper / eps).astype(np.int64) >> 3
+    span = last - first + 1
+    n_in_box = float(span[0]) * float(span[1]) * float(span[2])
     visited = 0.0
     for row in range(len(wanted)):
         pair = first_pair[wanted[row]]
@@ -396,13 +394,9 @@ def count_inside(  # type: ignore[no-untyped-def]
                 inside[row] += _count_pair(pair, lower, upper, first, last, pairs, ids, points, following, keys, heads)
                 pair = pairs[pair, NEXT]
             continue
-        for bx in range(first[0], last[0] + 1):
-            for by in range(first[1], last[1] + 1):
-                for bz in range(first[2], last[2] + 1):
-                    block = table[slot_of(table, keys, bx, by, bz)]
-                    pair = pair_table[slot_of(pair_table, pairs, wanted[row], block, 0)]  # no pair has block ABSENT
-                    if pair != ABSENT:
-                        inside[row] += _count_pair(
-                            pair, lower, upper, first, last, pairs, ids, points, following, keys, heads
-                        )
+        for x, y, z in np.ndindex(span[0], span[1], span[2]):
+            block = table[slot_of(table, keys, first[0] + x, first[1] + y, first[2] + z)]
+            pair = pair_table[slot_of(pair_table, pairs, wanted[row], block, 0)]  # no pair has block ABSENT
+            if pair != ABSENT:
+                inside[row] += _count_pair(pair, lower, upper, first, last, pairs, ids, points, following, keys, heads)
     return visited
