@@ -56,7 +56,7 @@ def labelled_points(
 class PointCounts(Counts):
     """The counts of a sequence: points by true class and predicted class, the last of which is void, int64 (C, C + 1);
     ``n_objects`` and their points over all steps ``n_points`` (1,); ``association`` (1,): the sum over objects of
-    sum_p s(g, p) IoU(g, p) / \\|g\\|; ``association_points`` (1,): the same without the division."""
+    sum_p s(g, p) IoU(g, p) / |g|; ``association_points`` (1,): the same without the division."""
 
     stored_as = "tracked points"
 

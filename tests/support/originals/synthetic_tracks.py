@@ -33,21 +33,15 @@ def track_problem(seed: int) -> list[Track]:
         draws = rng.random((n_objects, n_ids))
         similarity = np.where(is_near, 0.2 + 0.8 * draws, np.maximum(0, draws - 0.6))
         similarity = np.round(20 * similarity) / 20 if seed % 2 else similarity
-        if kind == "apart":
-            similarity[:] = 0
-        elif kind == "tied":
-            similarity[:] = 0.5
-        elif kind == "at thresholds":
-            similarity = np.arange(0.05, 0.99, 0.05)[(19 * draws).astype(int)]
-        elif kind == "perfect":
-            similarity = np.eye(n_objects, n_ids)
+        similarity = {
+            "apart": 0 * draws, "tied": 0 * draws + 0.5, "perfect": np.eye(n_objects, n_ids),
+            "at thresholds": np.arange(0.05, 0.99, 0.05)[(19 * draws).astype(int)],
+        }.get(kind, similarity)  # fmt: skip
         is_there, is_found = rng.random(n_objects) < 0.75, rng.random(n_ids) < 0.8
         is_there &= kind not in ("no object", "nothing")
         is_found &= kind not in ("no instance", "nothing")
-        if rng.random() < 0.1:
-            is_there[:] = False
-        if rng.random() < 0.1:
-            is_found[:] = False
+        is_there &= rng.random() >= 0.1
+        is_found &= rng.random() >= 0.1
         rows, columns = (np.flatnonzero(each)[np.argsort(rng.random(each.sum()))] for each in (is_there, is_found))
         steps.append((3 * rows + 2, 97 - 5 * columns, similarity[np.ix_(rows, columns)]))
     return steps
@@ -74,13 +68,8 @@ def point_problem(seed: int) -> list[Points]:
         wrong = rng.random((2, n)) < 0.1
         class_index = np.where(wrong[0], (rng.random(n) * (n_classes + 1) // 1).astype(np.int64) - 1, true_class)
         ids = np.where(wrong[1], (rng.random(n) * 9 // 1).astype(np.int64), true_id + int(3 * rng.random()))
-        if kind == "all void":
-            true_class[:] = -1
-        elif kind == "no prediction":
-            class_index[:] = -1
-        elif kind == "crowd":
-            true_id[:] = 0
-        elif kind == "perfect":
-            class_index, ids = true_class, true_id
+        true_class = np.where(kind == "all void", -1, true_class)
+        class_index = np.where(kind == "no prediction", -1, true_class if kind == "perfect" else class_index)
+        true_id, ids = 0 * true_id if kind == "crowd" else true_id, true_id if kind == "perfect" else ids
         steps.append((true_class, true_id, class_index, ids))
     return steps
