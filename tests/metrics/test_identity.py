@@ -112,10 +112,12 @@ def test_step_has_the_iou_of_counted_points_of_overlapping_masks() -> None:
 
 def test_point_in_several_masks_belongs_to_the_most_certain() -> None:
     masks = Masks.of_sets([np.array([0, 1]), np.array([1, 2]), np.array([2])])
-    args: Any = (np.zeros(4, int), np.ones(4, int), masks, np.array([0, 1, 2]), np.array([7, 8, 9]))
-    first = labelled_points(*args)
+    classes, ids = np.array([0, 1, 2]), np.array([7, 8, 9])
+    first, best = (
+        labelled_points(np.zeros(4, int), np.ones(4, int), masks, classes, ids, scores)
+        for scores in (None, np.array([0.1, 0.3, 0.3]))
+    )
     assert (first.class_index.tolist(), first.id.tolist()) == ([0, 0, 1, -1], [7, 7, 8, 0])
-    best = labelled_points(*args, scores=np.array([0.1, 0.3, 0.3]))
     assert (best.class_index.tolist(), best.id.tolist()) == ([0, 1, 1, -1], [7, 8, 8, 0])
 
 
