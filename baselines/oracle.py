@@ -18,6 +18,7 @@ class Oracle:
 
     name = "oracle"
     is_system = False
+    keeps_ids = True
     about = MethodAbout(
         paper="",
         source="",

@@ -27,6 +27,7 @@ class ConceptGraphs:
 
     name = "conceptgraphs"
     warms_up = True
+    keeps_ids = True
     Config: type[MappingConfig] = MappingConfig
     about = MethodAbout(
         paper="Gu, Kuwajerwala, Morin et al.: ConceptGraphs: Open-Vocabulary 3D Scene Graphs for Perception and "

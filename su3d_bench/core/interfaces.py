@@ -256,7 +256,8 @@ class MethodFacts(MethodAbility, Protocol):
     ground truth itself or a program that must be named; ``warms_up``: its first frames wait for compilers or imports,
     so a temporary object of the class, without tools, gets a synthetic frame before timing starts;
     ``needs_surface``: it needs the scan's mesh with its present settings; ``has_own_perception``: it finds masks
-    itself, so the caveat of the run's perception does not apply.
+    itself, so the caveat of the run's perception does not apply; ``keeps_ids``: an id in ``Instances.ids`` names
+    the same instance in all maps that ``finish`` returns for a scene, so that identity over time can be measured.
     """
 
     about: MethodAbout
@@ -266,6 +267,7 @@ class MethodFacts(MethodAbility, Protocol):
     warms_up: bool
     needs_surface: bool
     has_own_perception: bool
+    keeps_ids: bool
 
 
 class MethodFigures(MethodAbility, Protocol):

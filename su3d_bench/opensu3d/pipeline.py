@@ -30,6 +30,7 @@ class OpenSU3D:
 
     name = "opensu3d"
     warms_up = True
+    keeps_ids = True
     Config = OpenSU3DConfig
     about = MethodAbout(
         paper="Mohiuddin et al.: OpenSU3D: Open World 3D Scene Understanding using Foundation Models",
