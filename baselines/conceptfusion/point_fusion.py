@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, StoreError
-from su3d_bench.core.files.atomic import release_pages, scratch_folder
+from su3d_bench.core.files.atomic import release_pages, row_blocks, scratch_folder
 from su3d_bench.core.geometry import valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Int64Array
 
@@ -135,6 +135,17 @@ class FeatureTable:
     def features(self) -> HalfArray:
         """The features (N, D), read-only: a view of the table, whose rows change with the next ``average``."""
         return self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What ``restore`` needs besides the features."""
+        state = {"confidences": self.confidences}
+        return state if self._lengths is None else state | {"lengths": self._lengths[: self._n]}
+
+    def restore(self, features: HalfArray, confidences: Float64Array, lengths: Float64Array | None) -> None:
+        """Fill this empty table."""
+        for rows, block in row_blocks(features, BLOCK_ROWS):
+            self._write(block, rows.start)
+        self._confidences, self._lengths, self._n = confidences, lengths, len(features)
 
     def close(self) -> None:
         """Release the disk space; a remaining view keeps it until it is deleted."""
@@ -285,6 +296,10 @@ class PointFusion:
     def n_bytes(self) -> int:
         """Bytes of the points in use."""
         return self._n * 7 * 8
+
+    def restore(self, points: Float64Array, normals: Float64Array, counts: Float64Array) -> None:
+        """Replace the map by these points."""
+        self._points, self._normals, self._counts, self._n = points, normals, counts, len(counts)
 
     def associate(self, view: View) -> Int64Array:
         """The map point (P,) of each pixel, ABSENT for none; each point has at most one pixel. One pass over the map.
