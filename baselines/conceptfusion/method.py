@@ -202,6 +202,11 @@ class ConceptFusion:
         return PerceptionNeeds(masks="grounded")
 
     @property
+    def finishes_in_fork(self) -> bool:
+        """Whether features are in memory: a file is shared with a forked process, whose map would change with it."""
+        return self.config.feature_storage == "memory"
+
+    @property
     def n_points(self) -> int:
         """Points of the map so far, including those without a feature."""
         return len(self._map)

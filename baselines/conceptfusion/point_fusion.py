@@ -6,7 +6,6 @@ no metric uses them. The table has one half-precision feature per point, in memo
 
 from __future__ import annotations
 
-import os
 import tempfile
 from typing import IO, Any, Literal, NamedTuple
 
@@ -27,14 +26,15 @@ BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 class FeatureTable:
     """Features (N, D) float16 and the confidence of each.
 
-    They are in an anonymous file, on disk or in memory, which disappears with the process. Arithmetic
+    They are in memory, or in an anonymous file on disk, which disappears with the process. Arithmetic
     uses blocks in float32, rounded to half precision once per update. ``average_in_half`` stores the
     length of features separately, so that they stay within half precision.
     """
 
     def __init__(self, n_dimensions: int, place: Place) -> None:
         self.n_dimensions = n_dimensions
-        self._file = _nameless_file(place)
+        self._file = _nameless_file() if place == "disk" else None
+        self._rows = np.empty((0, n_dimensions), np.float16)  # in memory
         self._confidences = np.empty(0)
         self._lengths: Float64Array | None = None  # (N,) factor of each row
         self._n = 0
@@ -66,6 +66,11 @@ class FeatureTable:
         self._n = end
 
     def _write(self, block: HalfArray, first_row: int) -> None:
+        if self._file is None:
+            end = first_row + len(block)
+            self._rows = with_room(self._rows, first_row, end)
+            self._rows[first_row:end] = block
+            return
         # A plain write fails if the disk is full; writing through a memory map of a sparse file would kill the process.
         try:
             self._file.seek(first_row * self.n_dimensions * 2)
@@ -129,12 +134,16 @@ class FeatureTable:
         self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
+        if self._file is None:
+            return self._rows[: self._n]
         # mapped again at each use, because the file grows in between
         return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
 
     def features(self) -> HalfArray:
         """The features (N, D), read-only: a view of the table, whose rows change with the next ``average``."""
-        return self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
+        table = self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
+        table.flags.writeable = False
+        return table
 
     def state(self) -> dict[str, NDArray[Any]]:
         """What ``restore`` needs besides the features."""
@@ -149,12 +158,11 @@ class FeatureTable:
 
     def close(self) -> None:
         """Release the disk space; a remaining view keeps it until it is deleted."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
 
-def _nameless_file(place: Place) -> IO[bytes]:
-    if place == "memory" and hasattr(os, "memfd_create"):
-        return os.fdopen(os.memfd_create("features"), "w+b")
+def _nameless_file() -> IO[bytes]:
     try:
         file: IO[bytes] = tempfile.TemporaryFile(dir=scratch_folder())  # noqa: SIM115  (closed by the table)
     except OSError as error:

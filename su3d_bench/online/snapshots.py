@@ -55,12 +55,12 @@ class PendingSnapshot:
             self.reason_for_blocking = "only on Linux a process with threads can be forked safely"
         elif not getattr(method, "finishes_in_fork", False):
             self.reason_for_blocking = f"{method.name} cannot compute a map in another process"
-        if self.reason_for_blocking is not None:
-            logger.info("snapshot: computed at once: %s", self.reason_for_blocking)
-            self._answer = Snapshot(method.finish(), as_of)
-            return
         self._folder = TemporaryFolder("su3d-snapshot-")
         self._map, self._message = self._folder.path / "map.npz", self._folder.path / "error.txt"
+        if self.reason_for_blocking is not None:
+            logger.info("snapshot: computed at once: %s", self.reason_for_blocking)
+            write_prediction(self._map, method.finish())  # a file, because the map may have views of what updates change
+            return
         with warnings.catch_warnings():  # Python 3.12 warns if there are other threads; ``finish`` needs none of them
             warnings.simplefilter("ignore", DeprecationWarning)
             self._process = os.fork()
