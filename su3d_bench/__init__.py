@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from su3d_bench.api.lists import list_protocols as list_protocols
     from su3d_bench.api.run import evaluate as evaluate
     from su3d_bench.api.run import run as run
+    from su3d_bench.api.session import session as session
     from su3d_bench.api.tables import Comparison as Comparison
     from su3d_bench.api.tables import Run as Run
     from su3d_bench.api.tables import Scores as Scores
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "api.lists": ("list_datasets", "list_methods", "list_protocols"),
     "api.run": ("evaluate", "run"),
+    "api.session": ("session",),
     "api.tables": ("Comparison", "Run", "Scores", "load_run"),
     "core.errors": ("Su3dError",),
     "core.geometry": ("back_project",),

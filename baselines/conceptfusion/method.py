@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.baselines.conceptfusion.point_fusion import ABSENT, FeatureTable, Place, PointFusion, View, view_of
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.core.files.state import read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.core.types import (
@@ -30,6 +32,8 @@ from su3d_bench.core.types import (
     PerceptionNeeds,
     SceneInfo,
 )
+from su3d_bench.formats.numpy_files import map_npy
+from su3d_bench.store.predictions import write_rows
 
 Weights = Literal["softmax", "uniqueness"]
 Overlaps = Literal["sum", "small-over-large"]
@@ -157,6 +161,10 @@ class ConceptFusionConfig(BaseModel):
     feature_storage: Place = "disk"
 
 
+FEATURES = "features.npy"  # of a saved state
+_FORMS = {"points": "f8 N 3", "normals": "f8 N 3", "counts": "f8 N", "confidences": "?f8 N", "lengths": "?f8 N"}
+
+
 class ConceptFusion:
     """Pixel features from masks of named objects, fused into one feature per point; no instances."""
 
@@ -192,6 +200,11 @@ class ConceptFusion:
         ConceptGraphs' table distinguishes the two this way: its ConceptFusion+SAM replaces Mask2Former by SAM.
         """
         return PerceptionNeeds(masks="grounded")
+
+    @property
+    def finishes_in_fork(self) -> bool:
+        """Whether features are in memory: a file is shared with a forked process, whose map would change with it."""
+        return self.config.feature_storage == "memory"
 
     @property
     def n_points(self) -> int:
@@ -261,6 +274,27 @@ class ConceptFusion:
         """The points so far, each with its feature, zero for none; features are a view until the next update."""
         features = np.zeros((0, 0), np.float16) if self._features is None else self._features.features()
         return DenseFeatures(self._map.points.astype(np.float32), features)
+
+    def save_state(self, folder: Path) -> None:
+        """Store the points, and the features in a file of their own."""
+        table, fused = self._features, self._map
+        arrays = {"points": fused.points, "normals": fused.normals, "counts": fused.counts}
+        if table is not None:
+            arrays |= table.state()
+            write_rows(folder / FEATURES, table.features())
+        write_state(folder, arrays, {"has_features": table is not None})
+
+    def load_state(self, folder: Path) -> None:
+        """Continue from a stored state."""
+        arrays, values = read_state(folder, _FORMS)
+        self._clear()
+        self._map.restore(arrays["points"], arrays["normals"], arrays["counts"])
+        if values["has_features"]:
+            rows = map_npy(folder / FEATURES)
+            if rows.dtype != np.float16 or rows.ndim != 2 or len(rows) != len(self._map):
+                raise StoreError(f"{folder / FEATURES}: has {rows.dtype} {rows.shape}; expected one row per point")
+            self._features = FeatureTable(rows.shape[1], self.config.feature_storage)
+            self._features.restore(rows, arrays["confidences"], arrays.get("lengths"))
 
     def close(self) -> None:
         """Give the features' disk space back; the map cannot be updated after that."""

@@ -6,7 +6,6 @@ no metric uses them. The table has one half-precision feature per point, in memo
 
 from __future__ import annotations
 
-import os
 import tempfile
 from typing import IO, Any, Literal, NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, StoreError
-from su3d_bench.core.files.atomic import release_pages, scratch_folder
+from su3d_bench.core.files.atomic import release_pages, row_blocks, scratch_folder
 from su3d_bench.core.geometry import valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Int64Array
 
@@ -27,14 +26,15 @@ BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 class FeatureTable:
     """Features (N, D) float16 and the confidence of each.
 
-    They are in an anonymous file, on disk or in memory, which disappears with the process. Arithmetic
+    They are in memory, or in an anonymous file on disk, which disappears with the process. Arithmetic
     uses blocks in float32, rounded to half precision once per update. ``average_in_half`` stores the
     length of features separately, so that they stay within half precision.
     """
 
     def __init__(self, n_dimensions: int, place: Place) -> None:
         self.n_dimensions = n_dimensions
-        self._file = _nameless_file(place)
+        self._file = _nameless_file() if place == "disk" else None
+        self._rows = np.empty((0, n_dimensions), np.float16)  # in memory
         self._confidences = np.empty(0)
         self._lengths: Float64Array | None = None  # (N,) factor of each row
         self._n = 0
@@ -66,6 +66,11 @@ class FeatureTable:
         self._n = end
 
     def _write(self, block: HalfArray, first_row: int) -> None:
+        if self._file is None:
+            end = first_row + len(block)
+            self._rows = with_room(self._rows, first_row, end)
+            self._rows[first_row:end] = block
+            return
         # A plain write fails if the disk is full; writing through a memory map of a sparse file would kill the process.
         try:
             self._file.seek(first_row * self.n_dimensions * 2)
@@ -129,21 +134,35 @@ class FeatureTable:
         self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
+        if self._file is None:
+            return self._rows[: self._n]
         # mapped again at each use, because the file grows in between
         return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
 
     def features(self) -> HalfArray:
         """The features (N, D), read-only: a view of the table, whose rows change with the next ``average``."""
-        return self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
+        table = self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
+        table.flags.writeable = False
+        return table
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What ``restore`` needs besides the features."""
+        state = {"confidences": self.confidences}
+        return state if self._lengths is None else state | {"lengths": self._lengths[: self._n]}
+
+    def restore(self, features: HalfArray, confidences: Float64Array, lengths: Float64Array | None) -> None:
+        """Fill this empty table."""
+        for rows, block in row_blocks(features, BLOCK_ROWS):
+            self._write(block, rows.start)
+        self._confidences, self._lengths, self._n = confidences, lengths, len(features)
 
     def close(self) -> None:
         """Release the disk space; a remaining view keeps it until it is deleted."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
 
-def _nameless_file(place: Place) -> IO[bytes]:
-    if place == "memory" and hasattr(os, "memfd_create"):
-        return os.fdopen(os.memfd_create("features"), "w+b")
+def _nameless_file() -> IO[bytes]:
     try:
         file: IO[bytes] = tempfile.TemporaryFile(dir=scratch_folder())  # noqa: SIM115  (closed by the table)
     except OSError as error:
@@ -285,6 +304,10 @@ class PointFusion:
     def n_bytes(self) -> int:
         """Bytes of the points in use."""
         return self._n * 7 * 8
+
+    def restore(self, points: Float64Array, normals: Float64Array, counts: Float64Array) -> None:
+        """Replace the map by these points."""
+        self._points, self._normals, self._counts, self._n = points, normals, counts, len(counts)
 
     def associate(self, view: View) -> Int64Array:
         """The map point (P,) of each pixel, ABSENT for none; each point has at most one pixel. One pass over the map.

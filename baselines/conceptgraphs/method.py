@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from su3d_bench.baselines.conceptgraphs.map import ObjectMap
+from su3d_bench.baselines.conceptgraphs.map import FORMS, ObjectMap
 from su3d_bench.baselines.conceptgraphs.objects import Cosine, Fraction, Interval, MappingConfig
+from su3d_bench.core.files.state import read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo
@@ -28,6 +30,7 @@ class ConceptGraphs:
     name = "conceptgraphs"
     warms_up = True
     keeps_ids = True
+    finishes_in_fork = True
     Config: type[MappingConfig] = MappingConfig
     about = MethodAbout(
         paper="Gu, Kuwajerwala, Morin et al.: ConceptGraphs: Open-Vocabulary 3D Scene Graphs for Perception and "
@@ -87,6 +90,14 @@ class ConceptGraphs:
 
     def finish(self) -> Instances:
         return self._map.finish()
+
+    def save_state(self, folder: Path) -> None:
+        write_state(folder, *self._map.state())
+
+    def load_state(self, folder: Path) -> None:
+        arrays, values = read_state(folder, FORMS)
+        self._map = self._empty_map(int(values["seed"]))
+        self._map.restore(arrays, values)
 
 
 class DetectorConfig(MappingConfig):

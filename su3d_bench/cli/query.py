@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from su3d_bench.cli import options, output, questions
 from su3d_bench.cli.options import SHARED, Verbs, add_group, add_verb, count
@@ -69,7 +70,7 @@ def call_text(arguments: argparse.Namespace) -> None:
     su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json
     """
     from su3d_bench.core.maps import DenseFeatures, Instances
-    from su3d_bench.questions.model import rank
+    from su3d_bench.questions.model import best_of, rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.runs.finished import encoder_of
 
@@ -81,16 +82,7 @@ def call_text(arguments: argparse.Namespace) -> None:
         raise PredictionError(f"{job.prediction}: has {what}, so nothing can be ranked; choose another --method")
     encoder = encoder_of(run, arguments.device or "cpu")
     ranking = rank(prediction, arguments.text, encoder)
-    rows: list[dict[str, Any]] = [
-        {
-            "rank": place,
-            "id": int(prediction.ids[k]) if len(prediction.ids) else int(k),
-            "name": prediction.names[k],
-            "similarity": float(ranking.similarity[k]),
-            "centroid": [float(value) for value in prediction.centroids[k]],
-        }
-        for place, k in enumerate(ranking.order[: arguments.top], start=1)
-    ]
+    rows = [asdict(one) for one in best_of(prediction, ranking, arguments.top)]
     picture = arguments.out or job.picture(f"query-{output.file_name_of(arguments.text, 'text')}.png")
     output.remark_unseen(encoder, arguments.text, quiet=arguments.quiet)
     if not arguments.json:

@@ -257,7 +257,9 @@ class MethodFacts(MethodAbility, Protocol):
     so a temporary object of the class, without tools, gets a synthetic frame before timing starts;
     ``needs_surface``: it needs the scan's mesh with its present settings; ``has_own_perception``: it finds masks
     itself, so the caveat of the run's perception does not apply; ``keeps_ids``: an id in ``Instances.ids`` names
-    the same instance in all maps that ``finish`` returns for a scene, so that identity over time can be measured.
+    the same instance in all maps that ``finish`` returns for a scene, so that identity over time can be measured;
+    ``finishes_in_fork``: ``finish`` reads only memory of the process and files that updates do not change in place,
+    and starts no GPU work or threads that exist already, so it may run in a forked process while updates go on.
     """
 
     about: MethodAbout
@@ -268,6 +270,7 @@ class MethodFacts(MethodAbility, Protocol):
     needs_surface: bool
     has_own_perception: bool
     keeps_ids: bool
+    finishes_in_fork: bool
 
 
 class MethodFigures(MethodAbility, Protocol):
@@ -316,6 +319,29 @@ class Closable(MethodAbility, Protocol):
     """Releases its resources; called after the prediction is written or has failed."""
 
     def close(self) -> None: ...
+
+
+@runtime_checkable
+class Saves(MethodAbility, Protocol):
+    """Its state between two updates can be stored: after loading, further updates give the same maps to the last bit.
+
+    ``folder`` exists and is empty; ``core.files.state`` writes and checks it. ``load_state`` replaces ``start``; it
+    raises ``StoreError`` or ``ValueError`` for a state that is not valid, whatever its files contain.
+    """
+
+    def save_state(self, folder: Path) -> None: ...
+
+    def load_state(self, folder: Path) -> None: ...
+
+
+@runtime_checkable
+class Revises(MethodAbility, Protocol):
+    """Corrects its map after a loop closure."""
+
+    def revise(self, poses: Mapping[int, types.Float64Array]) -> None:
+        """Move the frames with these indices to new camera-to-world poses (4, 4); raises ``ConfigError`` if it cannot
+        with its settings or does not contain a frame, before any change."""
+        ...
 
 
 INTERFACES = {"dataset": Dataset, "method": Method}

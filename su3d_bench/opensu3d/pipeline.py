@@ -6,16 +6,18 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import Scratch
+from su3d_bench.core.files.state import check_range, read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
-from su3d_bench.opensu3d import tracking
+from su3d_bench.opensu3d import saved_state, tracking, voxel_map
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
@@ -31,6 +33,7 @@ class OpenSU3D:
     name = "opensu3d"
     warms_up = True
     keeps_ids = True
+    finishes_in_fork = True
     Config = OpenSU3DConfig
     about = MethodAbout(
         paper="Mohiuddin et al.: OpenSU3D: Open World 3D Scene Understanding using Foundation Models",
@@ -159,6 +162,26 @@ class OpenSU3D:
         instances = to_instances(points, ids, segments, self._images, self.config)
         self.postprocess_ms = (time.perf_counter() - start) * 1e3
         return instances
+
+    def save_state(self, folder: Path) -> None:
+        """Store the map, Q and all detections."""
+        arrays, texts = saved_state.image_arrays(self._images)
+        arrays |= self._map.state() | saved_state.table_arrays(self._table, self._seeds)
+        counts = {"next_id": self._next_id, "n_detections": self._n_detections, "losses": self._losses}
+        write_state(folder, arrays, {**texts, **counts, "last_losses": self.losses})
+
+    def load_state(self, folder: Path) -> None:
+        """Continue from a stored state."""
+        arrays, values = read_state(folder, {**voxel_map.FORMS, **saved_state.FORMS})
+        self._clear()
+        self._next_id, self._n_detections = int(values["next_id"]), int(values["n_detections"])
+        check_range("ids", arrays["ids"], NO_INSTANCE, min(self._next_id, IDS))
+        self._map.restore(arrays)
+        self._images = saved_state.images_of(arrays, values, self._scratch)
+        self._table.update(saved_state.table_of(arrays, self._next_id))
+        self._seeds = dict(arrays["seeds"].tolist())
+        self._losses.update({str(name): int(n) for name, n in values["losses"].items()})
+        self.losses = {str(name): int(n) for name, n in values["last_losses"].items()}
 
     def close(self) -> None:
         """Reset the state, log dropped points, and free memory and disk space."""

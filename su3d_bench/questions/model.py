@@ -129,6 +129,31 @@ class Ranking:
     similarity: Float64Array
 
 
+@dataclass(frozen=True)
+class RankedInstance:
+    """An instance in a ranking: ``rank`` from 1, its ``id``, cosine with the text, and ``centroid`` in metres."""
+
+    rank: int
+    id: int
+    name: str
+    similarity: float
+    centroid: tuple[float, ...]
+
+
+def best_of(instances: Instances, ranking: Ranking, n: int) -> tuple[RankedInstance, ...]:
+    """The first ``n`` instances of a ranking."""
+    return tuple(
+        RankedInstance(
+            place,
+            int(instances.ids[k]) if len(instances.ids) else int(k),
+            instances.names[k],
+            float(ranking.similarity[k]),
+            tuple(instances.centroids[k].tolist()),
+        )
+        for place, k in enumerate(ranking.order[:n], start=1)
+    )
+
+
 def rank(instances: Instances, text: str, encoder: Encoder) -> Ranking:
     """The ranking of all instances for one text; equal similarities keep the order of the map."""
     return rank_all(instances, [text], encoder)[0]

@@ -67,6 +67,13 @@ def no_detections(frame: types.Frame, needs: types.PerceptionNeeds) -> types.Det
     return _detections(frame, needs, n=0, dim=0)
 
 
+def detections_of(
+    frame: types.Frame, needs: types.PerceptionNeeds, perception: Perception, timer: Timer
+) -> types.Detections:
+    """The detections that a method with these ``needs`` gets with ``frame``."""
+    return no_detections(frame, needs) if needs.masks == "none" else perception.detect(frame, needs, timer)
+
+
 def _detections(frame: types.Frame, needs: types.PerceptionNeeds, n: int, dim: int) -> types.Detections:
     """``n`` detections without a name, each of the whole image."""
     return types.Detections(
@@ -215,11 +222,7 @@ class MethodFeed:
             elapsed_ms = (time.perf_counter() - start) * 1e3
             empty: Row = {"update": update, "frame": frame.index, "n_detections": 0, "rss_bytes": memory_bytes()}
             return empty | {"method_ms": 0.0, "total_ms": round(elapsed_ms, 3)}
-        detections = (
-            no_detections(frame, method.needs)
-            if method.needs.masks == "none"
-            else self._perception.detect(frame, method.needs, timer)
-        )
+        detections = detections_of(frame, method.needs, self._perception, timer)
         with self._clock.running("update"):
             method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3

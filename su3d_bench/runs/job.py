@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,6 +154,14 @@ def stride_of(job: SceneJob, part: Part) -> int:
     return job.config.stride or int(json.loads(part.options).get("stride", 1))
 
 
+def settings_key(sections: Iterable[tuple[str, str]], method: Method) -> dict[str, str]:
+    """The settings that can change a number, of sections with a prefix and JSON, and the inputs of ``method``."""
+    leaves = [((prefix, *path), value) for prefix, text in sections for path, value in flatten(json.loads(text))]
+    key = {".".join(path): json.dumps(value, ensure_ascii=False) for path, value in leaves}
+    key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
+    return key | {f"input.{name}": digest for name, digest in attribute_of(method, "inputs", {}).items()}
+
+
 def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     """The part of a prediction's key that is known before any data is read, the most informative fields first."""
     key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.config.seed)}
@@ -163,11 +171,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         if job.config.shares:
             key["anytime"] = str(job.config.shares)
         sections.append(("perception", job.perception))
-    for prefix, options in sections:
-        for path, value in flatten(json.loads(options)):
-            key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
-    key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
-    key |= {f"input.{name}": digest for name, digest in attribute_of(method, "inputs", {}).items()}
+    key |= settings_key(sections, method)
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
         if digest := registry.code_key(target):
             key[f"code.{kind}"] = digest

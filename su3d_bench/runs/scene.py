@@ -65,7 +65,7 @@ def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, .
 
 
 @cache
-def _warm_up(part: jobs.Part) -> None:
+def warm_up(part: jobs.Part) -> None:
     """Warm up a method that requests it, once per process for each method and its settings."""
     scratch: interfaces.Method = jobs.build_method(part)
     if getattr(scratch, "warms_up", False):
@@ -285,7 +285,7 @@ class _Scene:
             with clock.running("start"):
                 method.receive_ground_truth(truth)
         self.report_activity(part, "compiling the method")
-        _warm_up(part)
+        warm_up(part)
         self.report_activity(part, self.opening)
         start_memory_watch()
         feeding = frame_loop.MethodFeed(

@@ -128,13 +128,13 @@ def write_prediction(path: Path, prediction: Prediction) -> None:
     """Store ``prediction`` at ``path``, and the features of a dense one in a second file."""
     arrays, features_path = prediction_arrays(prediction), features_beside(path)
     if isinstance(prediction, DenseFeatures):
-        _write_rows(features_path, arrays.pop("features"))
+        write_rows(features_path, arrays.pop("features"))
     else:
         remove_file(features_path)
     write_npz(path, arrays)
 
 
-def _write_rows(path: Path, table: NDArray[Any]) -> None:
+def write_rows(path: Path, table: NDArray[Any]) -> None:
     """Write ``table`` to ``path`` as a .npy file, one block at a time."""
     descr = np.lib.format.dtype_to_descr(table.dtype)
     with replacing(path) as stream:

@@ -10,6 +10,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -247,9 +248,9 @@ class CompletionRecord:
     remarks: Mapping[str, Any]
 
 
-_ADAPTERS: dict[Any, TypeAdapter[Any]] = {
-    kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, CompletionRecord)
-}
+@cache
+def _adapter(kind: type) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
 
 
 def plain(record: Any) -> dict[str, Any]:
@@ -268,7 +269,7 @@ def plain(record: Any) -> dict[str, Any]:
 
 def checked(kind: type[Kind], value: Any) -> Kind:
     """``value`` as a record; raises ``ValidationError`` or ``RecursionError`` if it is invalid."""
-    record: Kind = _ADAPTERS[kind].validate_python(value)
+    record: Kind = _adapter(kind).validate_python(value)
     return record
 
 

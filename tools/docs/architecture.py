@@ -35,6 +35,7 @@ PURPOSE = {
     "questions": "queries and questions with known answers; reasoning over a map",
     "baselines": "one folder per method: baselines, external programs, the oracle",
     "runs": "splits a run into jobs, in processes or on clusters; resuming",
+    "online": "sessions: a method fed frame by frame by the caller; snapshots, saved states",
     "evaluation": "scores of predictions from files",
     "human_eval": "annotation sheets: creation, answers, scores",
     "robustness": "sweeps over corruptions, and the errors that methods tolerate",

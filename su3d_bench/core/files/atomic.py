@@ -300,6 +300,7 @@ class Scratch:
 
     def __init__(self, most_in_memory_bytes: int = MAX_IN_MEMORY_BYTES) -> None:
         self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=str(scratch_folder()))  # noqa: SIM115
+        self._most_in_memory_bytes = most_in_memory_bytes
         self.n_bytes = 0
 
     def put(self, array: NDArray[Any]) -> StoredRows:
@@ -320,6 +321,8 @@ class Scratch:
 
     def read(self, offset: int, n_bytes: int) -> bytes:
         """The ``n_bytes`` bytes at ``offset``."""
+        if self.n_bytes > self._most_in_memory_bytes > 0:  # on disk: a forked process shares the position in the file
+            return os.pread(self._file.fileno(), n_bytes, offset)
         self._file.seek(offset)
         return self._file.read(n_bytes)
 
