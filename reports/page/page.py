@@ -22,7 +22,7 @@ HERE = Path(__file__).parent
 REGISTRY = HERE.parent / "registry"
 SCRIPTS = (  # in execution order
     *("elements", "maps/shaders", "maps/view", "maps/cloud", "sections", "maps/paint", "maps/link", "maps/pane"),
-    *("maps/scene", "gallery", "errors", "timing", "compare", "page"),
+    *("maps/scene", "gallery", "errors", "timing", "compare", "robustness", "page"),
 )
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"

@@ -143,7 +143,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
     _number_by_1_2_5(axes.xaxis)
     _number_by_1_2_5(axes.yaxis)
     axes.grid(True, which="major")
-    _one_legend(figure, [axes])
+    draw_legend(figure, [axes])
     return figure
 
 
@@ -220,11 +220,11 @@ def _memory(times: Sequence[Sequence[UpdateTimes]], width: Width) -> Figure:
         axes.set_ylim(bottom=0)
         _number_by_1_2_5(axes.xaxis)
         axes.grid(True, which="major")
-    _one_legend(figure, panels)
+    draw_legend(figure, panels)
     return figure
 
 
-def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+def draw_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     """Draw one legend below all ``panels``, each line once."""
     named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if not named:
@@ -265,7 +265,7 @@ def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
             axes.plot([point.seconds for point in mine], values, label=label, **style_of_line(index))
         axes.set(xlabel="seconds until the map was available", ylabel=f"{protocol}: {name} (%)")
         axes.grid(True)
-    _one_legend(figure, all_axes)
+    draw_legend(figure, all_axes)
     return figure
 
 

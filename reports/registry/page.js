@@ -48,6 +48,8 @@ function bestOf(rows, value) {
 
 const pictureOf = (row) => (!row.picture ? null : h('img', { class: 'map', width: 120, height: 90, alt: `Map of ${row.method}`,
   src: `data:image/png;base64,${DATA.pictures[row.picture]}` }));
+// Of a sweep over corruptions, in points.
+const changesOf = (row) => row.changes.map(([family, change]) => `${family} ${signed(change)}`).join(', ');
 const authorsOf = (row) => (row.link
   ? h('a', { href: row.link, rel: 'noreferrer', 'aria-label': `${row.method}: ${row.authors}` }, row.authors) : row.authors);
 const words = (label, value, more = {}) => ({ label, value, words: true, ...more });
@@ -78,6 +80,7 @@ function boardTable(board, rows) {
     { label: 'Method', value: (row) => row.method, show: (row) => [pictureOf(row), link(row.page, row.method)] },
     { ...RANK, label: 'Rank', title: 'Simultaneous 95 % rank interval' },
     ...metrics,
+    ...(rows.some((row) => row.changes.length) ? [words('Change under corruptions, points', changesOf)] : []),
     { label: 'Time per frame, as submitted', title: 'Median time per processed frame, not measured again; in brackets without perception', num: true,
       value: (row) => row.update_s,
       show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
@@ -178,6 +181,7 @@ function methodPage() {
       intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
       h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),
       pictureOf(row), facts([
+        [`Mean change of ${board.headline[0]} under corruptions, points`, changesOf(row)],
         ['Authors', authorsOf(row)], ['Date', row.date],
         ['Time per frame, as submitted', isNumber(row.update_s)
           ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception (median of ${plural(row.n_updates, 'frame')}, `

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
 REPORTED = "as reported, not measured here"
 GAP_PT, SMALLEST_GAP_PT = 4, 2
+MAX_TITLE = 22  # characters of a line of a column's title, which may have several
 MAX_LABEL_PT = 150  # of labels in a table wider than the page; longer labels are wrapped
 # Column and page width of a two-column paper (IEEEtran: 252 pt and 516 pt), slightly reduced.
 FLOATS = (("table", 238), ("table*", 480))
@@ -124,7 +126,7 @@ def _float(table: Table) -> str:
 
 def _tabular(table: Table, columns: Sequence[int], label_pt: float | None) -> list[str]:
     first = "l" if label_pt is None else f"p{{{label_pt:.0f}pt}}"
-    titles = [escape(table.columns[k]) for k in columns]
+    titles = [_title(table.columns[k]) for k in columns]
     lines = [f"  \\begin{{tabular}}{{@{{}}{first}{'r' * len(columns)}@{{}}}}", r"    \toprule"]
     lines.append(f"    {' & '.join([_label(table.head, label_pt), *titles])} \\\\")
     was_reported = False
@@ -141,7 +143,7 @@ def _place(table: Table) -> _Place:
     """Choose the layout from character counts; widths are not measured."""
     label = max(len(text) for text in (table.head, *(f"{row.label} {row.mark}" for row in table.rows)))
     columns = [
-        max(len(text) for text in (name, *(row.cells[k].whole for row in table.rows if k < len(row.cells))))
+        max(map(len, (*_title_lines(name), *(row.cells[k].whole for row in table.rows if k < len(row.cells)))))
         for k, name in enumerate(table.columns)
     ]
     everything = tuple(range(len(columns)))
@@ -162,6 +164,15 @@ def _place(table: Table) -> _Place:
         left_pt -= needed_pt
     broken = label_pt if label * letter_pt > MAX_LABEL_PT else None
     return _Place(kind, size, SMALLEST_GAP_PT, broken, tuple(map(tuple, parts)))
+
+
+def _title(text: str) -> str:
+    stacked = r"\\".join(map(escape, _title_lines(text)))
+    return rf"\shortstack[r]{{{stacked}}}" if len(_title_lines(text)) > 1 else stacked
+
+
+def _title_lines(text: str) -> list[str]:
+    return textwrap.wrap(text, MAX_TITLE, break_long_words=False, break_on_hyphens=False) or [""]
 
 
 def _label(text: str, width_pt: float | None, mark: str = "") -> str:

@@ -132,6 +132,17 @@ def compare(
     same runs. Raises ``ConfigError`` if the two cannot be compared, naming the first field that differs.
     """
     pairs = sides.pair_methods(sides.parse_side(left, method), sides.parse_side(right, method))
+    return compare_pairs(pairs, protocols, per_class=per_class, numbers=numbers)
+
+
+def compare_pairs(
+    pairs: Sequence[tuple[sides.Side, sides.Side]],
+    protocols: Sequence[str] = (),
+    *,
+    per_class: bool = False,
+    numbers: sides.SideNumbers | None = None,
+) -> Comparison:
+    """As ``compare``, for pairs of sides that are already read."""
     first, second = pairs[0]
     compared: list[ProtocolComparison] = []
     for pair in pairs:

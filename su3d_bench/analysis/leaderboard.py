@@ -2,14 +2,14 @@
 
 A number is ranked if its run is complete, its protocol is installed here with the same digest, every scene's data have
 the digest that most runs have, the run's counts reproduce it, and it uses the same number of labels per mask or point
-as most. Everything else is excluded with the reason.
+as most. Everything else is excluded with the reason. Of a sweep over corruptions the clean methods are ranked.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -18,16 +18,18 @@ from typing import TypeVar
 
 import numpy as np
 
+from su3d_bench.analysis.sweeps import cells_of, family_means
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, shown, some
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.files.locks import is_locked
 from su3d_bench.core.types import Interval
+from su3d_bench.corruptions.apply import Cell as SweepCell
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.verify import examine
-from su3d_bench.store.records import MetricsRecord, RunRecord, read_record
+from su3d_bench.store.records import MetricsRecord, NumbersRecord, ResultRecord, RunRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
 
 MAX_RUNS = 10_000
@@ -44,7 +46,8 @@ class RankingRow:
     Values are fractions, in the order of ``headline``.
 
     ``of_scenes``: the first headline metric of each scene, from which rank intervals are computed. ``ranks``: best and
-    worst possible rank among rows that are not ceilings; None if not requested.
+    worst possible rank among rows that are not ceilings; None if not requested. ``changes``: of a sweep, the mean
+    change of the first headline metric in each family of corruptions, None if undefined.
     """
 
     run: str
@@ -62,6 +65,7 @@ class RankingRow:
     labels: str | None
     is_ceiling: bool
     ranks: tuple[int, int] | None = None
+    changes: tuple[tuple[str, float | None], ...] = ()
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -148,11 +152,15 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
     if others := [fault for fault in found if fault[0] not in places.values()]:
         yield Refused(name, *others[0])
         return
+    cells = cells_of(run.methods)
+    corrupted = {cell.name for own in cells.values() for cell in own}
     for (method, protocol), record in run.results.items():
-        if protocols and protocol not in protocols:
+        if (protocols and protocol not in protocols) or method in corrupted:
             continue
         what, result = places[method, protocol], record.result
-        reason = _exclusion_reason(run, record.failed) or faults.get(what)
+        of_cells = {cell: run.results.get((cell.name, protocol)) for cell in cells.get(method, ())}
+        wrong = (faults.get(places.get((cell.name, protocol), "")) for cell in of_cells)
+        reason = _exclusion_reason(run, record.failed) or faults.get(what) or next(filter(None, wrong), None)
         if reason or result is None:
             yield Refused(name, what, reason or "was not scored")
             continue
@@ -172,7 +180,21 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
             confidences=None if record.confidences is None else printable(record.confidences, 80),
             labels=record.labels,
             is_ceiling=is_ceiling(method, record.caveat),
+            changes=tuple(_changes(result, of_cells)),
         )
+
+
+def _changes(
+    clean: NumbersRecord, cells: Mapping[SweepCell, ResultRecord | None]
+) -> Iterator[tuple[str, float | None]]:
+    """The mean change of the first headline metric in each family; None if a cell lacks it or has other scenes."""
+
+    def value(numbers: NumbersRecord | None) -> float:
+        found = numbers.metrics.get(clean.headline[0]) if numbers and numbers.scenes == clean.scenes else None
+        return np.nan if found is None else found
+
+    changes = {cell: value(one and one.result) - value(clean) for cell, one in cells.items()}
+    yield from ((family, None if np.isnan(mean) else mean) for family, mean in family_means(changes).items())
 
 
 def _exclusion_reason(run: FinishedRun, failed: Sequence[str]) -> str | None:

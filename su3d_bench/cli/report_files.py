@@ -56,6 +56,7 @@ def call_html(arguments: argparse.Namespace) -> None:
     from su3d_bench.analysis.page.contents import QUERIES, PageOptions, page_contents
     from su3d_bench.analysis.page.gallery import summary_of
     from su3d_bench.reports.page.page import page_html
+    from su3d_bench.robustness.page import page_sweeps
 
     if not 0 < arguments.max_size_mb <= 1000:
         raise ConfigError(f"--max-size-mb {arguments.max_size_mb:g}: must be above 0 and at most 1000")
@@ -69,11 +70,17 @@ def call_html(arguments: argparse.Namespace) -> None:
     )
     with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
         contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
+    sweeps = page_sweeps(arguments.runs)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": summary_of(contents.galleries)},
+        {
+            **contents.numbers,
+            "maps": [one.listed() for one in maps],
+            "gallery": summary_of(contents.galleries),
+            "robustness": sweeps,
+        },
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         list(map(asdict, contents.galleries)),

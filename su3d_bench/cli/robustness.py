@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from su3d_bench.analysis.sides import Numbers
     from su3d_bench.core.types import UInt8Array
-    from su3d_bench.robustness.sweep import Cell
+    from su3d_bench.corruptions.apply import Cell
     from su3d_bench.runs.finished import FinishedRun
 
 
@@ -143,15 +143,14 @@ def call_report(arguments: argparse.Namespace) -> None:
     """
     from su3d_bench.robustness.measures import sweep_result
     from su3d_bench.robustness.pictures import draw_sweep
-    from su3d_bench.robustness.tables import sweep_tables
+    from su3d_bench.robustness.tables import is_of_embedded, sweep_tables
     from su3d_bench.runs.verify import read_checked
 
     run = read_checked(arguments.run)
     result = sweep_result(run, *_score_of(run, arguments), arguments.baseline)
     if arguments.figure is not None:
         draw_sweep(result, arguments.figure)
-    of_embedded = run.record.profile in ("embedded", "auto")
-    output.answer_or_write(arguments, result.to_json(), sweep_tables(result, of_embedded=of_embedded))
+    output.answer_or_write(arguments, result.to_json(), sweep_tables(result, of_embedded=is_of_embedded(run)))
 
 
 def call_tolerance(arguments: argparse.Namespace) -> int:
@@ -163,7 +162,7 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
     from su3d_bench.corruptions.apply import CORRUPTIONS, Condition
     from su3d_bench.corruptions.model import MAX_SEVERITY
     from su3d_bench.robustness.sweep import conditions_of, methods_of
-    from su3d_bench.robustness.tables import tolerance_table
+    from su3d_bench.robustness.tables import tolerance_tables
     from su3d_bench.robustness.tolerance import find_tolerances, numbers_of
     from su3d_bench.runs.plan import named_method
     from su3d_bench.runs.runner import run_plan
@@ -200,9 +199,9 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
         return numbers_of(run, *score[0], cells)
 
     found = find_tolerances(evaluate, list(target_of), corruptions, arguments.share)
-    table = tolerance_table(found, *score[0], arguments.share, n_scenes)
+    tables = tolerance_tables(found, *score[0], arguments.share, n_scenes)
     value = [{**vars(one), "corruption": one.corruption.address} for one in found]
-    output.answer_tables(arguments, value, [table])
+    output.answer_tables(arguments, value, tables)
     return EXIT_DONE
 
 

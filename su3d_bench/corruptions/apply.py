@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -58,6 +59,46 @@ def _condition(text: str) -> Condition:
     if not re.fullmatch(r"\d(\.\d{1,6})?", severity) or float(severity) > MAX_SEVERITY:
         raise ConfigError(f"corruption '{text}': expected {address}/SEVERITY with a severity from 0 to {MAX_SEVERITY}")
     return Condition(CORRUPTIONS[address], float(severity))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A ``method`` under ``conditions``, none if clean."""
+
+    method: str
+    conditions: tuple[Condition, ...]
+
+    @property
+    def suffix(self) -> str:
+        """What follows the method where it is requested."""
+        return f"{MARK}{'+'.join(one.address for one in self.conditions)}" if self.conditions else ""
+
+    @property
+    def name(self) -> str:
+        """Its name in a run, if ``method`` is the method's."""
+        return self.method + self.suffix.replace("/", "-")
+
+    @property
+    def corruption(self) -> str:
+        """The corruptions, without severities."""
+        return "+".join(one.corruption.address for one in self.conditions)
+
+    @property
+    def family(self) -> str:
+        return "+".join(one.corruption.family for one in self.conditions)
+
+
+def cell_of(name: str) -> Cell | None:
+    """The cell with that name in a run; None if the name has no corruption."""
+    method, _, text = name.rpartition(MARK)
+    known = {address.replace("/", "-"): address for address in CORRUPTIONS}
+    parts = [part.rpartition("-") for part in text.split("+")]
+    if not method or any(address not in known for address, _, _ in parts):
+        return None
+    with suppress(ConfigError):  # no severity, as in a method of that name from elsewhere
+        cell = Cell(method, parse_conditions("+".join(f"{known[part]}/{severity}" for part, _, severity in parts)))
+        return cell if cell.name == name else None
+    return None
 
 
 @dataclass(frozen=True)

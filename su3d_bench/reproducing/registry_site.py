@@ -13,7 +13,7 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
 from su3d_bench.core.files.locks import is_unfinished
-from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, with_interval
+from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, signed, with_interval
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.page.page import PAGE, Kind, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
@@ -28,8 +28,8 @@ MAX_ADDRESS_CHARACTERS = 500
 TITLE = "Registry of results"
 ROW_FIELDS = (  # fields of a row that pages show unchanged
     "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
-    "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run", "authors", "link",
-    "date",
+    "encoder", "trained_on", "command", "changed", "changes", "caveat", "warnings", "code", "commit", "run", "authors",
+    "link", "date",
 )  # fmt: skip
 
 
@@ -202,6 +202,7 @@ def _scene_page(value: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str,
 
 def _plain_tables(registry: Registry) -> Table | Prose:
     """The content of the first page if scripts are disabled."""
+    has_changes = any(row.changes for row in registry.rows)
     rows = [
         TableRow(
             row.method,
@@ -213,6 +214,7 @@ def _plain_tables(registry: Registry) -> Table | Prose:
                 Cell(NOT_MEASURED if row.update_s is None else f"{row.update_s:.3g}"),
                 Cell(row.hardware),
                 Cell(row.trained_on),
+                *([Cell(_changes(row))] if has_changes else []),
                 Cell(row.authors),
                 Cell(row.date or NOT_MEASURED),
                 Cell(f"{row.bundle.name}{SUFFIX} {row.bundle.sha256}"),
@@ -223,9 +225,14 @@ def _plain_tables(registry: Registry) -> Table | Prose:
     ]
     if not rows:
         return Prose(("This registry has no rows.",))
-    facts = ("hardware", "weights trained on", "authors", "date", "bundle")
+    changes = ["change under corruptions, points"] if has_changes else []
+    facts = ("hardware", "weights trained on", *changes, "authors", "date", "bundle")
     columns = ("protocol", "values", "rank", "scenes", "s per frame", *facts)
     return Table("registry", f"All rows, in per cent; times {AS_SUBMITTED}.", "method", columns, tuple(rows), ())
+
+
+def _changes(row: Row) -> str:
+    return ", ".join(f"{family} {signed(change)}" for family, change in row.changes) or NOT_MEASURED
 
 
 def _headline(row: Row) -> str:

@@ -14,10 +14,11 @@ import numpy as np
 
 from su3d_bench.analysis.comparison import Difference, difference_of
 from su3d_bench.analysis.sides import Numbers, Side, SideNumbers, headline_numbers
+from su3d_bench.analysis.sweeps import cells_of
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.corruptions.apply import Cell
 from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics.statistics import holm
-from su3d_bench.robustness.sweep import Cell, cell_of
 from su3d_bench.runs.finished import FinishedRun
 
 
@@ -84,26 +85,24 @@ def _difference_json(difference: Difference) -> dict[str, Any]:
 
 def sweep_result(run: FinishedRun, protocol: str, metric: str, baseline: str | None = None) -> SweepResult:
     """The measures of a finished sweep; raises ``ConfigError`` if it has no cells or the baseline is not in it."""
-    cells = [cell for name in run.methods if (cell := cell_of(name)) is not None]
-    methods = [name for name in dict.fromkeys(cell.method for cell in cells) if name in run.methods]
+    cells = cells_of(run.methods)
+    methods = list(cells)
     if not methods:
         raise ConfigError(f"{run.name}: has no method with and without corruptions; use su3d-bench robustness run")
     baseline = baseline or methods[0]
     if baseline not in methods:
         raise ConfigError(f"--baseline {baseline}: expected one of {', '.join(methods)}")
-    names = [*methods, *(cell.name for cell in cells if cell.method in methods)]
+    names = [*methods, *(cell.name for own in cells.values() for cell in own)]
     found = SideNumbers().over_common(protocol, [Side(run, name) for name in names])
     if not found:
         raise ConfigError(f"{run.name}: the methods have no common scene scored under {protocol}")
     numbers = {name: headline_numbers([one], metric) for name, one in zip(names, found, strict=True)}
     errors = {
-        method: {cell.name.removeprefix(method): numbers[cell.name].value for cell in cells if cell.method == method}
-        for method in methods
+        method: {cell.name.removeprefix(method): numbers[cell.name].value for cell in own}
+        for method, own in cells.items()
     }
     scenes = tuple(found[0].result.scenes)
-    results = tuple(
-        _method_result(method, [cell for cell in cells if cell.method == method], numbers, scenes) for method in methods
-    )
+    results = [_method_result(method, own, numbers, scenes) for method, own in cells.items()]
     return SweepResult(
         protocol, metric, scenes, baseline,
         tuple(replace(result, mce=_mce(result, errors[baseline])) for result in results),

@@ -18,7 +18,7 @@ from su3d_bench.corruptions.sensors.depth import edges
 from su3d_bench.metrics.protocols.loading import headline_protocols, load_protocol
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.reports.pictures.canvas import figure_style, write_figure
-from su3d_bench.reports.pictures.plots import figure_with_panels, style_of_line
+from su3d_bench.reports.pictures.plots import draw_legend, figure_with_panels, style_of_line
 from su3d_bench.robustness.measures import MethodResult, SweepResult
 from su3d_bench.runs.scene import poses_of
 from su3d_bench.runs.scenes import cache_root
@@ -171,7 +171,7 @@ def _names(names: tuple[str, ...], clean: tuple[str, ...]) -> UInt8Array:
     return picture
 
 
-PANEL_HEIGHT_IN = 2.2
+PANEL_HEIGHT_IN = 2.1
 
 
 @figure_style()
@@ -184,11 +184,11 @@ def draw_sweep(result: SweepResult, path: Path) -> None:
             severities, values = _curve(method, family)
             panel.plot(severities, values, label=method.method, markersize=4, **style_of_line(index))
         panel.set_title(family)
-        panel.set_xlim(0, MAX_SEVERITY)
+        panel.set_xlim(-0.15, MAX_SEVERITY + 0.15)
         panel.set_ylim(0, 1.05 * 100 * max(method.clean for method in result.methods) or 1)
         panel.set_xlabel("severity")
         panel.set_ylabel(f"{result.metric}, %")
-    axes[0].legend(fontsize=7)
+    draw_legend(figure, axes)
     write_figure(figure, path)
 
 

@@ -8,52 +8,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 from su3d_bench.core.errors import ConfigError, counted, suggest
-from su3d_bench.corruptions.apply import CORRUPTIONS, MARK, Condition, parse_conditions
+from su3d_bench.corruptions.apply import CORRUPTIONS, Cell, Condition, parse_conditions
 from su3d_bench.corruptions.model import MAX_SEVERITY
 
 MAX_METHODS = 2000
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A ``method`` under ``conditions``, none if clean."""
-
-    method: str
-    conditions: tuple[Condition, ...]
-
-    @property
-    def suffix(self) -> str:
-        """What follows the method where it is requested."""
-        return f"{MARK}{'+'.join(one.address for one in self.conditions)}" if self.conditions else ""
-
-    @property
-    def name(self) -> str:
-        """Its name in a run, if ``method`` is the method's."""
-        return self.method + self.suffix.replace("/", "-")
-
-    @property
-    def corruption(self) -> str:
-        """The corruptions, without severities."""
-        return "+".join(one.corruption.address for one in self.conditions)
-
-    @property
-    def family(self) -> str:
-        return "+".join(one.corruption.family for one in self.conditions)
-
-
-def cell_of(name: str) -> Cell | None:
-    """The cell with that name in a run; None if the name has no corruption."""
-    method, mark, text = name.rpartition(MARK)
-    if not mark:
-        return None
-    known = {address.replace("/", "-"): address for address in CORRUPTIONS}
-    parts = [part.rpartition("-") for part in text.split("+")]
-    if any(address not in known for address, _, _ in parts):
-        return None
-    return Cell(method, parse_conditions("+".join(f"{known[address]}/{severity}" for address, _, severity in parts)))
 
 
 def conditions_of(wanted: Sequence[str], severities: Sequence[int], only: Sequence[str]) -> list[tuple[Condition, ...]]:

@@ -10,6 +10,7 @@ from su3d_bench.corruptions.model import Corruption
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
 from su3d_bench.robustness.measures import CellResult, MethodResult, SweepResult
 from su3d_bench.robustness.tolerance import Tolerance
+from su3d_bench.runs.finished import FinishedRun
 
 EMBEDDED = "Colour corruptions are those of the embedded models: no model of this run was trained on photographs."
 
@@ -19,17 +20,26 @@ def sweep_tables(result: SweepResult, *, of_embedded: bool) -> list[Table | Pros
     families = list(dict.fromkeys(family for method in result.methods for family in method.families))
     head = ["method", f"clean {result.metric}", *families, "mean", "mCE", "resilience"]
     rows = [head, *(_summary(method, families) for method in result.methods)]
-    notes = [
+    heading = f"{result.protocol}: {result.metric} under corruptions"
+    notes = sweep_notes(result, of_embedded=of_embedded)
+    parts: list[Table | Prose] = [text_table("robustness", rows, heading=heading, notes=notes)]
+    return [*parts, *(_cells_table(method, result.metric) for method in result.methods)]
+
+
+def is_of_embedded(run: FinishedRun) -> bool:
+    """Whether no model of the run was trained on photographs."""
+    return run.record.profile in ("embedded", "auto")
+
+
+def sweep_notes(result: SweepResult, *, of_embedded: bool) -> list[str]:
+    """What the columns of the summary mean."""
+    return [
         "families: mean change over severities, then over corruptions, in points, with the 95 % interval over "
         f"{counted(len(result.scenes), 'scene')}; mean: over families",
         f"mCE: error relative to that of {result.baseline}; resilience: share of the clean value that is kept "
         "(Robo3D, Kong et al. 2023). A weak method loses little: read both beside the clean value",
         *([EMBEDDED] if of_embedded else []),
     ]
-    parts: list[Table | Prose] = [
-        text_table("robustness", rows, heading=f"{result.protocol}: {result.metric} under corruptions", notes=notes)
-    ]
-    return [*parts, *(_cells_table(method, result.metric) for method in result.methods)]
 
 
 def _summary(method: MethodResult, families: Sequence[str]) -> list[str]:
@@ -69,24 +79,29 @@ def _cell(one: CellResult | None) -> str:
     return f"{value}: {signed(one.difference.difference)}{'*' if p is not None and p < 0.05 else ''}"
 
 
-def tolerance_table(found: Sequence[Tolerance], protocol: str, metric: str, share: float, n_scenes: int) -> Table:
-    """The data sheet: one row per method, one column per corruption."""
-    corruptions = list({one.corruption.address: one.corruption for one in found}.values())
+def tolerance_tables(
+    found: Sequence[Tolerance], protocol: str, metric: str, share: float, n_scenes: int
+) -> list[Table | Prose]:
+    """The data sheet: one table per family, in it one row per method and one column per corruption."""
+    corruptions = {one.corruption.address: one.corruption for one in found}
     of_pair = {(one.method, one.corruption.address): one for one in found}
-    rows = [["method", *map(_title, corruptions)]]
-    rows += [
-        [method, *(_tolerated(of_pair[method, corruption.address]) for corruption in corruptions)]
-        for method in dict.fromkeys(one.method for one in found)
-    ]
-    notes = [
-        f"the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept, with the 95 % "
+    families: dict[str, list[Corruption]] = {}
+    for corruption in corruptions.values():
+        families.setdefault(corruption.family, []).append(corruption)
+    caption = (
+        f": the largest error at which {100 * share:g} % of the clean {metric} under {protocol} is kept, with the 95 % "
         f"interval over {counted(n_scenes, 'scene')}; '>': kept at the highest severity"
-    ]
-    return text_table("tolerance", rows, heading="Tolerated errors", notes=notes)
-
-
-def _title(corruption: Corruption) -> str:
-    return f"{corruption.address}, {corruption.unit}"
+    )
+    tables: list[Table | Prose] = []
+    for family, own in families.items():
+        rows = [["method", *(f"{one.name}, {one.unit}" for one in own)]]
+        rows += [
+            [method, *(_tolerated(of_pair[method, one.address]) for one in own)]
+            for method in dict.fromkeys(one.method for one in found)
+        ]
+        heading = f"Tolerated errors of {family}"
+        tables.append(text_table(f"tolerance-{family}", rows, heading=heading, caption="" if tables else caption))
+    return tables
 
 
 def _tolerated(one: Tolerance) -> str:

@@ -13,10 +13,9 @@ import numpy as np
 
 from su3d_bench.analysis.sides import Numbers, Side, SideNumbers, headline_numbers
 from su3d_bench.core.types import Float64Array, Interval
-from su3d_bench.corruptions.apply import Condition
+from su3d_bench.corruptions.apply import Cell, Condition
 from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption
 from su3d_bench.numerics.statistics import jackknife_interval
-from su3d_bench.robustness.sweep import Cell
 from su3d_bench.runs.finished import FinishedRun
 
 SHARE_KEPT = 0.95

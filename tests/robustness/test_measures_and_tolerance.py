@@ -12,10 +12,10 @@ from scored_room import ENCODER, ROOM
 from su3d_bench.analysis.sides import Numbers
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.maps import Instances
-from su3d_bench.corruptions.apply import CORRUPTIONS, parse_conditions
+from su3d_bench.corruptions.apply import CORRUPTIONS, Cell, cell_of, parse_conditions
 from su3d_bench.metrics.matching.labelling import classes_of_prediction
 from su3d_bench.robustness import measures
-from su3d_bench.robustness.sweep import Cell, cell_of, conditions_of, methods_of
+from su3d_bench.robustness.sweep import conditions_of, methods_of
 from su3d_bench.robustness.tolerance import find_tolerances
 
 HOLES = CORRUPTIONS["depth/holes"]
@@ -83,7 +83,8 @@ def test_name_of_a_cell_is_read_back() -> None:
         cell = Cell("opensu3d@top_m=1", parse_conditions(text))
         assert cell_of(cell.name) == cell
     assert cell_of("opensu3d") is None
-    assert cell_of("opensu3d~mine") is None
+    for text in ("opensu3d~mine", "opensu3d~depth-holes-9", "opensu3d~depth-holes-4.0", "~depth-holes-4"):
+        assert cell_of(text) is None
 
 
 def test_conditions_of_families_corruptions_and_pairs() -> None:

@@ -192,25 +192,31 @@ function niceTicks(low, high, most) {
 
 const DASHES = [null, '6 3', '2 3', '9 3 2 3', '4 2', '1 2', '12 4', '7 2 2 2'];
 
-function linePlot({ label, lines, xLabel, yLabel }) {
-  // Lines: {name, style, x: [], y: []}; styles differ in colour and dash.
-  const width = 760, height = 300, left = 62, right = 12, top = 22, bottom = 42;
+function linePlot({ label, lines, xLabel, yLabel, width = 760, height = 300, most = 0, isSmall = false }) {
+  // Lines: {name, style, x: [], y: [], band: [[low, high]]}; styles differ in colour and dash. The y axis reaches `most`.
+  // A small plot has no key and no download.
+  const left = isSmall ? 40 : 62, right = 12, top = 22, bottom = 42;
   const xs = lines.flatMap((one) => one.x), ys = lines.flatMap((one) => one.y);
   const plot = svg('svg', { viewBox: `0 0 ${width} ${height}`, width, role: 'img', 'aria-label': label });
   if (!xs.length) return h('p', { class: 'intro' }, 'No timings.');
-  const xHigh = Math.max(...xs, 1e-9), yHigh = Math.max(...ys, 1e-9) * 1.05;
+  const xHigh = Math.max(...xs, 1e-9), yHigh = Math.max(...ys, most, 1e-9) * 1.05;
   const px = (v) => left + (v / xHigh) * (width - left - right);
   const py = (v) => height - bottom - (v / yHigh) * (height - top - bottom);
   for (const tick of niceTicks(0, yHigh, 5)) {
     plot.append(svg('line', { class: 'grid', x1: left, x2: width - right, y1: py(tick), y2: py(tick) }),
       svg('text', { x: left - 6, y: py(tick) + 4, 'text-anchor': 'end' }, countText(tick)));
   }
-  for (const tick of niceTicks(0, xHigh, 7)) {
+  for (const tick of niceTicks(0, xHigh, Math.min(7, width / 60))) {
     plot.append(svg('text', { x: px(tick), y: height - bottom + 16, 'text-anchor': 'middle' }, countText(tick)));
   }
   plot.append(svg('line', { class: 'axis', x1: left, x2: width - right, y1: height - bottom, y2: height - bottom }),
     svg('text', { class: 'strong', x: (left + width - right) / 2, y: height - 6, 'text-anchor': 'middle' }, xLabel),
     svg('text', { class: 'strong', x: left, y: 12 }, yLabel));
+  const at = (x, y) => `${px(x).toFixed(1)} ${py(Math.min(yHigh, Math.max(0, y))).toFixed(1)}`;
+  for (const one of lines.filter((each) => each.band)) {
+    const edge = (end) => one.x.map((v, i) => at(v, one.band[i][end]));
+    plot.append(svg('path', { class: `band l${one.style % 8}`, d: `M${[...edge(0), ...edge(1).reverse()].join('L')}Z` }));
+  }
   for (const one of lines) {
     const d = one.x.map((v, i) => `${i ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
     plot.append(svg('path', { class: `line l${one.style % 8}`, d, 'stroke-dasharray': DASHES[one.style % 8] },
@@ -219,10 +225,15 @@ function linePlot({ label, lines, xLabel, yLabel }) {
     if (one.x.length < 30) one.x.forEach((v, i) => plot.append(svg('circle', { ...ring, cx: px(v), cy: py(one.y[i]) },
       svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
   }
+  if (isSmall) return plot;
+  return h('div', null, lineKey(lines), scrollBox(label, plot),
+    downloadButton('PNG', label, () => savePlot(label, plot, lines)));
+}
+
+function lineKey(lines) {
   const dash = (style) => svg('svg', { width: 30, height: 8, 'aria-hidden': 'true' },
     svg('line', { class: `line l${style}`, x1: 0, x2: 30, y1: 4, y2: 4, 'stroke-dasharray': DASHES[style] }));
-  const key = h('ul', { class: 'key' }, lines.map((one) => h('li', null, dash(one.style % 8), one.name)));
-  return h('div', null, key, scrollBox(label, plot), downloadButton('PNG', label, () => savePlot(label, plot, lines)));
+  return h('ul', { class: 'key' }, lines.map((one) => h('li', null, dash(one.style % 8), one.name)));
 }
 
 // The picture of a plot with its key, at twice the size of the screen.

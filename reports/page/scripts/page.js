@@ -62,7 +62,7 @@ function makeInTime() {
 
 headFacts();
 for (const make of [
-  summarySection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, gallerySection,
+  summarySection, robustnessSection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, gallerySection,
   timingSection, compareSection, provenanceSection,
 ]) make();
 makeInTime();

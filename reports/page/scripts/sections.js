@@ -3,6 +3,7 @@
 
 const DATA = JSON.parse(byId('data').textContent);
 const RUNS = DATA.runs;
+const SWEEPS = DATA.robustness || [];
 const shortName = (name) => name.replace(/[\\/]+$/, '').split(/[\\/]/).pop();
 const runNames = RUNS.map((run, k) => {
   const name = shortName(run.name);
@@ -125,6 +126,10 @@ function summarySection() {
         warn(h('strong', null, `${where}INCOMPLETE. `), 'Some scenes failed and are excluded from all numbers.',
           noteList(run.failed, 3));
       }
+    }
+    for (const one of SWEEPS) {
+      section.append(h('p', { class: 'note' }, `${RUNS.length > 1 ? `${runNames[one.run]}: ` : ''}${one.n_cells} methods `
+        + 'under corruptions are only in the section ', h('a', { href: '#robustness' }, 'Robustness'), '.'));
     }
     if (DATA.left_out) warn(h('strong', null, 'LARGE. '), `${DATA.left_out}.`);
     for (const protocol of PROTOCOLS) {

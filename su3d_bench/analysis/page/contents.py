@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.analysis.attribution import Explained, JobCounts, attribution_of, explained_of
-from su3d_bench.analysis.comparison import compare
+from su3d_bench.analysis.comparison import compare_pairs
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.analysis.sides import Side, SideNumbers
+from su3d_bench.analysis.sweeps import without_cells
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, printable_json
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.types import Float64Array, Int64Array
@@ -217,7 +218,7 @@ def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
         left, right = ([runs.index(side.run), side.method] for side in pair)
         found: dict[str, Any] = {"left": left, "right": right, "protocols": [], "remarks": [], "reason": None}
         try:
-            comparison = compare(*(f"{side.run.folder.path}:{side.method}" for side in pair), numbers=numbers).to_json()
+            comparison = compare_pairs([pair], numbers=numbers).to_json()
             found |= {name: comparison[name] for name in ("protocols", "remarks")}
         except Su3dError as error:
             found["reason"] = str(error)
@@ -333,10 +334,11 @@ def page_contents(
     """The contents of the page of the runs in ``folders``.
 
     ``begin`` is called once with the number of steps, ``report`` for each step. Raises ``StoreError`` if a folder has
-    no finished run; parts that cannot be computed have a reason on the page.
+    no finished run; parts that cannot be computed have a reason on the page. Of a sweep over corruptions only the clean
+    methods are listed.
     """
     folders = tuple(dict.fromkeys(folders))
-    runs = [read_checked(folder) for folder in folders]
+    runs = [without_cells(read_checked(folder)) for folder in folders]
     maps = scored_maps(runs) if options.with_maps else []
     max_points = points_of_each(len(maps), options.max_bytes)
     explained = _explained(runs) if options.with_errors and are_all_read(runs) else {}

@@ -10,7 +10,7 @@ import chromium
 import pytest
 from chromium import Chromium
 from page_checks import DESKTOP
-from painted_runs import COLLECTOR, painted_run, run, see_painted
+from painted_runs import COLLECTOR, painted_page, painted_run, run, see_painted
 
 from su3d_bench.cli.main import main
 
@@ -48,6 +48,15 @@ def page_of_runs(folder: Path) -> Path:
         see_painted(patch)
         assert main(["report", "html", *runs, *words]) == 0
     return page
+
+
+def page_of_sweep(folder: Path) -> Path:
+    """The output of ``report html`` for two methods under two corruptions."""
+    variants = ("", "@drop=1")
+    cells = [f"{one}~{name}" for name in ("masks/dropped/2", "masks/dropped/5", "pose/jumps/5") for one in variants]
+    painted_run(folder / "sweep", methods=[f"{COLLECTOR}{one}" for one in (*variants, *cells)])
+    painted_page(folder / "sweep", folder / "page.html")
+    return folder / "page.html"
 
 
 SELECT = "[...document.querySelectorAll('#{part} select')].find((one) => one.labels[0].textContent === '{label}')"

@@ -11,7 +11,7 @@ import pytest
 from chromium import needs_chromium
 from page_checks import CHECKS, complaints, unfold
 from registry_bundles import painted_bundle
-from runs_page import STRUCK, browser_for_pages, finished_runs, page_of_runs
+from runs_page import STRUCK, browser_for_pages, finished_runs, page_of_runs, page_of_sweep
 from synthetic_sheets import made
 
 from su3d_bench.cli.main import main
@@ -73,6 +73,7 @@ def page_of_method(folder: Path) -> Path:
 
 PAGES: Mapping[str, Callable[[Path], Path]] = {
     "HTML report": page_of_runs,
+    "HTML report of a sweep": page_of_sweep,
     "tables": page_of_tables,
     "annotation sheet": page_of_annotation,
     "items to review": page_of_second_looks,
