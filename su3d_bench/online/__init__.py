@@ -1,0 +1,1 @@
+"""Online evaluation: maps scored while the camera moves."""
