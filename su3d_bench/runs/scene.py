@@ -287,7 +287,7 @@ class _Scene:
             feeding.write_map(folder.prediction)
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
-        costs = {
+        costs: dict[str, Any] = {
             "maps": feeding.maps,
             "calibration_ms": feeding.calibration_ms,
             "peak_rss_bytes": peak_memory_bytes(),
