@@ -6,10 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench.core.errors import counted
+from su3d_bench.core.errors import counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, csv_lines, percent, text_table
-from su3d_bench.metrics.costs import MethodSummary
+from su3d_bench.metrics.costs import MethodSummary, UpdateTimes
 from su3d_bench.numerics.statistics import Growth
+from su3d_bench.store.records import RealTimeRecord
 
 MIB = 2**20
 CACHE = "cache"
@@ -29,9 +30,14 @@ class AnytimePoint:
 
 
 def timing_tables(
-    summaries: Sequence[MethodSummary], anytime: Sequence[AnytimePoint], hardware: Mapping[str, str], camera_rate: float
+    summaries: Sequence[MethodSummary],
+    anytime: Sequence[AnytimePoint],
+    hardware: Mapping[str, str],
+    camera_rate: float,
+    times: Sequence[UpdateTimes] = (),
 ) -> list[Table | Prose]:
-    """Return all tables. ``hardware``: run -> machine; ``camera_rate``: frames per second."""
+    """Return all tables. ``hardware``: run -> machine; ``camera_rate``: frames per second; ``times``: of each scene,
+    for runs in real time."""
     runs = dict.fromkeys(summary.run for summary in summaries)
     parts: list[Table | Prose] = [Prose((f"{run}: {hardware[run]}",)) for run in runs]
     parts.append(text_table("timing", list(_methods_table(summaries, camera_rate))))
@@ -43,6 +49,8 @@ def timing_tables(
         caption = f", ms per update ({updates})"
         name = f"timing-{summary.run}-{summary.method}"
         parts.append(text_table(name, list(_stages_table(summary)), heading=summary.method, caption=caption))
+    if clocked := [each for each in times if each.realtime is not None]:
+        parts.append(text_table("timing-real-time", list(_real_time_table(clocked)), heading="Real time"))
     if anytime:
         parts.append(text_table("timing-midway", list(_anytime_table(anytime)), heading="Intermediate maps"))
     return parts
@@ -119,6 +127,29 @@ def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
     for point in points:
         values = [percent(point.metrics[name]) if name in point.metrics else "" for name in names]
         yield [point.run, point.method, point.protocol, f"{100 * point.share:g} %", f"{point.seconds:.1f}", *values]
+
+
+def _real_time_table(times: Sequence[UpdateTimes]) -> Iterator[list[str]]:
+    """One row per run, method and clock."""
+    yield ["run", "method", "Hz", "queue", "frames", "processed", "dropped", "latency (ms)", "processed/s", "durations"]
+    clocks: dict[tuple[str, ...], list[RealTimeRecord]] = {}
+    for each in times:
+        if (clock := each.realtime) is not None:
+            queue = clock.queue if clock.queue_size == 1 else f"{clock.queue} {clock.queue_size}"
+            source = "simulated" if clock.is_simulated else "measured"
+            key = each.run, each.method, f"{clock.rate_hz:g}", queue, f"{source}: {printable(clock.device, 120)}"
+            clocks.setdefault(key, []).append(clock)
+    for (run, method, rate, queue, source), scenes in clocks.items():
+        n_frames, n_processed, n_dropped = (
+            sum(getattr(clock, name) for clock in scenes) for name in ("n_frames", "n_processed", "n_dropped")
+        )
+        latency = sum(clock.n_processed * (clock.latency_ms or 0.0) for clock in scenes)
+        yield [
+            *(run, method, rate, queue, str(n_frames), str(n_processed), str(n_dropped)),
+            _ms(latency / n_processed if n_processed else float("nan")),
+            f"{n_processed / sum(clock.duration_s for clock in scenes):.2f}",
+            source,
+        ]
 
 
 def _ms(value: float) -> str:

@@ -189,8 +189,11 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
         if any(len(of_scene.maps) != len(maps) for of_scene in times):
             continue  # the record of a scene's maps is damaged
         for index, (share, metrics) in enumerate(maps):
-            seconds = 0.0  # of the updates before the map, and of finishing it
+            seconds = 0.0  # of the updates before the map, and of finishing it; in real time of the recording
             for of_scene in times:
+                if of_scene.realtime is not None:
+                    seconds += share * of_scene.realtime.duration_s
+                    continue
                 made = of_scene.maps[index]
                 seconds += float(of_scene.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
             headline = {metric: metrics.get(metric) for metric in record.headline}

@@ -82,7 +82,7 @@ def run(
     given = several("methods", methods, str | type)
     targets = [registry.target_of("method", one) if isinstance(one, type) else one for one in given]
     if any(isinstance(one, type) and one.__module__.partition(".")[0] != "su3d_bench" for one in given):
-        if jobs not in (None, 1) or more.get("executor", "inline") not in ("auto", "inline"):
+        if jobs not in (None, 1) or more.get("executor", "inline") not in ("auto", "inline") or more.get("memory"):
             raise ConfigError("run: a class runs in this process; use jobs=1, or save it and pass 'file.py:Class'")
         jobs = 1
     values = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output, report_files
@@ -131,8 +132,15 @@ def call_timing(arguments: argparse.Namespace) -> None:
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.hardware for run in runs}
-    tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
-    value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
+    tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate, list(chain(*times)))
+    value: dict[str, object] = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
+    clocks = [
+        {"run": each.run, "scene": each.scene, "method": each.method, **asdict(each.realtime)}
+        for each in chain(*times)
+        if each.realtime is not None
+    ]
+    if clocks:
+        value["real_time"] = clocks
     output.answer_tables(arguments, value, tables)
     if arguments.out is None:
         return

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, output_path
+from su3d_bench.cli.options import EXECUTOR, JOBS, Parser, Verbs, add_verb, count, output_path, positive
 from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -38,6 +39,7 @@ def add_run_options(parser: Parser) -> None:
     parser.option("--protocols PROTOCOL...", headline, action="extend")
     parser.shared("--all-protocols", "--profile", "--device")
     parser.shared("--jobs", help=JOBS)
+    parser.option("--memory SIZE", "memory limit of each worker process, such as 8G (default: none)")
     parser.shared("--limit", "--question-solver", "--refiner", "--offline", *EXECUTOR)
     parser.shared("--seed", type=int, default=None)
     parser.option("--stride N", "use every Nth frame (default: set by the method)", type=int)
@@ -50,6 +52,12 @@ def add_run_options(parser: Parser) -> None:
         action=argparse.BooleanOptionalAction,
     )
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
+    parser.option("--realtime HZ", "frames that arrive per second; those that find no place are dropped", type=positive)
+    queues = ("newest", "drop-new", "drop-old")
+    parser.option("--queue POLICY", "what waits while the method is busy (default: newest)", choices=queues)
+    parser.option("--queue-size N", "places in the queue of drop-new and drop-old (default: 10)", type=count)
+    parser.option("--schedule PATH", "run or schedule.csv to replay: the same frames, the same maps", type=Path)
+    parser.option("--cost FILE", "CSV file of durations to simulate: device, and duration_ms or mean_ms and sd_ms")
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option("--out DIR", "run folder (default: a folder in runs/)", type=output_path)
     into = parser.add_mutually_exclusive_group()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.safe_output import one_line
@@ -93,9 +93,29 @@ DEFAULT_SOURCE = "default"
 
 
 # Where scenes run and whether pictures are drawn: this changes no number.
-NEUTRAL_SETTINGS = frozenset(
-    {"jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
-)
+NEUTRAL_SETTINGS = frozenset({
+    "jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm",
+    "memory",
+})  # fmt: skip
+SIZE = re.compile(r"(\d{1,9}(?:\.\d{1,3})?)([KMGT])(?:i?B)?")
+
+
+def size_bytes(text: str) -> int:
+    """The number of bytes in ``8G``, with units of 1024; a ``ValueError`` if it is not a size.
+
+    >>> size_bytes("8G"), size_bytes("1.5K")
+    (8589934592, 1536)
+    """
+    found = SIZE.fullmatch(text)
+    if found is None or not float(found[1]):
+        raise ValueError("expected a size such as 8G or 500M")
+    return int(float(found[1]) * 1024 ** (1 + "KMGT".index(found[2])))
+
+
+def _checked_size(text: str) -> str:
+    if text:
+        size_bytes(text)
+    return text
 
 
 class RunConfig(BaseModel):
@@ -108,8 +128,11 @@ class RunConfig(BaseModel):
     ``perception.language``; ``refiner``: how labels n' are chosen, by vote or by that model; ``offline``: no language
     model is called, replies stored with the run are used; ``accept_poses``: also run recordings whose depth contradicts
     their poses; ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
+    ``realtime``: frames that arrive per second, 0: each waits for the method; ``queue`` and ``queue_size`` (0: 1 for
+    ``newest``, otherwise 10): which frames wait while it is busy; ``schedule``: a run or file to replay; ``cost``: a
+    file of durations to simulate;
     ``executor`` auto: this process for one job, otherwise processes; ``retries``: for a scene whose job
-    died; ``slurm``: KEY=VALUE for submitit.
+    died; ``slurm``: KEY=VALUE for submitit; ``memory``: the limit of each worker process, such as 8G.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -128,10 +151,16 @@ class RunConfig(BaseModel):
     offline: bool = False
     accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
+    realtime: float = Field(default=0, ge=0, le=1e6, allow_inf_nan=False)
+    queue: Literal["newest", "drop-new", "drop-old"] = "newest"
+    queue_size: int = Field(default=0, ge=0, le=10_000_000)
+    schedule: Path | None = None
+    cost: Path | None = None
     executor: Literal["auto", "inline", "processes", "slurm"] = "auto"
     gpus_per_job: int = Field(default=0, ge=0, le=64)
     retries: int = Field(default=2, ge=0)
     slurm: tuple[str, ...] = ()
+    memory: Annotated[str, AfterValidator(_checked_size)] = ""
 
     @property
     def shares(self) -> tuple[float, ...]:

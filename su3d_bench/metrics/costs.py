@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import Growth, growth_exponent
-from su3d_bench.store.records import MapCost
+from su3d_bench.store.records import MapCost, RealTimeRecord
 
 # Stages that are not mapping: reading the frame, and perception. They give the mapping time of runs by earlier
 # versions, whose updates have no ``method_ms``.
@@ -27,7 +27,7 @@ class UpdateTimes:
     ``columns`` has (N,) float64 for every column of ``updates.csv``: ``total_ms``, ``method_ms``, one ``<stage>_ms``
     per stage, sizes. ``maps`` are the intermediate ones and the last; what was not measured is None.
     ``calibration_ms``: the time of a fixed workload, measured between the updates; ``start_ms`` and ``close_ms``: of
-    the method before the first frame and after the last map.
+    the method before the first frame and after the last map. ``realtime``: the clock of a real-time run.
     """
 
     run: str
@@ -40,6 +40,7 @@ class UpdateTimes:
     calibration_ms: float | None = None
     start_ms: float | None = None
     close_ms: float | None = None
+    realtime: RealTimeRecord | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))

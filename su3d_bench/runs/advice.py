@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import math
 import shlex
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.corruptions.apply import MARK
 from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.real_time import is_measured
 from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
@@ -57,7 +59,11 @@ def estimate(plan: Plan) -> list[JobEstimate]:
             except DataError as error:
                 remark = str(error)
         measured = update_s[part]
-        seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
+        each_s = GUESSED_UPDATE_S if measured is None else measured
+        if job.config.realtime:  # a busy method processes what fits into the recording's duration
+            n_updates = min(n_updates, math.ceil(n_updates / job.config.realtime / max(each_s, 1e-9)))
+        n_passes = 2 if is_measured(job.config) else 1
+        seconds = GUESSED_SCENE_S + n_passes * n_updates * each_s
         rows.append(JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark))
     return rows
 

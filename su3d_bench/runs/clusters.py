@@ -124,7 +124,7 @@ def executor_for(config: RunConfig, n_workers: int, folder: Path, report: Report
     if executor == "inline":
         yield lambda work, units, lost: executors.run_inline(work, units, report)
     elif executor == "processes":
-        yield partial(executors.run_processes, report=report, jobs=n_workers)
+        yield partial(executors.run_processes, report=report, jobs=n_workers, memory=config.memory)
     else:
         with TemporaryFolder("su3d-slurm-") as scratch:  # submitit creates the folder even for a mere check
             slurm_executor(scratch, config, n_workers)

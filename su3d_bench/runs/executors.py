@@ -9,7 +9,9 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import os
+import resource
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -21,7 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-from su3d_bench.core.config import RunConfig, parse_value
+from su3d_bench.core.config import RunConfig, parse_value, size_bytes
 from su3d_bench.core.errors import ConfigError, Su3dError
 from su3d_bench.core.safe_output import answers_apart, doors
 from su3d_bench.core.system.signals import Terminated, ending_in_order
@@ -92,11 +94,12 @@ def run_processes(
     *,
     jobs: int,
     lost: Callable[[Unit, str], Outcome],
+    memory: str = "",
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they complete, at most ``jobs`` in parallel, each unit in a fresh spawned process.
 
     ``lost`` creates the outcome of a unit whose process died, from a clause describing how. A ``Su3dError`` raised by
-    ``work``, or an interrupt, stops all units.
+    ``work``, or an interrupt, stops all units. ``memory``: the limit of each process, such as 8G.
     """
     waiting = list(reversed(units))
     running: dict[Connection, tuple[Unit, BaseProcess]] = {}
@@ -104,7 +107,7 @@ def run_processes(
         while waiting or running:
             while waiting and len(running) < jobs:
                 unit = waiting.pop()
-                connection, process = _start(work, unit)
+                connection, process = _start(work, unit, memory)
                 running[connection] = unit, process
             for ready in wait(list(running)):
                 assert isinstance(ready, Connection)
@@ -115,7 +118,7 @@ def run_processes(
                 unit, process = running.pop(ready)
                 process.join()
                 ready.close()
-                yield lost(unit, _cause(process.exitcode)) if message is None else unwrap(message)
+                yield lost(unit, _cause(process.exitcode, memory)) if message is None else unwrap(message)
     finally:
         _end([process for _, process in running.values()])
         for connection in running:
@@ -134,7 +137,7 @@ def _end(processes: Sequence[BaseProcess]) -> None:
             process.join()
 
 
-def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProcess]:
+def _start(work: Work[Unit, Outcome], unit: Unit, memory: str) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in ONE_THREAD}
@@ -144,7 +147,7 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     resource_tracker.ensure_running()
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, PARENT_SIGNALS)
     try:
-        process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
+        process = context.Process(target=_worker, args=(work, unit, theirs, memory), daemon=True)
         process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
@@ -189,7 +192,10 @@ def unwrap(message: tuple[str, Any]) -> Any:
     return content
 
 
-def _cause(exit_code: int | None) -> str:
+def _cause(exit_code: int | None, memory: str) -> str:
+    if memory and exit_code in (-signal.SIGABRT, -signal.SIGSEGV, -signal.SIGTRAP):
+        name = signal.Signals(-exit_code).name
+        return f"the worker crashed ({name}), as native code does when it exceeds --memory {memory}"
     if exit_code == -signal.SIGKILL:
         return "the worker was killed (signal 9), usually because memory ran out; try fewer --jobs"
     if exit_code is not None and exit_code < 0:
@@ -197,10 +203,36 @@ def _cause(exit_code: int | None) -> str:
     return f"the worker ended early (exit code {exit_code})"
 
 
-def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
+def limit_memory(n_bytes: int | None) -> None:
+    """Limit the memory of this process and its children, each alone; None removes the limit.
+
+    The limit is ``RLIMIT_DATA``: on Linux private writable memory, which arrays and heaps use. ``RLIMIT_AS`` also
+    counts address space that is only reserved, of which CUDA takes many times the memory of the machine.
+    """
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    soft = hard if n_bytes is None or (hard != resource.RLIM_INFINITY and n_bytes > hard) else n_bytes
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+# How libraries report that memory cannot be allocated: C++, OpenCV, ONNX Runtime, torch, threads of Python.
+_OUT_OF_MEMORY = ("bad_alloc", "Insufficient memory", "Failed to allocate memory", "can't allocate memory",
+                  "can't start new thread")  # fmt: skip
+
+
+def exceeds_memory(error: BaseException, memory: str) -> str | None:
+    """One line if ``error`` is the end of a method that exceeded its limit, which is removed; otherwise None."""
+    if not memory or not (isinstance(error, MemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY)):
+        return None
+    limit_memory(None)  # so that the failure can be recorded
+    return f"exceeded --memory {memory}; allow more, or use a smaller --limit"
+
+
+def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection, memory: str) -> None:
     for number in PARENT_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, PARENT_SIGNALS)
+    if memory:
+        limit_memory(size_bytes(memory))
     try:
         with ending_in_order():
             threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -228,10 +260,10 @@ SLURM_OPTIONS = ("gpus_per_job", "retries", "slurm")
 
 
 def executor_of(config: RunConfig, n_workers: int) -> str:
-    """The executor that ``auto`` selects: this process for one job, otherwise processes."""
+    """The executor that ``auto`` selects: this process for one job without a memory limit, otherwise processes."""
     if config.executor != "auto":
         return config.executor
-    return "inline" if n_workers == 1 else "processes"
+    return "inline" if n_workers == 1 and not config.memory else "processes"
 
 
 def check_execution(config: RunConfig) -> None:
@@ -243,6 +275,10 @@ def check_execution(config: RunConfig) -> None:
             raise ConfigError(f"{flag}: has no effect with the executor '{config.executor}'; add --executor {SLURM}")
     if config.executor == "inline" and config.jobs > 1:
         raise ConfigError(f"--jobs {config.jobs}: the executor 'inline' runs one job; choose --executor processes")
+    if config.memory and (config.executor in ("inline", SLURM) or sys.platform != "linux"):
+        raise ConfigError(
+            f"--memory {config.memory}: needs Linux and --executor processes; for Slurm, --slurm mem_gb=N"
+        )
     slurm_parameters(config)
 
 

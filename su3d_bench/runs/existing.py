@@ -185,6 +185,8 @@ def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
 
 
 def _is_same(path: KeyPath, before: Any, after: Any, existing: ExistingRun) -> bool:
+    if path in (("schedule",), ("cost",)):  # their content is in the keys of the maps
+        return (before is None) == (after is None)
     if path == ("anytime",):
         return sorted(set(before or ())) == sorted(set(after or ()))
     if path == ("profile",) and "auto" in (before, after):  # which resolved to the named one
@@ -204,7 +206,8 @@ def _shown(path: KeyPath, value: Any) -> str:
 
 
 def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
-    return values.get(("stride",)) or values.get(("method", method, "stride"), 1)
+    own = 1 if values.get(("realtime",)) else values.get(("method", method, "stride"), 1)
+    return values.get(("stride",)) or own
 
 
 def check_request(existing: ExistingRun, now: Request, into: Into, where: str) -> None:

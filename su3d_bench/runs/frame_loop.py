@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self, TypeVar
@@ -28,17 +29,17 @@ from su3d_bench.store.records import updates_text
 
 
 @dataclass(frozen=True)
-class FirstFrames(Sequence[types.Frame]):
-    """The first ``n`` of ``frames``, read from disk at every access."""
+class ChosenFrames(Sequence[types.Frame]):
+    """The ``frames`` at ``places``, read from disk at every access."""
 
     frames: Sequence[types.Frame]
-    n: int
+    places: Sequence[int]
 
     def __len__(self) -> int:
-        return self.n
+        return len(self.places)
 
     def __getitem__(self, index: Any) -> Any:
-        places = range(self.n)[index]
+        places = self.places[index]
         return self.frames[places] if isinstance(places, int) else [self.frames[place] for place in places]
 
 
@@ -186,6 +187,7 @@ class MethodFeed:
         self._skips_empty = skips_empty
         self._timer = Timer()
         self._rows: list[Row] = []
+        self._processing_ms = 0.0
         self._calibrations: list[float] = []
 
     @property
@@ -203,29 +205,37 @@ class MethodFeed:
         for update in range(len(self._rows), n_fed):
             if update % CALIBRATE_EVERY == 0:
                 self._calibrations.append(calibration_ms())
-            row = self._feed(update, frames)
+            row = self._feed(update, frames.next_frame)
             self._rows.append(row)
             size = row.get("n_instances")
             self._report(
                 Event(self._scene, self._method.name, update + 1, n_frames, None if size is None else int(size))
             )
 
-    def _feed(self, update: int, frames: ReadAhead[types.Frame]) -> Row:
+    def measured_ms(self, frames: Sequence[types.Frame], place: int) -> float:
+        """Feed the frame at ``place``; the milliseconds of its perception and update, without those of reading it."""
+        self._report(Event(self._scene, self._method.name, place, len(frames)))
+        self._rows.append(self._feed(len(self._rows), partial(frames.__getitem__, place)))
+        return self._processing_ms
+
+    def _feed(self, update: int, read: Callable[[], types.Frame]) -> Row:
         timer, method = self._timer, self._method
         start = time.perf_counter()
         with timer.stage("decode"):
-            frame = frames.next_frame()
+            frame = read()
+        arrival = time.perf_counter()
         if not (frame.depth_m > 0).any():
             if not self._skips_empty:
                 raise DataError(f"{self._scene} frame {frame.index}: depth is empty (no pixel is above 0 m)")
             timer.take()
-            elapsed_ms = (time.perf_counter() - start) * 1e3
+            elapsed_ms, self._processing_ms = (time.perf_counter() - start) * 1e3, 0.0
             empty: Row = {"update": update, "frame": frame.index, "n_detections": 0, "rss_bytes": memory_bytes()}
             return empty | {"method_ms": 0.0, "total_ms": round(elapsed_ms, 3)}
         detections = detections_of(frame, method.needs, self._perception, timer)
         with self._clock.running("update"):
             method.update(frame, detections, timer)
-        total_ms = (time.perf_counter() - start) * 1e3
+        end = time.perf_counter()
+        total_ms, self._processing_ms = (end - start) * 1e3, (end - arrival) * 1e3
         own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
         of_method: Row = {name: int(attribute_of(method, name)) for name in SIZES if hasattr(method, name)}
         of_method |= attribute_of(method, "losses", {})

@@ -25,6 +25,7 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
 from su3d_bench.runs.plugins import attribute_of, checked_dataset, checked_method, made, settings_model
+from su3d_bench.runs.real_time import clock_key
 from su3d_bench.store.records import CompletionRecord
 from su3d_bench.store.run_folder import JobFolder
 
@@ -150,8 +151,8 @@ class MethodOutcome:
 
 
 def stride_of(job: SceneJob, part: Part) -> int:
-    """Frames between updates: the run's if set, otherwise the method's own, otherwise 1."""
-    return job.config.stride or int(json.loads(part.options).get("stride", 1))
+    """Frames between updates, or between arrivals in real time: the run's if set, otherwise the method's own or 1."""
+    return job.config.stride or (1 if job.config.realtime else int(json.loads(part.options).get("stride", 1)))
 
 
 def settings_key(sections: Iterable[tuple[str, str]], method: Method) -> dict[str, str]:
@@ -170,6 +171,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         key |= {"stride": str(stride_of(job, part)), "limit": str(job.config.limit or "none")}
         if job.config.shares:
             key["anytime"] = str(job.config.shares)
+        key |= clock_key(job.config, job.scene, part.name)
         sections.append(("perception", job.perception))
     key |= settings_key(sections, method)
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
@@ -184,17 +186,18 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
 
 class ConfiguredMethods:
     """Methods and the part of the keys of their predictions that is known before any data is read, computed once per
-    dataset."""
+    dataset, or per scene if schedules are replayed."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+        self._known: dict[tuple[Part, Part, str], tuple[Any, dict[str, str]]] = {}
 
     def of(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
         """The method of ``part`` and its ``config_key``."""
-        if (job.dataset, part) not in self._known:
+        place = job.dataset, part, "" if job.config.schedule is None else job.scene
+        if place not in self._known:
             method = build_method(part)
-            self._known[job.dataset, part] = method, config_key(job, part, method)
-        return self._known[job.dataset, part]
+            self._known[place] = method, config_key(job, part, method)
+        return self._known[place]
 
 
 def check_same_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
@@ -252,7 +255,7 @@ class JobInputs:
             self.job.scene,
             self.name,
             profile=self.perception.profile if self.method.needs.frames else None,
-            caveat=caveat_of(self.method, self.perception, self.info),
+            caveat=remarks["caveat"],
             encoder=self.perception.encoder.name,
             encoder_digest=self.perception.encoder.digest,
             data_digest=self.data_digest,
@@ -263,8 +266,9 @@ class JobInputs:
         )
 
 
-def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
-    """The note shown with every number: where the scenes, the masks, or the method's own proposals come from."""
+def caveat_of(method: Method, perception: Perception, scene: SceneInfo, clock: str | None = None) -> str | None:
+    """The note shown with every number: where the scenes, the masks, or the method's own proposals come from, and the
+    ``clock`` of a real-time run."""
     own = attribute_of(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
@@ -273,7 +277,7 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
     made = f"{GENERATED_ROOMS} {scene.dataset}, not its scenes" if is_made else None
-    parts = [made, perception.caveat if sees_profile(method) else None, own]
+    parts = [made, perception.caveat if sees_profile(method) else None, own, clock]
     return "; ".join(part for part in parts if part) or None
 
 

@@ -61,6 +61,7 @@ from su3d_bench.runs.job import (
     options_model,
     part_of,
 )
+from su3d_bench.runs.real_time import check_is_timed, is_measured, with_clock
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
 
@@ -213,7 +214,7 @@ def make_plan(
     check_keys(settings)
     if into == "extend":
         settings = extended(settings, existing, str(out))
-    config = resolve(settings, (), RunConfig)
+    config = with_clock(resolve(settings, (), RunConfig))
     check_execution(config)
     if config.profile not in PROFILES:
         raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
@@ -248,6 +249,7 @@ def make_plan(
     domain: ImageDomain = "rendered-rooms" if set(targets) <= GENERATED else "camera"
     profile = resolve_profile(config.profile, domain, of_perception)
     uses_captions = profile == "paper" and of_perception.paper.captions == "model"
+    check_is_timed(config, profile, uses_captions=uses_captions)
     has_replies = config.offline or (folder.path / "language").is_dir()  # else requests are sent
     if (asked or uses_captions) and not has_replies and config.executor != SLURM:
         check_key(of_perception.language)
@@ -269,7 +271,8 @@ def make_plan(
         )
         for index, (target, scene) in enumerate(chosen)
     )
-    n_here = config.jobs or (len(jobs) if config.executor == SLURM else default_jobs(profile, of_perception))
+    n_alone = 1 if is_measured(config) and config.executor != SLURM else 0  # parallel jobs slow each other
+    n_here = config.jobs or n_alone or (len(jobs) if config.executor == SLURM else default_jobs(profile, of_perception))
     n_workers = min(n_here, len(jobs))
     notes += tuple(_notes_on_protocols(protocols, config.protocols))
     return _started(Plan(config, settings, folder, jobs, n_workers, notes, existing), into)

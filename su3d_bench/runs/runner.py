@@ -158,7 +158,18 @@ def _finished_scenes(plan: Plan, run: RunUnits) -> Iterator[tuple[MethodOutcome,
             left.append(job)
         else:
             yield outcomes
-    yield from run(run_scene, left, lost=failed_outcomes)
+    if not plan.config.memory:
+        yield from run(run_scene, left, lost=failed_outcomes)
+        return
+    # A method that exceeds its memory may take its process with it, so that each has one of its own.
+    units = [replace(job, methods=(part,), ceiling=None) for job in left for part in job.parts]
+    parts = {job.scene: [part.name for part in job.parts] for job in left}
+    done: dict[tuple[str, str], MethodOutcome] = {}
+    for (outcome,) in run(run_scene, units, lost=failed_outcomes):
+        done[outcome.scene, outcome.method] = outcome
+        found = [done.get((outcome.scene, name)) for name in parts[outcome.scene]]
+        if None not in found:
+            yield tuple(outcome for outcome in found if outcome is not None)
 
 
 # ---- 4: collect and combine (``summarise``), and 5: write the results

@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import math
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -23,7 +23,7 @@ from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.signals import is_interrupt
-from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.system.timing import MethodClock, Timer, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.corruptions.apply import CorruptedFrames, CorruptedPerception, SceneCorruption, parse_conditions
 from su3d_bench.metrics.compatibility import kind_incompatibility
@@ -31,6 +31,7 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth, pack_scores, score_located
+from su3d_bench.online.clock import Schedule
 from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
@@ -41,9 +42,10 @@ from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import job as jobs
-from su3d_bench.runs.executors import Event, Report
+from su3d_bench.runs.executors import Event, Report, exceeds_memory
 from su3d_bench.runs.frame_loop import SceneLog
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
+from su3d_bench.runs.real_time import is_measured, schedule_of
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import UnscoredRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -103,7 +105,7 @@ def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     except BaseException as error:
         if is_interrupt(error) or (isinstance(error, StoreError) and not user_code_line(error)):
             raise
-        line = error_line(error)
+        line = exceeds_memory(error, job.config.memory) or error_line(error)
         name = printable(job.scene)
         line = line if line.startswith(name) else f"{name}: {line}"
         log.lines.append("".join(traceback.format_exception(error)) + f"failed: {line}")
@@ -255,25 +257,82 @@ class _Scene:
     def _predict(
         self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
-        """Feed a newly created method, so that its construction is timed too, and record its map as complete."""
+        """Feed a newly created method, so that its construction is timed too, and record its map as complete.
+
+        In real time, a first method is fed only to measure the schedule, which is then replayed: what a map contains
+        at a time is known only when the next update has been measured.
+        """
+        frames: Sequence[Frame] = ()
+        shares, doubts, schedule = tuple[float, ...](), tuple[str, ...](), None
+        if inputs.method.needs.frames:
+            shares, doubts = self.job.config.shares, self.job.doubts or ()
+            frames = self.dataset.frames(self.job.scene_name, inputs.info.stride)
+            frames = frame_loop.ChosenFrames(frames, range(len(frames))[: self.job.config.limit or None])
+            if corruption := self.corruption(part):
+                frames = CorruptedFrames(frames, corruption)
+            if self.job.config.realtime:
+                schedule = self._schedule(part, inputs, frames)
+                frames = frame_loop.ChosenFrames(frames, schedule.fed)
+        for line in doubts:
+            logger.warning("%s", line)
+        with self._feeding(part, inputs, inputs.perception, frames) as (feeding, clock):
+            n = len(frames)
+            with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
+                for share in shares:
+                    n_fed = math.ceil(share * n) if schedule is None else schedule.n_fed_by(share)
+                    feeding.feed_until(n_fed, ahead, n)
+                    feeding.write_map(folder.anytime(share))
+                feeding.feed_until(n, ahead, n)
+            self.report_activity(part, "finishing the map")
+            feeding.write_map(folder.prediction)
+        write_text(folder.updates, feeding.updates_text())
+        files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
+        costs: dict[str, Any] = {
+            "maps": feeding.maps,
+            "calibration_ms": feeding.calibration_ms,
+            "peak_rss_bytes": peak_memory_bytes(),
+            "device_bytes": device_memory_bytes(),
+            "start_ms": round(clock.take("start").method_ms, 3),
+            "close_ms": round(clock.take("close").method_ms, 3),
+        }
+        remarks = {"costs": costs, REMARK: doubts} | log.remarks()
+        if schedule is not None:
+            write_text(folder.schedule, schedule.text())
+            files.append(folder.schedule)
+            costs["realtime"] = schedule.numbers()
+            remarks["clock"] = schedule.stream.note(part.name)
+        folder.mark_complete("predict", key, files, remarks)
+
+    def _schedule(self, part: jobs.Part, inputs: jobs.JobInputs, frames: Sequence[Frame]) -> Schedule:
+        """The schedule of a real-time run of ``part``; measured without the cache, whose times are not perception's."""
+        config, stride = self.job.config, inputs.info.stride
+        make = partial(schedule_of, config, self.job.scene, part.name, len(frames), stride)
+        if not is_measured(config):
+            return make(cost_ms=None)
+        settings: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
+        job = replace(self.job, perception=settings.model_copy(update={"cache": False}).model_dump_json())
+        perception = perception_of(job, inputs.info, lambda: self.marked)
+        if corruption := self.corruption(part):
+            perception = CorruptedPerception(perception, corruption)
+        if inputs.method.needs.masks != "none":
+            first = frames[0]
+            if (first.depth_m > 0).any():
+                perception.detect(first, inputs.method.needs, Timer())  # models are loaded at the first call
+        with self._feeding(part, inputs, perception, frames) as (feeding, _):
+            return make(cost_ms=partial(feeding.measured_ms, frames))
+
+    @contextmanager
+    def _feeding(
+        self, part: jobs.Part, inputs: jobs.JobInputs, perception: Perception, frames: Sequence[Frame]
+    ) -> Iterator[tuple[frame_loop.MethodFeed, MethodClock]]:
+        """A new method of ``part``, started, and closed at the end of the block."""
         clock = MethodClock()
         with clock.running("start"):
             method: interfaces.Method = jobs.build_method(part)
-        frames: Sequence[Frame] = ()
-        n, shares, doubts = 0, tuple[float, ...](), tuple[str, ...]()
-        if method.needs.frames:
-            shares, doubts = self.job.config.shares, self.job.doubts or ()
-            frames = self.dataset.frames(self.job.scene_name, inputs.info.stride)
-            n = min(len(frames), self.job.config.limit or len(frames))
-            if corruption := self.corruption(part):
-                frames = CorruptedFrames(frame_loop.FirstFrames(frames, n), corruption)
-                n = len(frames)
-        for line in doubts:
-            logger.warning("%s", line)
         if isinstance(method, interfaces.UsesSceneTools):
             tools = interfaces.SceneTools(
-                frames=frame_loop.FirstFrames(frames, n),
-                regions=frame_loop.TimedRegions(inputs.perception.regions(), clock),
+                frames=frames,
+                regions=frame_loop.TimedRegions(perception.regions(), clock),
                 true_proposals=self._true_proposals if method.needs.true_proposals else None,
             )
             with clock.running("start"):
@@ -289,7 +348,7 @@ class _Scene:
         self.report_activity(part, self.opening)
         start_memory_watch()
         feeding = frame_loop.MethodFeed(
-            self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)),
+            self.job.scene, method, perception, lambda event: self.report(replace(event, label=part.name)),
             clock, skips_empty=bool(part.corruption),
         )  # fmt: skip
         try:
@@ -297,28 +356,11 @@ class _Scene:
             read_surface = partial(self.dataset.surface, self.job.scene_name) if has_surface else None
             with clock.running("start"):
                 method.start(replace(inputs.info, read_surface=read_surface))
-            with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
-                for share in shares:
-                    feeding.feed_until(math.ceil(share * n), ahead, n)
-                    feeding.write_map(folder.anytime(share))
-                feeding.feed_until(n, ahead, n)
-            self.report_activity(part, "finishing the map")
-            feeding.write_map(folder.prediction)
+            yield feeding, clock
         finally:
             if isinstance(method, interfaces.Closable):
                 with clock.running("close"):
                     method.close()
-        write_text(folder.updates, feeding.updates_text())
-        files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
-        costs = {
-            "maps": feeding.maps,
-            "calibration_ms": feeding.calibration_ms,
-            "peak_rss_bytes": peak_memory_bytes(),
-            "device_bytes": device_memory_bytes(),
-            "start_ms": round(clock.take("start").method_ms, 3),
-            "close_ms": round(clock.take("close").method_ms, 3),
-        }
-        folder.mark_complete("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
 
     def _true_proposals(self) -> Proposals:
         if not self.dataset.variants:
@@ -343,9 +385,10 @@ class _Scene:
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         reasons = [UnscoredRecord(self.job.scene, part.name, *pair) for pair in unscored.items()]
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
-        doubts = folder.remarks("predict").get(REMARK, ())
+        predicted = folder.remarks("predict")
+        doubts = predicted.get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
-        remarks["caveat"] = jobs.caveat_of(inputs.method, inputs.perception, inputs.info)
+        remarks["caveat"] = jobs.caveat_of(inputs.method, inputs.perception, inputs.info, predicted.get("clock"))
         folder.mark_complete("score", key, [*files, folder.log], remarks)
 
     def scores(

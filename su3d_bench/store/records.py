@@ -223,6 +223,31 @@ class MapCost:
 
 
 @dataclass(frozen=True)
+class RealTimeRecord:
+    """The clock of a real-time run on one scene.
+
+    ``n_frames`` arrived, ``n_processed`` of them were finished in time, ``n_dropped`` were never started;
+    ``latency_ms``: mean from the arrival to the end of the update. ``device``: the machine of the durations, which were
+    measured or simulated.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=1e6)]
+    queue: str
+    queue_size: Count
+    device: str
+    is_simulated: bool
+    n_frames: Count
+    n_processed: Count
+    n_dropped: Count
+    latency_ms: Amount | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """The duration of the recording."""
+        return self.n_frames / self.rate_hz
+
+
+@dataclass(frozen=True)
 class CostsRecord:
     """``costs`` in the completion record of ``predict``: intermediate maps and the last one, null if not measured.
 
@@ -237,6 +262,7 @@ class CostsRecord:
     device_bytes: Count | None = None
     start_ms: Amount | None = None
     close_ms: Amount | None = None
+    realtime: RealTimeRecord | None = None
 
 
 @dataclass(frozen=True)

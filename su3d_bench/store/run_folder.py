@@ -33,7 +33,7 @@ FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run with files o
 # The files written by a run or by a command that adds to a map; "refined_names.json" is written by refine.
 _RUN_OPTIONS = re.compile(
     r"run\.toml|(run|metrics|ablation)\.json|\.lock|(language|slurm|\.cache)/.+|scenes/[^/]+/[^/]+/("
-    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|updates\.csv"
+    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|(updates|schedule)\.csv"
     r"|log\.txt|done\.json|refined_names\.json|pictures/[^/]+\.png)",
     re.DOTALL,
 )
@@ -178,6 +178,11 @@ class JobFolder:
     @property
     def updates(self) -> Path:
         return self.path / "updates.csv"
+
+    @property
+    def schedule(self) -> Path:
+        """The times of the frames of a real-time run."""
+        return self.path / "schedule.csv"
 
     @property
     def log(self) -> Path:

@@ -34,6 +34,7 @@ PURPOSE = {
     "predictions": "prediction formats of other programs: reading and export",
     "questions": "queries and questions with known answers; reasoning over a map",
     "baselines": "one folder per method: baselines, external programs, the oracle",
+    "online": "evaluation while the camera moves: the real-time clock",
     "runs": "splits a run into jobs, in processes or on clusters; resuming",
     "online": "sessions: a method fed frame by frame by the caller; snapshots, saved states",
     "evaluation": "scores of predictions from files",

@@ -1,0 +1,117 @@
+"""The real-time clock of a run: its settings, its part of the keys, and the schedule of each job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from su3d_bench.core.config import RunConfig
+from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.errors import ConfigError, DataError, counted, printable, reading, shown
+from su3d_bench.core.system.timing import hardware_line
+from su3d_bench.online.clock import QUEUE_SIZE, Schedule, Stream, frame_times, read_costs, read_schedule
+from su3d_bench.store.run_folder import RunFolder
+
+OF_CLOCK = ("queue", "queue_size", "cost")  # settings without effect unless frames arrive in real time
+# Perception of these profiles reads results, so that its time is not that of any perception.
+NOT_TIMED = ("oracle", "stored")
+
+
+def with_clock(config: RunConfig) -> RunConfig:
+    """``config`` with all values of the clock, those of ``--schedule`` read from it; ``ConfigError`` if they conflict.
+
+    A schedule determines the rate, the queue and the stride.
+    """
+    if config.schedule is None and not config.realtime:
+        for name in OF_CLOCK:
+            if getattr(config, name) != RunConfig.model_fields[name].default:
+                raise ConfigError(f"{_flag(config, name)}: has no effect without --realtime HZ")
+        return config
+    if config.schedule is None:
+        if config.queue == "newest" and config.queue_size > 1:
+            raise ConfigError(f"--queue-size {config.queue_size}: 'newest' has one place; choose another --queue")
+        size = config.queue_size or (1 if config.queue == "newest" else QUEUE_SIZE)
+        return config.model_copy(update={"queue_size": size})
+    if config.cost is not None:
+        raise ConfigError("--cost: has no effect with --schedule, which has its own times")
+    stream = read_schedule(_any_schedule(config.schedule)).stream
+    values = {"realtime": stream.rate_hz, **stream.model_dump(include={"queue", "queue_size", "stride"})}
+    for name, value in values.items():
+        if getattr(config, name) not in (RunConfig.model_fields[name].default, value):
+            raise ConfigError(f"{_flag(config, name)}: the schedule has {value}; omit the option")
+    return config.model_copy(update=values)
+
+
+def _flag(config: RunConfig, name: str) -> str:
+    return f"--{name.replace('_', '-')} {getattr(config, name)}"
+
+
+def _any_schedule(place: Path) -> Path:
+    """The file itself, or one of the schedules of a run."""
+    if not place.is_dir():
+        return place
+    found = [job.schedule for job in RunFolder(place).jobs() if job.schedule.is_file()]
+    if not found:
+        raise ConfigError(f"--schedule {shown(place)}: has no schedules; name a run with --realtime, or a schedule.csv")
+    return found[0]
+
+
+def is_measured(config: RunConfig) -> bool:
+    """Whether the durations of updates are measured by the run itself."""
+    return config.realtime > 0 and config.schedule is None and config.cost is None
+
+
+def check_is_timed(config: RunConfig, profile: str, *, uses_captions: bool) -> None:
+    """A ``ConfigError`` if perception would be read from files or replies instead of being timed."""
+    if is_measured(config) and (profile in NOT_TIMED or uses_captions):
+        what = "captions of a language model" if uses_captions else f"profile '{profile}'"
+        raise ConfigError(f"--realtime: {what}: perception is stored, so it cannot be timed; add --cost FILE")
+
+
+def _schedule_file(config: RunConfig, scene: str, method: str) -> Path:
+    assert config.schedule is not None
+    place = config.schedule
+    return RunFolder(place).job(scene, method).schedule if place.is_dir() else place
+
+
+def clock_key(config: RunConfig, scene: str, method: str) -> dict[str, str]:
+    """The part of a prediction's key that describes the clock; a ``DataError`` if the schedule is of another scene."""
+    if not config.realtime:
+        return {}
+    source = "measured"
+    if config.schedule is not None:
+        file = _schedule_file(config, scene, method)
+        stream = read_schedule(file).stream
+        if stream.scene != scene:
+            raise DataError(f"{shown(file)}: is the schedule of {stream.scene}, not of {printable(scene, 200)}")
+        if (stream.rate_hz, stream.stride) != (config.realtime, config.stride):
+            raise DataError(f"{shown(file)}: its rate or stride is not that of the other schedules of the run")
+        source = digest_file(file)
+    elif config.cost is not None:
+        with reading(shown(config.cost), DataError):
+            source = f"simulated {digest_file(config.cost)}"
+        read_costs(config.cost, method)
+    return {"realtime": f"{config.realtime} Hz, {config.queue} {config.queue_size}", "schedule": source}
+
+
+def schedule_of(
+    config: RunConfig, scene: str, method: str, n_frames: int, stride: int, cost_ms: Callable[[int], float] | None
+) -> Schedule:
+    """The schedule of one job: replayed, drawn from the cost file, or with the durations that ``cost_ms`` measures."""
+    if config.schedule is not None:
+        file = _schedule_file(config, scene, method)
+        schedule = read_schedule(file)
+        if len(schedule.times) != n_frames:
+            has = f"has {counted(len(schedule.times), 'frame')}, but {n_frames} arrive"
+            raise DataError(f"{scene}: {shown(file)} {has}; use the same --limit")
+        return schedule
+    device = hardware_line()
+    if config.cost is not None:
+        costs = read_costs(config.cost, method)
+        device, cost_ms = costs.device, costs.draws([config.seed, int(digest_bytes(scene.encode())[:15], 16)])
+    assert cost_ms is not None
+    stream = Stream(
+        scene=printable(scene, 300), method=printable(method, 300), rate_hz=config.realtime, stride=stride,
+        queue=config.queue, queue_size=config.queue_size, device=device, is_simulated=config.cost is not None,
+    )  # fmt: skip
+    return Schedule(stream, frame_times(n_frames, config.realtime, config.queue, config.queue_size, cost_ms))
