@@ -50,6 +50,12 @@ def add_run_options(parser: Parser) -> None:
         action=argparse.BooleanOptionalAction,
     )
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
+    parser.option("--anytime-every N", "also score the map after every N updates", type=int)
+    parser.option(
+        "--seen-so-far",
+        "score each of these maps and the last one also against what the frames until then have shown",
+        action=argparse.BooleanOptionalAction,
+    )
     parser.shared("--set", "--config", "--dry-run", "--format")
     parser.option("--out DIR", "run folder (default: a folder in runs/)", type=output_path)
     into = parser.add_mutually_exclusive_group()
