@@ -65,7 +65,7 @@ def test_names_are_judged_for_seen_objects_only() -> None:
     assert isinstance(some, OpenLexTruth) and list(some.objects) == [5]
 
 
-@pytest.mark.parametrize("name", ["rooms-reasoning", "rooms-presence", "arkit-boxes"])
+@pytest.mark.parametrize("name", ["rooms-reasoning", "rooms-presence", "replica-boxes"])
 def test_protocols_about_the_complete_scene_name_the_reason(name: str) -> None:
     assert reason_against(load_protocol(name))
     assert reason_against(load_protocol("rooms-retrieval")) is None
