@@ -256,12 +256,14 @@ def _anytime(points: Sequence[AnytimePoint], width: Width) -> Figure:
     panels = _curves(points)
     figure, all_axes = figure_with_panels(width, *[2.2] * len(panels))
     several = len({point.run for point in points}) > 1
+    truths = dict.fromkeys(point.truth for point in points)
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
-        curves = dict.fromkeys((point.run, point.method) for point in points)
-        for index, (run, method) in enumerate(curves):
-            mine = [point for point in points if (point.run, point.method, point.protocol) == (run, method, protocol)]
+        curves = dict.fromkeys((point.run, point.method, point.truth) for point in points)
+        for index, (run, method, truth) in enumerate(curves):
+            of_curve = run, method, truth, protocol
+            mine = [point for point in points if (point.run, point.method, point.truth, point.protocol) == of_curve]
             values = [100.0 * value if (value := point.metrics.get(name)) is not None else np.nan for point in mine]
-            label = _label(method, run, several)
+            label = _label(method, run, several) + (f", {truth}" if len(truths) > 1 else "")
             axes.plot([point.seconds for point in mine], values, label=label, **style_of_line(index))
         axes.set(xlabel="seconds until the map was available", ylabel=f"{protocol}: {name} (%)")
         axes.grid(True)

@@ -9,17 +9,22 @@ from typing import Any
 from su3d_bench.core.errors import counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, csv_lines, percent, text_table
 from su3d_bench.metrics.costs import MethodSummary, UpdateTimes
+from su3d_bench.metrics.seen import area_under
 from su3d_bench.numerics.statistics import Growth
 from su3d_bench.store.records import RealTimeRecord
 
 MIB = 2**20
 CACHE = "cache"
 SIZES = ("points", "instances", "frames")
+WHOLE, SEEN, SEEN_CEILING = "whole scene", "seen so far", "seen so far: ceiling"  # what a map is scored against
 
 
 @dataclass(frozen=True)
 class AnytimePoint:
-    """The scores of the map after a share of the updates, and the seconds until then, over all scenes together."""
+    """The scores of the map after a share of the updates, and the seconds until then, over all scenes together.
+
+    ``truth``: the ground truth that the map is scored against; for ``SEEN_CEILING`` that ground truth is the map.
+    """
 
     run: str
     method: str
@@ -27,6 +32,7 @@ class AnytimePoint:
     share: float
     seconds: float
     metrics: Mapping[str, float | None]
+    truth: str = WHOLE
 
 
 def timing_tables(
@@ -123,10 +129,18 @@ def _growth(growth: Growth | None) -> str:
 
 def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
     names = list(dict.fromkeys(name for point in points for name in point.metrics))
-    yield ["run", "method", "protocol", "frames", "seconds", *names]
+    yield ["run", "method", "protocol", "ground truth", "frames", "seconds", *names]
+    curve = list[AnytimePoint]()
     for point in points:
+        curve.append(point)
+        where = [point.run, point.method, point.protocol, point.truth]
         values = [percent(point.metrics[name]) if name in point.metrics else "" for name in names]
-        yield [point.run, point.method, point.protocol, f"{100 * point.share:g} %", f"{point.seconds:.1f}", *values]
+        yield [*where, f"{100 * point.share:.4g} %", f"{point.seconds:.1f}", *values]
+        if point.share == 1:
+            areas = [area_under([(each.share, each.metrics.get(name)) for each in curve]) for name in names]
+            shown = [percent(area) if name in point.metrics else "" for name, area in zip(names, areas, strict=True)]
+            yield [*where, "area", "", *shown]
+            curve.clear()
 
 
 def _real_time_table(times: Sequence[UpdateTimes]) -> Iterator[list[str]]:

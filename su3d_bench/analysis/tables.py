@@ -24,7 +24,7 @@ from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import ANNOTATED_SUFFIX, Measured
 from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
 from su3d_bench.reports.tables.run import found_table
-from su3d_bench.reports.tables.timing import AnytimePoint
+from su3d_bench.reports.tables.timing import SEEN, SEEN_CEILING, WHOLE, AnytimePoint
 from su3d_bench.runs.ablation import read_rows
 from su3d_bench.runs.finished import FinishedRun, is_scores_file, read_run
 from su3d_bench.runs.summary import found_in, without_score
@@ -177,7 +177,8 @@ def _measured(name: str, run: FinishedRun, record: ResultRecord, names: Iterable
 
 
 def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) -> list[AnytimePoint]:
-    """The intermediate maps and the final one of a method in one of ``runs``, if intermediate maps were scored."""
+    """The intermediate maps and the final one of a method in one of ``runs``, if intermediate maps were scored: against
+    the whole ground truth, then against what was seen, and this ground truth itself."""
     run = next(run for run in runs if run.name == times[0].run)
     method = times[0].method
     points = []
@@ -185,20 +186,29 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
         if name != method or not record.anytime or record.result is None:
             continue
         midway = sorted(record.anytime, key=lambda point: point.share)
-        maps = [*((point.share, point.metrics) for point in midway), (1.0, record.result.metrics)]
-        if any(len(of_scene.maps) != len(maps) for of_scene in times):
+        n_maps, is_every = len(midway) + 1, midway[0].n_updates > 0
+        if any(len(each.maps) > n_maps or len(each.maps) < (1 if is_every else n_maps) for each in times):
             continue  # the record of a scene's maps is damaged
-        for index, (share, metrics) in enumerate(maps):
-            seconds = 0.0  # of the updates before the map, and of finishing it; in real time of the recording
-            for of_scene in times:
-                if of_scene.realtime is not None:
-                    seconds += share * of_scene.realtime.duration_s
-                    continue
-                made = of_scene.maps[index]
-                seconds += float(of_scene.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
-            headline = {metric: metrics.get(metric) for metric in record.headline}
-            points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
+        shares = [*(point.share for point in midway), 1.0]
+        seconds = [sum(_seconds_until(one, index, share) for one in times) for index, share in enumerate(shares)]
+        curves = {WHOLE: [*(point.metrics for point in midway), record.result.metrics]}
+        if record.seen is not None and len(record.seen) == n_maps:
+            curves |= {SEEN: [point.metrics for point in record.seen]}
+            curves |= {SEEN_CEILING: [point.ceiling or {} for point in record.seen]}
+        for truth, of_curve in curves.items():
+            for share, until, metrics in zip(shares, seconds, of_curve, strict=True):
+                headline = {metric: metrics.get(metric) for metric in record.headline}
+                points.append(AnytimePoint(run.name, method, protocol, share, until, headline, truth))
     return points
+
+
+def _seconds_until(times: UpdateTimes, index: int, share: float) -> float:
+    """Seconds of the updates before a map, or before the last one if the scene has fewer, and of finishing it; in real
+    time those of the recording."""
+    if times.realtime is not None:
+        return share * times.realtime.duration_s
+    made = times.maps[min(index, len(times.maps) - 1)]
+    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
 
 
 def choose(

@@ -26,6 +26,7 @@ from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.numerics.visibility import visible
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
 from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.maps import names_of
@@ -39,7 +40,6 @@ MAX_WIDTH = 480  # pixels of an image; wider ones are downscaled
 MAX_POINTS = 60_000  # of a map, and of the ground truth
 NEAR_SPACINGS = 3.0  # maximum distance of a pixel to its instance's nearest point, in point spacings
 EVERY_PIXEL = 2  # pixel step on both axes at which instances are looked up
-SEEN_M = 0.05  # maximum distance between a point and the measured surface
 MAX_IDS = 0xFFFF  # rerun's ids have 16 bits; 0 means no instance
 UInt16Array = NDArray[np.uint16]
 # Entity paths; names of methods are only appended below them, so that they cannot collide.
@@ -267,7 +267,7 @@ class Growth:
     def step(self, frame: Frame) -> None:
         """Log what ``frame`` adds to the map."""
         self._own = f"from frame {frame.index:06}"
-        self._is_seen |= in_view(self._owned.cloud.points, frame)
+        self._is_seen |= visible(self._owned.cloud.points, frame)
         is_known = self._first_frame[self._owned.instance] <= frame.index
         self._show(self._is_seen & is_known)
 
@@ -419,21 +419,6 @@ def ids_of(rows: Int64Array) -> UInt16Array:
     [1, 3, 0, 0]
     """
     return np.where((rows >= 0) & (rows < MAX_IDS - 1), rows + 1, 0).astype(np.uint16)
-
-
-def in_view(points: Float32Array, frame: Frame) -> BoolArray:
-    """Which of ``points`` (n, 3) the camera sees: inside its image and close to the measured depth."""
-    height, width = frame.depth_m.shape
-    relative = (points.astype(np.float64) - frame.camera_to_world[:3, 3]) @ frame.camera_to_world[:3, :3]
-    rows = np.flatnonzero(relative[:, 2] > 0)
-    pixels = relative[rows] @ frame.intrinsics.T
-    places = np.rint(pixels[:, :2] / pixels[:, 2:])
-    is_inside = ((places >= 0) & (places < (width, height))).all(axis=1)
-    rows, column_row = rows[is_inside], places[is_inside].astype(np.int64)
-    measured = frame.depth_m[column_row[:, 1], column_row[:, 0]]
-    seen = np.zeros(len(points), np.bool_)
-    seen[rows] = np.abs(relative[rows, 2] - measured) < SEEN_M
-    return seen
 
 
 def smaller(frame: Frame, width: int) -> Frame:

@@ -52,6 +52,12 @@ def add_run_options(parser: Parser) -> None:
         action=argparse.BooleanOptionalAction,
     )
     parser.option("--anytime SHARE...", "also score the map after these fractions of the updates", type=float)
+    parser.option("--anytime-every N", "also score the map after every N updates", type=int)
+    parser.option(
+        "--seen-so-far",
+        "score each of these maps and the last one also against what the frames until then have shown",
+        action=argparse.BooleanOptionalAction,
+    )
     parser.option("--realtime HZ", "frames that arrive per second; those that find no place are dropped", type=positive)
     queues = ("newest", "drop-new", "drop-old")
     parser.option("--queue POLICY", "what waits while the method is busy (default: newest)", choices=queues)

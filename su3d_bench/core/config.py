@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.safe_output import one_line
@@ -127,12 +127,13 @@ class RunConfig(BaseModel):
     ``question_solver``: how reasoning questions are answered, by geometry alone or by the text model of
     ``perception.language``; ``refiner``: how labels n' are chosen, by vote or by that model; ``offline``: no language
     model is called, replies stored with the run are used; ``accept_poses``: also run recordings whose depth contradicts
-    their poses; ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5;
-    ``realtime``: frames that arrive per second, 0: each waits for the method; ``queue`` and ``queue_size`` (0: 1 for
-    ``newest``, otherwise 10): which frames wait while it is busy; ``schedule``: a run or file to replay; ``cost``: a
-    file of durations to simulate;
-    ``executor`` auto: this process for one job, otherwise processes; ``retries``: for a scene whose job
-    died; ``slurm``: KEY=VALUE for submitit; ``memory``: the limit of each worker process, such as 8G.
+    their poses; ``anytime``: fractions of the updates after which the map so far is also scored, such as 0.1 0.25 0.5,
+    or ``anytime_every``: a number of updates between such maps, 0 for none; ``seen_so_far``: score these maps and the
+    last one also against what the frames until then have shown; ``realtime``: frames that arrive per second, 0: each
+    waits for the method; ``queue`` and ``queue_size`` (0: 1 for ``newest``, otherwise 10): which frames wait while it
+    is busy; ``schedule``: a run or file to replay; ``cost``: a file of durations to simulate; ``executor`` auto: this
+    process for one job, otherwise processes; ``retries``: for a scene whose job died; ``slurm``: KEY=VALUE for
+    submitit; ``memory``: the limit of each worker process, such as 8G.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -151,6 +152,8 @@ class RunConfig(BaseModel):
     offline: bool = False
     accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
+    anytime_every: int = Field(default=0, ge=0)
+    seen_so_far: bool = False
     realtime: float = Field(default=0, ge=0, le=1e6, allow_inf_nan=False)
     queue: Literal["newest", "drop-new", "drop-old"] = "newest"
     queue_size: int = Field(default=0, ge=0, le=10_000_000)
@@ -162,10 +165,33 @@ class RunConfig(BaseModel):
     slurm: tuple[str, ...] = ()
     memory: Annotated[str, AfterValidator(_checked_size)] = ""
 
+    @field_validator("anytime_every")
+    @classmethod
+    def _is_alone(cls, every: int, others: ValidationInfo) -> int:
+        if every and others.data.get("anytime"):
+            raise ValueError("not together with anytime; choose one of them")
+        return every
+
     @property
     def shares(self) -> tuple[float, ...]:
         """The fractions of ``anytime``, ascending, without duplicates."""
         return tuple(sorted(set(self.anytime)))
+
+    @property
+    def anytime_text(self) -> str:
+        """Which intermediate maps are scored, for keys; '' if none."""
+        return f"every {self.anytime_every}" if self.anytime_every else str(self.shares) if self.shares else ""
+
+    def anytime_points(self, n_updates: int) -> dict[float, int]:
+        """The intermediate maps of ``n_updates`` updates, ascending: the number of updates before each, by the fraction
+        of the updates, below 1, or with ``anytime_every`` by that number.
+
+        >>> RunConfig(anytime=(0.5, 0.1)).anytime_points(15), RunConfig(anytime_every=5).anytime_points(15)
+        ({0.1: 2, 0.5: 8}, {5: 5, 10: 10})
+        """
+        if self.anytime_every:
+            return {n: n for n in range(self.anytime_every, n_updates, self.anytime_every)}
+        return {share: math.ceil(share * n_updates) for share in self.shares} if n_updates else {}
 
 
 @dataclass(frozen=True)

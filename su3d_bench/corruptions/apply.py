@@ -7,7 +7,7 @@ A corrupted method is written ``METHOD~FAMILY/NAME/SEVERITY``, with ``+`` betwee
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -164,6 +164,11 @@ class CorruptedFrames(Sequence[Frame]):
     def __init__(self, frames: Sequence[Frame], corruption: SceneCorruption) -> None:
         self._frames, self._corruption = frames, corruption
         self._places = corruption.order(len(frames))
+
+    @property
+    def clean(self) -> Iterator[Frame]:
+        """The frames in this order as they were before."""
+        return (self._frames[int(place)] for place in self._places)
 
     def __len__(self) -> int:
         return len(self._places)

@@ -21,6 +21,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import visible_truth
+from su3d_bench.numerics.visibility import SEEN_M
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.refining import refined_digest
 from su3d_bench.questions.solver import answers_digest
@@ -67,13 +68,14 @@ def build_method(part: Part) -> Any:
 
 
 def with_visible_truth(
-    part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
+    part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet] | None
 ) -> Prediction:
     """``prediction``, a map of the method ``part``; computed again for a method that uses ground truth if ``rules``
     need a different one.
 
     This is the case if ``truth`` names its classes differently from the ``first`` ground truth of the dataset, which
-    the map was made from, or if stuff without instances counts. Of OpenLex3D's labels it gets the first synonyms.
+    the map was made from, if ``first`` is None, or if stuff without instances counts. Of OpenLex3D's labels it gets the
+    first synonyms.
     """
     method = build_method(part)
     if isinstance(truth, OpenLexTruth):
@@ -81,7 +83,7 @@ def with_visible_truth(
     if not isinstance(method, UsesGroundTruth) or not isinstance(truth, GroundTruth):
         return prediction
     visible = visible_truth(rules, truth)
-    if visible is truth and truth.labels == first():
+    if first is not None and visible is truth and truth.labels == first():
         return prediction
     method.receive_ground_truth(visible)
     recomputed: Prediction = method.finish()
@@ -169,8 +171,8 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
     if method.needs.frames:
         key |= {"stride": str(stride_of(job, part)), "limit": str(job.config.limit or "none")}
-        if job.config.shares:
-            key["anytime"] = str(job.config.shares)
+        if job.config.anytime_text:
+            key["anytime"] = job.config.anytime_text
         key |= clock_key(job.config, job.scene, part.name)
         sections.append(("perception", job.perception))
     key |= settings_key(sections, method)
@@ -239,6 +241,9 @@ class JobInputs:
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
         key |= {"pictures": str(self.job.config.pictures)}
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
+        if self.job.config.seen_so_far:
+            of_frames = f"limit {self.job.config.limit}, stride {self.info.stride}"
+            key["seen"] = f"{self.job.config.anytime_text}, {of_frames}, within {SEEN_M:g} m"
         if self.job.config.question_solver == "llm" and any(one.answers is not None for one in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.uses_names for protocol in rules.values()) else key

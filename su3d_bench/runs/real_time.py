@@ -27,6 +27,8 @@ def with_clock(config: RunConfig) -> RunConfig:
             if getattr(config, name) != RunConfig.model_fields[name].default:
                 raise ConfigError(f"{_flag(config, name)}: has no effect without --realtime HZ")
         return config
+    if config.anytime_every:
+        raise ConfigError("--anytime-every: in real time updates have no fixed distance; use --anytime SHARE")
     if config.schedule is None:
         if config.queue == "newest" and config.queue_size > 1:
             raise ConfigError(f"--queue-size {config.queue_size}: 'newest' has one place; choose another --queue")

@@ -7,12 +7,12 @@ having ``receive_ground_truth`` (the oracle, from which ceilings are computed).
 from __future__ import annotations
 
 import logging
-import math
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,16 +21,28 @@ from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable, user_code_line
 from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.maps import Prediction, Proposals
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.signals import is_interrupt
 from su3d_bench.core.system.timing import MethodClock, Timer, device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
+from su3d_bench.core.types import (
+    BoolArray,
+    Float64Array,
+    Frame,
+    GroundTruth,
+    InstanceMesh,
+    Int32Array,
+    ObjectBoxes,
+    SceneInfo,
+)
 from su3d_bench.corruptions.apply import CorruptedFrames, CorruptedPerception, SceneCorruption, parse_conditions
 from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import Truth, pack_scores, score_located
+from su3d_bench.metrics.scoring import Truth, pack_scores, score_located, score_scene
+from su3d_bench.metrics.seen import clouds_of, reason_against, restricted
+from su3d_bench.numerics.visibility import first_shown
 from su3d_bench.online.clock import Schedule
 from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
 from su3d_bench.perception.language.client import ChatClient
@@ -148,6 +160,7 @@ class _Scene:
         self.report = report
         self._truths: dict[str, GroundTruth] = {}
         self._corruptions: dict[str, SceneCorruption] = {}
+        self._shown: dict[tuple[int, str], dict[str, list[Int32Array]]] = {}
 
     @cached_property
     def dataset(self) -> Any:
@@ -263,30 +276,27 @@ class _Scene:
         at a time is known only when the next update has been measured.
         """
         frames: Sequence[Frame] = ()
-        shares, doubts, schedule = tuple[float, ...](), tuple[str, ...](), None
+        points, doubts, schedule = dict[float, int](), tuple[str, ...](), None
         if inputs.method.needs.frames:
-            shares, doubts = self.job.config.shares, self.job.doubts or ()
-            frames = self.dataset.frames(self.job.scene_name, inputs.info.stride)
-            frames = frame_loop.ChosenFrames(frames, range(len(frames))[: self.job.config.limit or None])
-            if corruption := self.corruption(part):
-                frames = CorruptedFrames(frames, corruption)
+            frames, doubts = self._frames(part), self.job.doubts or ()
+            points = self.job.config.anytime_points(len(frames))
             if self.job.config.realtime:
                 schedule = self._schedule(part, inputs, frames)
+                points = {share: schedule.n_fed_by(share) for share in points}
                 frames = frame_loop.ChosenFrames(frames, schedule.fed)
         for line in doubts:
             logger.warning("%s", line)
         with self._feeding(part, inputs, inputs.perception, frames) as (feeding, clock):
             n = len(frames)
             with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
-                for share in shares:
-                    n_fed = math.ceil(share * n) if schedule is None else schedule.n_fed_by(share)
+                for point, n_fed in points.items():
                     feeding.feed_until(n_fed, ahead, n)
-                    feeding.write_map(folder.anytime(share))
+                    feeding.write_map(folder.anytime(point))
                 feeding.feed_until(n, ahead, n)
             self.report_activity(part, "finishing the map")
             feeding.write_map(folder.prediction)
         write_text(folder.updates, feeding.updates_text())
-        files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
+        files = [folder.prediction, folder.updates, *map(folder.anytime, points)]
         costs: dict[str, Any] = {
             "maps": feeding.maps,
             "calibration_ms": feeding.calibration_ms,
@@ -362,6 +372,13 @@ class _Scene:
                 with clock.running("close"):
                     method.close()
 
+    def _frames(self, part: jobs.Part) -> frame_loop.ChosenFrames | CorruptedFrames:
+        """The frames that a method gets, or in real time those that arrive."""
+        frames = self.dataset.frames(self.job.scene_name, jobs.stride_of(self.job, part))
+        first = frame_loop.ChosenFrames(frames, range(len(frames))[: self.job.config.limit or None])
+        corruption = self.corruption(part)
+        return CorruptedFrames(first, corruption) if corruption else first
+
     def _true_proposals(self) -> Proposals:
         if not self.dataset.variants:
             raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
@@ -373,12 +390,15 @@ class _Scene:
         """Score under every protocol with ground truth here, draw the map, and record both as complete."""
         prediction = read_prediction(folder.prediction)
         scores, unscored = self.scores(part, inputs.perception.encoder, prediction, folder)
-        files = [folder.counts]
-        write_bytes(folder.counts, pack_scores(scores))
-        for share in self.job.config.shares if jobs.build_method(part).needs.frames else ():
-            early, _ = self.scores(part, inputs.perception.encoder, read_prediction(folder.anytime(share)), None)
-            write_bytes(folder.anytime_counts(share), pack_scores(early))
-            files.append(folder.anytime_counts(share))
+        by_file = {folder.counts: scores}
+        n_updates = int(folder.remarks("predict")["costs"]["maps"][-1]["n_updates"])
+        for point in self.job.config.anytime_points(n_updates):
+            early, _ = self.scores(part, inputs.perception.encoder, read_prediction(folder.anytime(point)), None)
+            by_file[folder.curve_counts("anytime", point)] = early
+        n_seen = self._score_seen(part, inputs, folder, by_file) if part in self.job.methods else 0
+        for file, of_file in by_file.items():
+            write_bytes(file, pack_scores(of_file))
+        files = [*by_file]
         if self.job.config.pictures:
             self.report_activity(part, "drawing the map")
             truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
@@ -389,12 +409,65 @@ class _Scene:
         doubts = predicted.get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
         remarks["caveat"] = jobs.caveat_of(inputs.method, inputs.perception, inputs.info, predicted.get("clock"))
+        remarks |= {"n_updates": n_updates, "n_seen": n_seen}
         folder.mark_complete("score", key, [*files, folder.log], remarks)
 
+    def _score_seen(
+        self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, by_file: dict[Path, dict[str, SceneScore]]
+    ) -> int:
+        """Add the scores of each map, and of the ground truth, against what the frames until then have shown; return
+        the number of these frames, 0 for a method without frames.
+
+        The oracle's own map is at each point what all frames until then have shown.
+        """
+        is_oracle = isinstance(inputs.method, interfaces.UsesGroundTruth)
+        if not self.job.config.seen_so_far or not (inputs.method.needs.frames or is_oracle):
+            return 0
+        self.report_activity(part, "finding what the frames show")
+        shown, n = self._first_shown(part)
+        if not shown:
+            return 0
+        ceiling = self.job.ceiling or next(one for one in self.job.methods if one.name == CEILING_METHOD)
+        perfect, encoder = jobs.build_method(ceiling), inputs.perception.encoder
+        perfect.receive_ground_truth(self.first_truth)
+        for point, n_fed in (*self.job.config.anytime_points(n).items(), (None, n)):
+            seen = {variant: [place < n_fed for place in places] for variant, places in shown.items()}
+            own = folder.prediction if is_oracle or point is None else folder.anytime(point)
+            refined_in = folder if point is None else None
+            of_map, _ = self.scores(part, encoder, read_prediction(own), refined_in, seen)
+            of_truth, _ = self.scores(ceiling, encoder, perfect.finish(), None, seen)
+            by_file[folder.curve_counts("seen", point)] = of_map
+            by_file[folder.curve_counts("ceiling", point)] = of_truth
+        return n
+
+    def _first_shown(self, part: jobs.Part) -> tuple[dict[str, list[Int32Array]], int]:
+        """Which frame that a method gets shows each point first, by variant of the ground truth; and their number.
+
+        A corruption changes only which frames these are: they count as they were before it.
+        """
+        frames, key = self._frames(part), (jobs.stride_of(self.job, part), part.corruption)
+        if key not in self._shown:
+            clouds = {}
+            for rules in map(load_protocol, self.job.protocols):
+                with suppress(GroundTruthMissing):
+                    clouds[rules.ground_truth] = clouds_of(self.truth(rules.ground_truth))
+            clean = frames.clean if isinstance(frames, CorruptedFrames) else iter(frames)
+            places = iter(first_shown([cloud for each in clouds.values() for cloud in each], clean))
+            self._shown[key] = {variant: [next(places) for _ in each] for variant, each in clouds.items()}
+        return self._shown[key], len(frames)
+
     def scores(
-        self, part: jobs.Part, encoder: interfaces.Encoder, prediction: Prediction, refined_in: JobFolder | None
+        self,
+        part: jobs.Part,
+        encoder: interfaces.Encoder,
+        prediction: Prediction,
+        refined_in: JobFolder | None,
+        seen: Mapping[str, Sequence[BoolArray]] | None = None,
     ) -> tuple[dict[str, SceneScore], dict[str, str]]:
-        """The scores under every protocol that can score the map, and why the others cannot."""
+        """The scores under every protocol that can score the map, and why the others cannot.
+
+        ``seen``: the points of each variant of the ground truth to which it is restricted.
+        """
         scores: dict[str, SceneScore] = {}
         unscored: dict[str, str] = {}
         corruption = self.corruption(part)
@@ -406,15 +479,22 @@ class _Scene:
             except GroundTruthMissing as error:
                 unscored[rules.name] = error_line(error)
                 continue
-            if (reason := kind_incompatibility(rules, prediction)) is not None:
+            reason = None if seen is None else reason_against(rules)
+            if (reason := reason or kind_incompatibility(rules, prediction)) is not None:
                 unscored[rules.name] = reason
                 continue
             self.report_activity(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
-            configured = jobs.with_visible_truth(part, rules, truth, prediction, lambda: self.first_truth.labels)
-            known = self._truth_of(rules, truth, refined_in)
+            known: Truth = self._truth_of(rules, truth, refined_in)
+            base: Truth = truth
+            if seen is not None:
+                known, base = (restricted(one, seen[rules.ground_truth]) for one in (known, base))
+            first = None if seen is not None else lambda: self.first_truth.labels
+            configured = jobs.with_visible_truth(part, rules, base, prediction, first)
             names = tuple(rules.prompt_names.get(entry.name, entry.name) for entry in rules.classes)
             asked = rules.with_names(corruption.names(names)) if corruption and corruption.at("names") else rules
-            scores[rules.name] = score_located(asked, known, configured, encoder)
+            # Points far outside what was seen do not mean that the map is in another frame.
+            score = score_located if seen is None else score_scene
+            scores[rules.name] = score(asked, known, configured, encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:

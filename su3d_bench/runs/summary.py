@@ -30,6 +30,7 @@ from su3d_bench.metrics.metric import SceneScore, n_predictions
 from su3d_bench.metrics.protocols.loading import load_protocol, more_protocols_line
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
+from su3d_bench.metrics.seen import area_under, reason_against
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.run import Found, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, record_of_rules
@@ -37,10 +38,11 @@ from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan, usual_protocols
 from su3d_bench.store import records
 from su3d_bench.store.predictions import read_prediction
-from su3d_bench.store.run_folder import JobFolder, RunFolder
+from su3d_bench.store.run_folder import Curve, JobFolder, RunFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
 Outcomes = Sequence[MethodOutcome]
+Points = Sequence[tuple[float, float | None]]  # share of the updates, and the point of ``JobFolder.curve_counts``
 COMPUTED_BY_METHOD = "computed by the method"
 
 
@@ -63,14 +65,18 @@ def summarise(plan: Plan, outcomes: Outcomes) -> records.MetricsRecord:
     for method in plan.methods:
         mine = by_method.get(method, ())
         scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, attrgetter("counts"))
-        early = {
-            share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
-            for share in plan.config.shares
-        }
+        points: dict[Curve, Points] = {}
+        if plan.config.anytime_text:
+            points["anytime"] = _points(plan, mine, "n_updates")
+        if plan.config.seen_so_far:
+            points["seen"] = [*_points(plan, mine, "n_seen"), (1.0, None)]
+        scores_at = cache(partial(_scores_at, plan, mine))
         for rule in rules.values():
-            result = _result(plan, method, rule, mine, scores, early)
+            result = _result(plan, method, rule, mine, scores)
             scored = tuple(result.result.scenes) if result.result else ()
-            results[rule.name, method] = replace(result, ceiling=ceiling(rule.name, scored))
+            result = replace(result, ceiling=ceiling(rule.name, scored))
+            metrics_at = partial(_metrics_at, scores_at, rule, scored)
+            results[rule.name, method] = with_curves(result, points, metrics_at)
     return records.MetricsRecord(
         is_partial=plan.is_partial,
         limit=plan.config.limit,
@@ -96,23 +102,66 @@ def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -
     return plain_json(combined_metrics(rules, of_scenes)) if of_scenes and len(of_scenes) == len(scenes) else None
 
 
-def _result(
-    plan: Plan, method: str, rules: ProtocolRules, outcomes: Outcomes, scores: Scores, early: Mapping[float, Scores]
+def _points(plan: Plan, outcomes: Outcomes, n_of_scene: str) -> Points:
+    """The intermediate maps of the scene with most updates, whose number the remarks on its scores have."""
+    folders = [plan.folder.job(outcome.scene, outcome.method) for outcome in outcomes if outcome.error is None]
+    n = max((int(folder.remarks("score").get(n_of_scene, 0)) for folder in folders), default=0)
+    return [(point if point < 1 else point / n, point) for point in plan.config.anytime_points(n)]
+
+
+def _scores_at(plan: Plan, outcomes: Outcomes, curve: Curve, point: float | None) -> Scores:
+    return _read_scores(plan, outcomes, partial(JobFolder.reached_counts, curve=curve, point=point))
+
+
+def _metrics_at(
+    scores_at: Callable[[Curve, float | None], Scores], rules: ProtocolRules, scenes: Sequence[str],
+    curve: Curve, point: float | None,
+) -> Any:  # fmt: skip
+    return _metrics_over(scenes, rules, scores_at(curve, point))
+
+
+def with_curves(
+    result: records.ResultRecord, points: Mapping[Curve, Points], metrics_at: Callable[[Curve, float | None], Any]
 ) -> records.ResultRecord:
-    """The result without its ceiling; intermediate maps count if all scenes of the final one are scored."""
+    """``result`` with the curves of ``points`` and the areas under them; points of which ``metrics_at`` has no metrics
+    are omitted, as when a scene is not scored."""
+    of_curve = {
+        curve: [(share, found, int(point or 0), point) for share, point in of if (found := metrics_at(curve, point))]
+        for curve, of in points.items()
+    }
+    anytime = tuple(records.MidwayRecord(*row[:3]) for row in of_curve.get("anytime", ()))
+    seen = tuple(records.SeenRecord(*row[:3], metrics_at("ceiling", row[3])) for row in of_curve.get("seen", ()))
+    lines: dict[str, list[tuple[float, records.Values]]] = {}
+    if anytime and result.result is not None:
+        lines["anytime"] = [*((point.share, point.metrics) for point in anytime), (1.0, result.result.metrics)]
+    if len(seen) > 1:
+        lines["seen"] = [(point.share, point.metrics) for point in seen]
+        lines["ceiling"] = [(point.share, point.ceiling or {}) for point in seen]
+    areas = {
+        curve: {name: area_under([(share, values.get(name)) for share, values in line]) for name in result.headline}
+        for curve, line in lines.items()
+    }
+    return replace(
+        result,
+        anytime=anytime if "anytime" in points else None,
+        seen=seen if "seen" in points else None,
+        areas=areas or None,
+    )
+
+
+def _result(plan: Plan, method: str, rules: ProtocolRules, outcomes: Outcomes, scores: Scores) -> records.ResultRecord:
+    """The result without its ceiling and curves."""
     planned = dict.fromkeys(
         job.scene for job in plan.jobs if any(load_protocol(name).name == rules.name for name in job.protocols)
     )
     mine = {outcome.scene: outcome for outcome in outcomes if outcome.scene in planned}
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
     failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
-    scenes = [scene for protocol, scene in scores if protocol == rules.name]
     doubts = tuple(line for scene in sorted(scored) for line in mine[scene].doubts)
     numbers = records.NumbersRecord(**combine(rules, scored).to_json()) if scored else None
     if numbers is not None:
         numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
     encoder = _join(outcome.encoder for outcome in mine.values() if outcome.profile is not None)
-    midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
     return records.ResultRecord(
         method=method,
         protocol=rules.name,
@@ -128,7 +177,6 @@ def _result(
         unscored=tuple(scene for scene in planned if scene not in scored and scene not in failed),
         ceiling=None,
         result=numbers,
-        anytime=tuple(records.MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
         confidences=None if numbers is None else confidences_of(rules, numbers),
         labels=None if numbers is None else labels_counted(rules, by_features=encoder is not None),
     )
@@ -203,6 +251,9 @@ def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str
     lines = [line for outcome in outcomes for line in outcome.warnings]
     unscored = _unscored(outcomes)
     lines += not_scored_lines(unscored)
+    if plan.config.seen_so_far:
+        reasons = {rules.name: reason_against(rules) for rules in plan.rules}
+        lines += [f"{name}: not scored against what was seen: {reason}" for name, reason in reasons.items() if reason]
     # A table shows its caveat below it; scenes that no protocol scores have no table.
     has_table = {(one.method, one.caveat) for one in outcomes if (one.scene, one.method) not in without_score}
     caveats: dict[str, dict[str, None]] = {}

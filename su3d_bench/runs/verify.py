@@ -31,10 +31,10 @@ from su3d_bench.reports.tables.model import is_ceiling
 from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.job import Part, build_method, options_model, sees_profile
-from su3d_bench.runs.summary import confidences_of
+from su3d_bench.runs.summary import Points, confidences_of, with_curves
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, CompletionRecord, NumbersRecord, ResultRecord, plain
-from su3d_bench.store.run_folder import JobFolder
+from su3d_bench.store.run_folder import Curve, JobFolder
 
 # Values in metrics.json that must follow from the counts. Intervals and warnings may change without a new version of
 # the protocol: those of the counts are shown.
@@ -209,12 +209,18 @@ def _recomputed(
     rules, is_elsewhere = run.rules(protocol, to_the_letter=True), record.method in run.external
     numbers = NumbersRecord(**combine(rules, counts).to_json())
     truths = {scene: perfect.get(protocol, {}).get(scene) for scene in counts}
-    written = plain(stated) | {"ceiling": record.ceiling or {}, "anytime": {}}
-    known = plain(numbers) | {"ceiling": _metrics(rules, truths), "anytime": {}}
-    for point in record.anytime or ():
-        of_share = run.scores(record.method, partial(JobFolder.anytime_counts, share=point.share)).get(protocol, {})
-        known["anytime"][f"{point.share:g}"] = _metrics(rules, {scene: of_share.get(scene) for scene in counts})
-        written["anytime"][f"{point.share:g}"] = point.metrics
+    written = plain(stated) | {"ceiling": record.ceiling or {}} | _curve_values(record)
+
+    def metrics_at(curve: Curve, point: float | None) -> dict[str, float | None]:
+        at_point = run.scores(record.method, partial(JobFolder.reached_counts, curve=curve, point=point))
+        return _metrics(rules, {scene: at_point.get(protocol, {}).get(scene) for scene in counts})
+
+    points: dict[Curve, Points] = {
+        "anytime": [(one.share, one.n_updates or one.share) for one in record.anytime or ()],
+        "seen": [(one.share, None if one.share == 1 else one.n_updates or one.share) for one in record.seen or ()],
+    }
+    curves = _curve_values(with_curves(replace(record, result=numbers), points, metrics_at))
+    known = plain(numbers) | {"ceiling": _metrics(rules, truths)} | curves
     fault = contradiction(written, known)
     if (stated.n_scenes, set(stated.scenes), record.version) != (len(counts), set(counts), rules.version):
         fault = f"it has {stated.n_scenes} scenes of version {record.version}, the counts {len(counts)}"
@@ -232,6 +238,15 @@ def _recomputed(
     return recomputed, fault and f"metrics.json does not follow from the counts: {fault}"
 
 
+def _curve_values(record: ResultRecord) -> dict[str, Any]:
+    """The values of the curves by table, point and metric."""
+    return {
+        "anytime": {f"{one.share:g}": one.metrics for one in record.anytime or ()},
+        "seen": {f"{one.share:g}": {"map": one.metrics, "ceiling": one.ceiling or {}} for one in record.seen or ()},
+        "areas": record.areas or {},
+    }
+
+
 def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> dict[str, float | None]:
     """The metrics over these scenes; empty if one has no counts."""
     whole = {scene: score for scene, score in scores.items() if score is not None}
@@ -240,7 +255,7 @@ def _metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore | None]) -> d
 
 def contradiction(written: Mapping[str, Any], known: Mapping[str, Any]) -> str | None:
     """The first value of ``written`` that differs from ``known``; None if none."""
-    for table in (*CHECKED_FIELDS, "ceiling", "anytime"):
+    for table in (*CHECKED_FIELDS, "ceiling", "anytime", "seen", "areas"):
         values = dict(flatten(known[table]))
         for where, value in flatten(written[table]):
             if where not in values or not _agree(value, values[where]):

@@ -167,17 +167,31 @@ class NumbersRecord:
 
 @dataclass(frozen=True)
 class MidwayRecord:
-    """The metrics of the maps after the fraction ``share`` of the updates."""
+    """The metrics of the maps after the fraction ``share`` of the updates.
+
+    ``n_updates``: after this number of updates, of which ``share`` is the fraction in the longest scene; 0 if fractions
+    were requested.
+    """
 
     share: Share
     metrics: Values
+    n_updates: Count = 0
+
+
+@dataclass(frozen=True)
+class SeenRecord(MidwayRecord):
+    """The same against the ground truth restricted to what the frames until then have shown; ``ceiling``: its own."""
+
+    ceiling: Values | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRecord:
     """One method under one protocol; ``encoder`` is null if the method labelled its instances itself.
 
-    ``result`` is null if no scene was scored; ``anytime`` is missing if no intermediate map was requested;
+    ``result`` is null if no scene was scored; ``anytime`` is missing if no intermediate map was requested, ``seen`` if
+    they were not scored against what was seen, the last point for the last map; ``areas`` of the headline metrics are
+    those under the curves ``anytime``, ``seen`` and the ``ceiling`` of the latter, by curve and metric.
     ``confidences``: what ranked the predictions for average precision, null without that metric. ``labels``: how many
     labels per mask or point count, null if labels are not scored, or if an older run did not record it.
     """
@@ -197,6 +211,8 @@ class ResultRecord:
     ceiling: Values | None
     result: NumbersRecord | None
     anytime: tuple[MidwayRecord, ...] | None = None
+    seen: tuple[SeenRecord, ...] | None = None
+    areas: Mapping[str, Values] | None = None
     confidences: str | None = None
     labels: str | None = None
 
@@ -285,8 +301,9 @@ def plain(record: Any) -> dict[str, Any]:
     if isinstance(record, RunRecord) and record.ground_truth is None:
         del written["predictions"], written["ground_truth"]
     for result in written["results"] if isinstance(record, MetricsRecord) else ():
-        if result["anytime"] is None:
-            del result["anytime"]
+        for name in ("anytime", "seen", "areas"):
+            if result[name] is None:
+                del result[name]
     for protocol in written["protocols"] if isinstance(record, RunRecord) else ():
         if protocol["rules"] is None:
             del protocol["rules"]

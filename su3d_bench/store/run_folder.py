@@ -14,17 +14,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, shown
-from su3d_bench.core.files.atomic import make_folder, read_json, write_error, write_json
+from su3d_bench.core.files.atomic import is_file, make_folder, read_json, write_error, write_json
 from su3d_bench.core.files.locks import LOCK_FILE, clear_unfinished, hold_folder, is_unfinished, temporary_path
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import SCHEMA, CompletionRecord, checked, plain
 
+# Maps scored against the whole ground truth, against what the frames until then had shown, and the latter as a map.
+Curve = Literal["anytime", "seen", "ceiling"]
 JOBS = "scenes"
 SHARED_FOLDERS = ("language", "language/images")  # written by all jobs of a run; a job clears its own folders
 MARKS = ("run.toml", "run.json")  # files that identify a run folder; a run writes the first one first
@@ -33,7 +35,8 @@ FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run with files o
 # The files written by a run or by a command that adds to a map; "refined_names.json" is written by refine.
 _RUN_OPTIONS = re.compile(
     r"run\.toml|(run|metrics|ablation)\.json|\.lock|(language|slurm|\.cache)/.+|scenes/[^/]+/[^/]+/("
-    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|(updates|schedule)\.csv"
+    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|(updates|schedule)\.csv"
+    r"|((anytime|seen|ceiling)(-[0-9.e+-]+)?-)?counts\.npz"
     r"|log\.txt|done\.json|refined_names\.json|pictures/[^/]+\.png)",
     re.DOTALL,
 )
@@ -163,13 +166,20 @@ class JobFolder:
     def prediction(self) -> Path:
         return self.path / "prediction.npz"
 
-    def anytime(self, share: float) -> Path:
-        """The map after the first fraction ``share`` of the updates."""
-        return self.path / f"anytime-{share:g}.npz"
+    def anytime(self, point: float) -> Path:
+        """The map after the first fraction ``point`` of the updates if it is below 1, otherwise after that many."""
+        return self.path / f"anytime-{point:g}.npz"
 
-    def anytime_counts(self, share: float) -> Path:
-        """The counts of that map."""
-        return self.path / f"anytime-{share:g}-counts.npz"
+    def curve_counts(self, curve: Curve, point: float | None) -> Path:
+        """The counts of that map, or of the last one if ``point`` is None."""
+        at = "" if point is None else f"-{point:g}"
+        return self.counts if (curve, point) == ("anytime", None) else self.path / f"{curve}{at}-counts.npz"
+
+    def reached_counts(self, curve: Curve, point: float | None) -> Path:
+        """The same to read: a scene with fewer updates than ``point`` counts with its last map."""
+        file = self.curve_counts(curve, point)
+        has_ended = point is not None and point >= 1 and not is_file(file)
+        return self.curve_counts(curve, None) if has_ended else file
 
     @property
     def counts(self) -> Path:

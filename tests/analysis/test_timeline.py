@@ -18,7 +18,7 @@ from painted_runs import painted_run, see_painted
 
 from su3d_bench.analysis import timeline as places
 from su3d_bench.analysis.page.maps import Spaces
-from su3d_bench.analysis.timeline import MAX_POINTS, SEEN_M, Recording, SceneTimeline, in_view
+from su3d_bench.analysis.timeline import MAX_POINTS, Recording, SceneTimeline
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
 from su3d_bench.runs.finished import read_run
@@ -137,11 +137,6 @@ def test_masks_have_the_size_of_their_photo_and_are_not_empty(run: Path) -> None
 def frame(depth_m: float = 2.0, size: tuple[int, int] = (40, 60)) -> Frame:
     intrinsics = np.array([[50.0, 0, 29.5], [0, 50.0, 19.5], [0, 0, 1]])
     return Frame(0, 0.0, np.zeros((*size, 3), np.uint8), np.full(size, depth_m, np.float32), np.eye(4), intrinsics)
-
-
-def test_point_is_in_view_only_if_the_camera_measured_it() -> None:
-    points = np.array([[0, 0, 2], [0, 0, 2 + 2 * SEEN_M], [0, 0, 1], [9, 0, 2], [0, 0, -2]], np.float32)
-    assert in_view(points, frame()).tolist() == [True, False, False, False, False]
 
 
 def test_logged_content_reaches_the_library_at_its_place_and_time() -> None:

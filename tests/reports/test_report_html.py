@@ -34,7 +34,7 @@ HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     methods = (COLLECTOR, f"{COLLECTOR}@noise_m=0.3")
-    return painted_run(tmp_path_factory.mktemp("page") / "run", "--anytime", "0.5", methods=methods)
+    return painted_run(tmp_path_factory.mktemp("page") / "run", "--anytime", "0.5", "--seen-so-far", methods=methods)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,8 @@ def test_page_has_the_numbers_of_metrics_json(run: Path, page: str) -> None:
         for name in ("metrics", "intervals", "per_scene", "per_class", "coverage"):
             assert shown["result"][name] == stored["result"][name]
         assert shown["ceiling"] == stored["ceiling"]
-        assert [one["metrics"] for one in shown["anytime"]] == [one["metrics"] for one in stored["anytime"]]
+        for curve in ("anytime", "seen"):
+            assert [one["metrics"] for one in shown[curve]] == [one["metrics"] for one in stored[curve]]
 
 
 def test_page_begins_with_its_date_version_and_command(page: str) -> None:

@@ -22,7 +22,7 @@ from su3d_bench.store.records import MapCost
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return painted_run(tmp_path_factory.mktemp("timing") / "run", "--anytime", "0.5", "0.1")
+    return painted_run(tmp_path_factory.mktemp("timing") / "run", "--anytime", "0.5", "0.1", "--seen-so-far")
 
 
 def times(total_ms: Float64Array, **columns: Float64Array) -> UpdateTimes:
@@ -103,7 +103,10 @@ def test_timing_report_prints_tables_and_writes_plots(
 ) -> None:
     assert main(["report", "timing", str(run), "--out", str(tmp_path), "--warm-up", "1"]) == 0
     shown = capsys.readouterr().out
-    assert shown.count("| collector |") == 1 + 2 * 3
+    assert shown.count("| collector |") == 1 + 2 * 3 * 4  # three curves of two protocols, with their areas
+    rows = [[cell.strip() for cell in line.split("|")] for line in shown.splitlines()]
+    seen = [row[5:] for row in rows if row[3:5] == ["rooms-semantic", "seen so far: ceiling"]]
+    assert [row[0] for row in seen] == ["10 %", "50 %", "100 %", "area"] and {row[2] for row in seen} == {"100.0"}
     assert "12 updates of 2 scenes" in shown
     assert "| exponent by instances |" in shown
     rows = list(csv.DictReader((tmp_path / "timing.csv").open()))

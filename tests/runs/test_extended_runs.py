@@ -68,6 +68,8 @@ CANNOT_JOIN = {
     "--set perception.naming.temperature=0.5": "perception.naming.temperature was 0.05, now 0.5",
     "--profile oracle": 'profile was "auto", now "oracle"',
     "--anytime 0.5": "anytime was [], now [0.5]",
+    "--anytime-every 2": "anytime_every was 0, now 2",
+    "--seen-so-far": "seen_so_far was false, now true",
 }
 
 

@@ -95,12 +95,16 @@ function anytime(section) {
   }
   function draw() {
     const name = metric.input.value;
-    const lines = midway.filter((one) => one.protocol === protocols.protocol()).map((one) => {
-      const shares = one.anytime.map((each) => [each.share, each.metrics[name]]);
-      const points = [...shares, [1, one.result.metrics[name]]].filter(([, value]) => isNumber(value))
-        .sort((a, b) => a[0] - b[0]);
-      return { name: nameOf(one), style: styleOf(one.run, one.method), x: points.map(([share]) => 100 * share),
+    const line = (label, shares, style) => {
+      const points = shares.filter(([, value]) => isNumber(value)).sort((a, b) => a[0] - b[0]);
+      return { name: label, style, x: points.map(([share]) => 100 * share),
         y: points.map(([, value]) => (isCount(name) ? value : 100 * value)) };
+    };
+    const lines = midway.filter((one) => one.protocol === protocols.protocol()).flatMap((one) => {
+      const style = styleOf(one.run, one.method), of = (curve) => curve.map((each) => [each.share, each.metrics[name]]);
+      const whole = line(nameOf(one), [...of(one.anytime), [1, one.result.metrics[name]]], style);
+      if (!one.seen.length) return [whole];
+      return [whole, line(`${nameOf(one)}, seen so far`, of(one.seen), style + SIDES.length)];
     });
     place.replaceChildren(linePlot({ label: `${name} of intermediate maps`, lines,
       xLabel: 'percentage of frames', yLabel: isCount(name) ? name : `${name} in per cent` }));

@@ -104,7 +104,7 @@ LEFT_OUT = (
     f"comparisons (compare) and all maps except those of the first scenes, at most {MAX_MAPS}"
 )
 # Fields of a result record that the page shows elsewhere, or not at all.
-NOT_SHOWN = ("encoder_digest", "anytime")
+NOT_SHOWN = ("encoder_digest", "anytime", "seen", "areas")
 NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean")
 
 
@@ -154,7 +154,7 @@ def _shown(result: ResultRecord) -> dict[str, Any]:
     shown: dict[str, Any] = {key: value for key, value in plain(result).items() if key not in NOT_SHOWN}
     if result.result is not None:
         shown["result"] = {key: value for key, value in shown["result"].items() if key not in NUMBERS_NOT_SHOWN}
-    return shown | {"anytime": [plain(midway) for midway in result.anytime or ()]}
+    return shown | {curve: list(map(plain, getattr(result, curve) or ())) for curve in ("anytime", "seen")}
 
 
 def _about(run: FinishedRun) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -219,6 +220,21 @@ class Twins(Painted):
 
     name = "twins"
     painted_as: ClassVar[dict[str, str]] = {"a/b": "a", "a_b": "b", "a%2Fb": "c"}
+
+
+class Noisy(Painted):
+    """Scenes whose depth has 2 cm of noise and holes; b has half as many frames."""
+
+    name = "noisy"
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        return _Frames(self, scene, range(0, self.options.n_frames // (2 if scene == "b" else 1), stride))
+
+    def frame(self, scene: str, index: int) -> Frame:
+        frame, rng = super().frame(scene, index), np.random.default_rng(index)
+        noisy = frame.depth_m + 0.02 * rng.standard_normal(frame.depth_m.shape)
+        depth_m = np.where(rng.random(frame.depth_m.shape) < 0.1, 0, noisy)
+        return replace(frame, depth_m=depth_m.astype(np.float32))
 
 
 class SlashCollector(Collector):
