@@ -1,15 +1,14 @@
-"""``su3d-bench report html``, ``rerun``, ``bundle`` and ``verify``: pages, recordings and archives of finished runs."""
+"""``su3d-bench report html``, ``bundle`` and ``verify``: pages and archives of finished runs."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 from su3d_bench.cli import output
-from su3d_bench.cli.options import Verbs, add_verb, count, output_path
+from su3d_bench.cli.options import Verbs, add_verb, output_path
 from su3d_bench.cli.output import answer_either, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
@@ -29,10 +28,6 @@ def add_pages(verbs: Verbs) -> None:
         "--max-size-mb MB", "maximum page size; maps are thinned to fit (default: 30)", type=float, default=30.0
     )
     parser.shared("--jobs")
-    parser = add_verb(verbs, "rerun", call_rerun, data=True)
-    parser.shared("run", "--scenes", "--methods")
-    parser.option("--stride N", "use every Nth frame (default: at most 60 frames per scene)", type=count)
-    parser.option("--out FILE", ".rrd file to write", type=output_path, required=True)
 
 
 def add_archives(verbs: Verbs) -> None:
@@ -90,46 +85,6 @@ def call_html(arguments: argparse.Namespace) -> None:
     n_bytes = len(page.encode())
     value = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "max_points": contents.max_points}
     answer_either(arguments, value, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
-
-
-def call_rerun(arguments: argparse.Namespace) -> None:
-    """Export frames, masks, maps and ground truth of a run for the viewer Rerun (rerun.io).
-
-    su3d-bench report rerun runs/my-run --out my-run.rrd
-    su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
-    """
-    from su3d_bench.analysis.page.maps import Spaces
-    from su3d_bench.analysis.timeline import Recording, SceneTimeline, check_not_empty, rerun_sdk
-    from su3d_bench.core.files.atomic import make_folder, replacing
-    from su3d_bench.human_eval.sources import chosen_of
-    from su3d_bench.runs.executors import Event
-    from su3d_bench.runs.finished import read_run
-
-    if arguments.out.suffix != ".rrd" or arguments.out.is_dir():
-        raise ConfigError(f"--out {printable(str(arguments.out), 200)}: expected a file name that ends in .rrd")
-    run = read_run(arguments.run)
-    scenes = chosen_of(run, "scene", arguments.scenes, run.scenes)
-    methods = chosen_of(run, "method", arguments.methods, run.methods)
-    sdk = rerun_sdk()
-    spaces = Spaces(())
-    timelines = [SceneTimeline(run, scene, methods, arguments.stride or 0, spaces) for scene in scenes]
-    make_folder(arguments.out.parent)
-    with output.progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
-        for one in timelines:
-            on_progress = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
-            one.write(Recording(sdk, one.scene, methods, stream), on_progress)
-        check_not_empty(timelines, run.name)
-    for one in timelines:
-        remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)
-    n_bytes, n_frames = arguments.out.stat().st_size, sum(one.n_frames for one in timelines)
-    n_maps = sum(one.n_maps for one in timelines)
-    about = {
-        "file": str(arguments.out), "n_bytes": n_bytes, "rerun": str(sdk.__version__), "n_frames": n_frames,
-        "n_maps": n_maps, "scenes": list(scenes), "methods": list(methods),
-    }  # fmt: skip
-    shown = f"{counted(len(scenes), 'scene')}, {counted(n_maps, 'map')}, {counted(n_frames, 'frame')}"
-    how = f"open it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)"
-    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}", how)
 
 
 def call_bundle(arguments: argparse.Namespace) -> None:

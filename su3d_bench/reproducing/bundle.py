@@ -45,8 +45,10 @@ MAX_MEMBERS = 200_000
 MAX_MANIFEST = 64 << 20
 MAX_REMARK_CHARACTERS = 400  # characters
 PIECE = 1 << 20
-_JOB_OPTIONS = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|(updates|schedule)\.csv|log\.txt|done\.json"
-                       r"|((anytime|seen|ceiling)(-[0-9.e+-]+)?-)?counts\.npz|refined_names\.json")  # fmt: skip
+_JOB_OPTIONS = re.compile(
+    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|(updates|schedule)\.csv|log\.txt|done\.json"
+    r"|((anytime|seen|ceiling)(-[0-9.e+-]+)?-)?counts\.npz|refined_names\.json"
+)
 _FILE_OF_RUN = re.compile(
     f"{'|'.join(map(re.escape, RECORDS))}|language/.+|{JOBS}/[^/]+/[^/]+/({_JOB_OPTIONS.pattern})"
 )

@@ -105,7 +105,9 @@ def test_session_equals_run_also_saved_and_continued_midway(walk: Walk, method: 
         assert_same(s.snapshot().prediction, expected)
 
 
-@pytest.mark.parametrize("method", ["opensu3d", "conceptgraphs-detector", "sam3d@incremental", "conceptfusion", IN_MEMORY])
+@pytest.mark.parametrize(
+    "method", ["opensu3d", "conceptgraphs-detector", "sam3d@incremental", "conceptfusion", IN_MEMORY]
+)
 def test_snapshot_while_updates_go_on_is_the_map_of_its_frame(walk: Walk, method: str) -> None:
     with su3d.session(method, walk.info) as s:
         for frame in walk.frames[:3]:

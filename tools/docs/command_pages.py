@@ -36,7 +36,6 @@ MORE = {
     "report tables": "`report verify` recomputes every cell.",
     "report claims": "Definitions: [Statements of the paper](methods/paper-statements.md).",
     "report html": "See [HTML report](running/html-report.md).",
-    "report rerun": "See [Rerun export](running/rerun.md).",
     "report leaderboard": "Runs are comparable if protocol, data and number of labels agree.",
     "dev registry add": "Entries with other rules, data, encoders or duplicate names are rejected: "
     "[Registry of results](running/registry.md).",
