@@ -80,14 +80,14 @@ def _value(array: NDArray[Any], k: int) -> str:
 def _of_maps(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of the maps of a run by this program, on this machine or another."""
     encoder = run.encoder(device_of(run))
-    for job in _jobs(run):
+    for job in jobs_of(run):
         run.dataset(job.scene)  # raises if the data here differ
         for part in job.methods:
             if is_file(run.folder.job(job.scene, part.name).counts):
                 yield job.scene, part.name, scores_again(job, part, encoder)
 
 
-def _jobs(run: FinishedRun) -> Sequence[SceneJob]:
+def jobs_of(run: FinishedRun) -> Sequence[SceneJob]:
     """The jobs of a run with its folder here; machine settings are dropped, no image model is loaded."""
     settings = tuple(
         entry for entry in run.data.settings.entries

@@ -28,6 +28,7 @@ def add_parser(verbs: Verbs) -> None:
     actions = add_group(verbs, "report", add_parser)
     _add_tables(actions)
     _add_timing(actions)
+    _add_identity(actions)
     report_files.add_pages(actions)
     _add_instances(actions)
     _add_claims(actions)
@@ -152,6 +153,26 @@ def call_timing(arguments: argparse.Namespace) -> None:
     pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out, arguments.width)
     files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
     remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
+
+
+def _add_identity(verbs: Verbs) -> None:
+    parser = add_verb(verbs, "identity", call_identity, data=True)
+    parser.shared("run", "--methods", "--protocols", "--format")
+
+
+def call_identity(arguments: argparse.Namespace) -> None:
+    """Report whether instances keep their ids over time: HOTA, OWTA, IDF1 and STQ.
+
+    su3d-bench run --scenes homes/tuning0 --methods opensu3d --anytime-every 4 --out runs/over-time
+    su3d-bench report identity runs/over-time
+    """
+    from su3d_bench.analysis.identity import identities, identity_table
+    from su3d_bench.runs.verify import read_checked
+
+    run = read_checked(arguments.run)
+    with output.progress(len(run.scenes), is_quiet=arguments.quiet) as report:
+        found = identities(run, arguments.methods, arguments.protocols, report)
+    output.answer_tables(arguments, {"methods": list(map(asdict, found))}, [identity_table(found)])
 
 
 def _add_instances(verbs: Verbs) -> None:

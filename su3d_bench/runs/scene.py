@@ -104,6 +104,19 @@ def scores_again(job: jobs.SceneJob, part: jobs.Part, encoder: interfaces.Encode
     return scores
 
 
+def maps_over_time(
+    job: jobs.SceneJob, part: jobs.Part, variant: str, report: Report
+) -> tuple[list[tuple[Path, int]], GroundTruth, Int32Array]:
+    """The intermediate maps and the last one of ``part``, each with the number of frames shown until then; the ground
+    truth; and for each of its points the place of the first frame that shows it."""
+    scene = _Scene(job, report)
+    scene.report_activity(part, "finding what the frames show")
+    shown, n = scene.first_shown(part)
+    folder = RunFolder(job.folder).job(job.scene, part.name)
+    maps = [(folder.anytime(point), n_shown) for point, n_shown in job.config.anytime_points(n).items()]
+    return [*maps, (folder.prediction, n)], scene.truth(variant), shown[variant][0]
+
+
 def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     """The one place where a scene's failure, of any kind, is recorded instead of ending the run."""
     job = scene.job
@@ -424,7 +437,7 @@ class _Scene:
         if not self.job.config.seen_so_far or not (inputs.method.needs.frames or is_oracle):
             return 0
         self.report_activity(part, "finding what the frames show")
-        shown, n = self._first_shown(part)
+        shown, n = self.first_shown(part)
         if not shown:
             return 0
         ceiling = self.job.ceiling or next(one for one in self.job.methods if one.name == CEILING_METHOD)
@@ -440,7 +453,7 @@ class _Scene:
             by_file[folder.curve_counts("ceiling", point)] = of_truth
         return n
 
-    def _first_shown(self, part: jobs.Part) -> tuple[dict[str, list[Int32Array]], int]:
+    def first_shown(self, part: jobs.Part) -> tuple[dict[str, list[Int32Array]], int]:
         """Which frame that a method gets shows each point first, by variant of the ground truth; and their number.
 
         A corruption changes only which frames these are: they count as they were before it.

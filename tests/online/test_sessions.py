@@ -335,17 +335,17 @@ def test_every_damage_of_a_saved_session_is_one_line(method: str, tmp_path: Path
     assert len(files) >= 3
     generator = np.random.default_rng(0)
     for n, file in enumerate(files * 4):
-        spoilt = tmp_path / f"copy-{n}"
-        shutil.copytree(tmp_path / "whole", spoilt)
-        content = bytearray((spoilt / file).read_bytes())
+        damaged = tmp_path / f"copy-{n}"
+        shutil.copytree(tmp_path / "whole", damaged)
+        content = bytearray((damaged / file).read_bytes())
         if n < len(files):
             content = content[: len(content) // 2]
         elif n < 2 * len(files):
             content.clear()
         else:
             content[int(generator.integers(len(content)))] ^= 0x80
-        (spoilt / file).write_bytes(content)
-        refused(".", load=spoilt)
+        (damaged / file).write_bytes(content)
+        refused(".", load=damaged)
     (tmp_path / "copy-0" / "state-1" / "arrays.npz").unlink()
     refused("its files are not those of session.json|damaged|JSON|invalid", load=tmp_path / "copy-0")
     refused("is not a saved session", load=tmp_path / "absent")

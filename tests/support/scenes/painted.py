@@ -237,6 +237,25 @@ class Noisy(Painted):
         return replace(frame, depth_m=depth_m.astype(np.float32))
 
 
+class Renamer(Collector):
+    """Declares that ids persist, but changes them all after four updates."""
+
+    name = "renamer"
+    keeps_ids = True
+
+    def __init__(self, config: Collector.Config) -> None:
+        super().__init__(config)
+        self._n_updates = 0
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        super().update(frame, detections, timer)
+        self._n_updates += 1
+
+    def finish(self) -> Instances:
+        found = super().finish()
+        return replace(found, ids=np.arange(len(found)) + (1000 if self._n_updates > 4 else 0))
+
+
 class SlashCollector(Collector):
     """A method whose name is a path to another folder."""
 
