@@ -105,7 +105,9 @@ def test_session_equals_run_also_saved_and_continued_midway(walk: Walk, method: 
         assert_same(s.snapshot().prediction, expected)
 
 
-@pytest.mark.parametrize("method", ["opensu3d", "conceptgraphs-detector", "sam3d@incremental", "conceptfusion", IN_MEMORY])
+@pytest.mark.parametrize(
+    "method", ["opensu3d", "conceptgraphs-detector", "sam3d@incremental", "conceptfusion", IN_MEMORY]
+)
 def test_snapshot_while_updates_go_on_is_the_map_of_its_frame(walk: Walk, method: str) -> None:
     with su3d.session(method, walk.info) as s:
         for frame in walk.frames[:3]:
@@ -308,7 +310,7 @@ def test_a_user_defined_method_is_not_loaded_from_a_folder(saved: Path, tmp_path
     file.write_text("raise SystemExit('imported')")
     record = json.loads((saved / "session.json").read_text())
     (saved / "session.json").write_text(json.dumps(record | {"target": f"{file}:Method"}))
-    refused("its method is not built in; pass method=", load=saved)
+    refused("the saved method is not built in; pass method=", load=saved)
 
 
 def test_saving_replaces_the_state_and_spares_other_files(saved: Path) -> None:
