@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from su3d_bench.core import registry
-from su3d_bench.core.arguments import typed
+from su3d_bench.core.arguments import several, typed
 from su3d_bench.core.config import Setting, Settings
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.core.types import SceneInfo
@@ -93,7 +93,8 @@ def session(
 
 def _part(method: str | type, values: Mapping[str, Any]) -> Part:
     """The method with its settings; ``ConfigError`` for an unknown one."""
-    named = named_method(registry.target_of("method", method) if isinstance(method, type) else method)
+    (given,) = several("method", method, str | type)
+    named = named_method(registry.target_of("method", given) if isinstance(given, type) else given)
     if named.corruption:
         raise ConfigError(f"session: {named.name}: corruptions are for runs; change the frames before you push them")
     return method_part(named, _settings(("method", named.name), values))

@@ -193,7 +193,8 @@ def image_of(content: Mapping[str, Any], scratch: Scratch) -> ImageRecord:
     ):
         raise StoreError("saved state: hits, names and captions of an image do not fit")
     large = {name: scratch.put(content[name]) for name in ("multi_scale", "global_feature", "hits")}
-    return ImageRecord(**{**content, **large, "names": tuple(map(sys.intern, names))})
+    texts = {name: tuple(map(sys.intern, content[name])) for name in ("names", "captions")}
+    return ImageRecord(**{**content, **large, **texts})
 
 
 def record_of(
