@@ -162,7 +162,7 @@ class ConceptFusionConfig(BaseModel):
 
 
 FEATURES = "features.npy"  # of a saved state
-_FORMS = {"points": "f8 N 3", "normals": "f8 N 3", "counts": "f8 N", "confidences": "?f8 N", "lengths": "?f8 N"}
+_FORMS = {"points": "f8 N 3", "normals": "f8 N 3", "counts": "f8 N", "confidences": "f8 N", "lengths": "f8 N"}
 
 
 class ConceptFusion:
@@ -278,23 +278,24 @@ class ConceptFusion:
     def save_state(self, folder: Path) -> None:
         """Store the points, and the features in a file of their own."""
         table, fused = self._features, self._map
-        arrays = {"points": fused.points, "normals": fused.normals, "counts": fused.counts}
         if table is not None:
-            arrays |= table.state()
             write_rows(folder / FEATURES, table.features())
-        write_state(folder, arrays, {"has_features": table is not None})
+        state = None if table is None else table.state()
+        write_state(
+            folder, {"points": fused.points, "normals": fused.normals, "counts": fused.counts, "features": state}
+        )
 
     def load_state(self, folder: Path) -> None:
         """Continue from a stored state."""
-        arrays, values = read_state(folder, _FORMS)
+        values = read_state(folder, _FORMS)
         self._clear()
-        self._map.restore(arrays["points"], arrays["normals"], arrays["counts"])
-        if values["has_features"]:
-            rows = map_npy(folder / FEATURES)
-            if rows.dtype != np.float16 or rows.ndim != 2 or len(rows) != len(self._map):
+        self._map.restore(values["points"], values["normals"], values["counts"])
+        if values["features"] is not None:
+            rows, confidences = map_npy(folder / FEATURES), values["features"]["confidences"]
+            if rows.dtype != np.float16 or rows.ndim != 2 or {len(rows), len(confidences)} != {len(self._map)}:
                 raise StoreError(f"{folder / FEATURES}: has {rows.dtype} {rows.shape}; expected one row per point")
             self._features = FeatureTable(rows.shape[1], self.config.feature_storage)
-            self._features.restore(rows, arrays["confidences"], arrays.get("lengths"))
+            self._features.restore(rows, confidences, values["features"]["lengths"])
 
     def close(self) -> None:
         """Give the features' disk space back; the map cannot be updated after that."""

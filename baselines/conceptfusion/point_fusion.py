@@ -145,10 +145,9 @@ class FeatureTable:
         table.flags.writeable = False
         return table
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Float64Array | None]:
         """What ``restore`` needs besides the features."""
-        state = {"confidences": self.confidences}
-        return state if self._lengths is None else state | {"lengths": self._lengths[: self._n]}
+        return {"confidences": self.confidences, "lengths": None if self._lengths is None else self._lengths[: self._n]}
 
     def restore(self, features: HalfArray, confidences: Float64Array, lengths: Float64Array | None) -> None:
         """Fill this empty table."""

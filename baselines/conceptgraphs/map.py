@@ -11,12 +11,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.baselines.conceptgraphs import objects as steps
 from su3d_bench.baselines.conceptgraphs.objects import MapObject, MappingConfig, Sighting
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.state import check_starts, check_texts
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances, Masks, starts_of
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Frame, Int64Array, OrientedBox
@@ -24,18 +22,12 @@ from su3d_bench.core.types import Detections, Float32Array, Float64Array, Frame,
 MIN_SIDE_M = 0.02  # thinner boxes are extended to it before intersection
 MIN_IOU = 1e-6
 NEW_OBJECT = -1
-# The arrays of a state: O objects of N points and S sightings in total, features of F and T dimensions.
+# A state's arrays: an object of N points, features of F and T dimensions, a box.
 FORMS = {
-    "numbers": "i8 O",
-    "point_starts": "i8 O+1",
-    "points": "f8 N 3",
-    "boxes": "f8 O 5 3",
-    "features": "f8 O F",
-    "text_features": "f8 O T",
-    "sighting_starts": "i8 O+1",
-    "sightings": "i8 S 2",
-    "scores": "f8 S",
-}
+    "points": "f8 N 3", "feature": "f8 F", "text_feature": "f8 T", "centre": "f8 3", "sizes": "f8 3",
+    "rotation": "f8 3 3",
+}  # fmt: skip
+CLASSES = (MapObject, Sighting, OrientedBox)
 
 
 def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Float64Array:
@@ -214,58 +206,17 @@ class ObjectMap:
     def _is_due(self, interval: int) -> bool:
         return interval > 0 and self._n_frames % interval == 0
 
-    def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """The arrays and other values from which ``restore`` recreates the map."""
-        items = self._everything
-        seen = [sighting for item in items for sighting in item.sightings]
-        boxes = [np.vstack([item.box.centre, item.box.sizes, item.box.rotation]) for item in items]
-        features = [(item.feature, item.text_feature) for item in items]
-        arrays: dict[str, NDArray[Any]] = {
-            "numbers": np.array([item.number for item in items], np.int64),
-            "point_starts": starts_of(len(item.points) for item in items),
-            "points": np.concatenate([np.zeros((0, 3)), *(item.points for item in items)]),
-            "boxes": np.array(boxes, np.float64).reshape(-1, 5, 3),
-            "features": np.array([one for one, _ in features]).reshape(len(items), -1 if items else 0),
-            "text_features": np.array([one for _, one in features]).reshape(len(items), -1 if items else 0),
-            "sighting_starts": starts_of(item.n_detections for item in items),
-            "sightings": np.array([(one.frame_index, one.detection) for one in seen], np.int64).reshape(-1, 2),
-            "scores": np.array([one.score for one in seen], np.float64),
-        }
-        values = {
-            "seed": self._seed,
-            "counts": [self._n_frames, self._n_created, self._feature_size],
-            "background": [name for name, item in self._background.items() if item is not None],
-            "names": [one.name for one in seen],
-            "captions": [one.caption for one in seen],
-        }
-        return arrays, values
+    def state(self) -> dict[str, Any]:
+        """The values from which ``restore`` recreates the map."""
+        counts = [self._seed, self._n_frames, self._n_created, self._feature_size]
+        return {"objects": self._objects, "background": self._background, "counts": counts}
 
-    def restore(self, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> None:
-        """Fill this empty map; ``arrays`` have the forms ``FORMS``."""
-        starts, seen_starts, n_seen = arrays["point_starts"], arrays["sighting_starts"], len(arrays["scores"])
-        check_starts("point_starts", starts, len(arrays["points"]))
-        check_starts("sighting_starts", seen_starts, n_seen)
-        names, captions = (check_texts(key, values.get(key), n_seen) for key in ("names", "captions"))
-        background = check_texts("background", values.get("background"), len(values["background"]))
-        if len(background) > len(starts) - 1 or not self._background.keys() >= set(background):
-            raise StoreError("saved state: 'background' does not fit the settings or the objects")
-        rows = zip(arrays["sightings"].tolist(), names, captions, arrays["scores"].tolist(), strict=True)
-        seen = [Sighting(*where, name, caption, score) for where, name, caption, score in rows]
-        items = [
-            MapObject(
-                number=int(arrays["numbers"][k]),
-                points=arrays["points"][starts[k] : starts[k + 1]].copy(),
-                box=OrientedBox(box[0], box[1], box[2:]),
-                feature=arrays["features"][k],
-                text_feature=arrays["text_features"][k],
-                sightings=tuple(seen[seen_starts[k] : seen_starts[k + 1]]),
-            )
-            for k, box in enumerate(arrays["boxes"])
-        ]
-        n = len(items) - len(background)
-        self._objects = items[:n]
-        self._background |= dict(zip(background, items[n:], strict=True))
-        self._n_frames, self._n_created, self._feature_size = map(int, values["counts"])
+    def restore(self, values: Mapping[str, Any]) -> None:
+        """Fill this empty map."""
+        if values["background"].keys() != self._background.keys():
+            raise StoreError("saved state: 'background' does not fit the settings")
+        self._objects, self._background = values["objects"], values["background"]
+        self._seed, self._n_frames, self._n_created, self._feature_size = map(int, values["counts"])
 
     def finish(self) -> Instances:
         """The map after a final clean-up, background objects last and labelled with their names."""

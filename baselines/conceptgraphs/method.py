@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from su3d_bench.baselines.conceptgraphs.map import FORMS, ObjectMap
+from su3d_bench.baselines.conceptgraphs.map import CLASSES, FORMS, ObjectMap
 from su3d_bench.baselines.conceptgraphs.objects import Cosine, Fraction, Interval, MappingConfig
 from su3d_bench.core.files.state import read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
@@ -92,12 +92,11 @@ class ConceptGraphs:
         return self._map.finish()
 
     def save_state(self, folder: Path) -> None:
-        write_state(folder, *self._map.state())
+        write_state(folder, self._map.state())
 
     def load_state(self, folder: Path) -> None:
-        arrays, values = read_state(folder, FORMS)
-        self._map = self._empty_map(int(values["seed"]))
-        self._map.restore(arrays, values)
+        self._map = self._empty_map(seed=0)
+        self._map.restore(read_state(folder, FORMS, CLASSES))
 
 
 class DetectorConfig(MappingConfig):

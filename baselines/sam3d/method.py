@@ -19,10 +19,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from su3d_bench.baselines.sam3d import overlap
 from su3d_bench.baselines.sam3d.overlap import NO_GROUP, GroupedCloud
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.files.state import check_range, check_starts, check_texts, read_state, write_state
+from su3d_bench.core.files.state import check_range, read_state, write_state
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.maps import Instances, starts_of
+from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import (
     BoolArray,
@@ -205,57 +205,21 @@ class SAM3D:
 
     def save_state(self, folder: Path) -> None:
         """Store the clouds, the views, and the scan's mesh."""
-        surface, views, clouds = self._surface, self._views, self._clouds
-        poses = [(index, place) for index, (place, _) in self._poses.items()]
-        n_dimensions = len(views[0].feature) if views else 0
-        arrays = {
-            "cloud_starts": starts_of(map(len, clouds)),
-            "points": np.concatenate([np.zeros((0, 3)), *(cloud.points for cloud in clouds)]),
-            "group": np.concatenate([_NO_IDS, *(cloud.group for cloud in clouds)]),
-            "view_starts": starts_of(len(cloud.views) for cloud in clouds),
-            "view_group": np.concatenate([_NO_IDS, *(cloud.view_group for cloud in clouds)]),
-            "cloud_views": np.concatenate([_NO_IDS, *(cloud.views for cloud in clouds)]),
-            "frames": np.array(poses, np.int64).reshape(-1, 2),
-            "poses": np.array([pose for _, pose in self._poses.values()]).reshape(-1, 4, 4),
-            "numbers": np.array([(v.frame_index, v.detection, v.n_pixels) for v in views], np.int64).reshape(-1, 3),
-            "features": np.array([v.feature for v in views], np.float32).reshape(-1, n_dimensions),
-            "scores": np.array([v.score for v in views], np.float64),
-        }
-        if surface is not None:
-            arrays |= {"vertices": surface.vertices, "triangles": surface.triangles}
-            arrays |= {} if surface.segments is None else {"segments": surface.segments}
-        names, captions = [v.name for v in views], [v.caption for v in views]
-        write_state(folder, arrays, {"scene": self._scene, "names": names, "captions": captions})
+        of_frames = {"clouds": self._clouds, "poses": self._poses, "masks": self._views}
+        write_state(folder, {**of_frames, "surface": self._surface, "scene": self._scene})
 
     def load_state(self, folder: Path) -> None:
         """Continue from a stored state."""
-        arrays, values = read_state(folder, _FORMS)
-        starts, view_starts, n_views = arrays["cloud_starts"], arrays["view_starts"], len(arrays["scores"])
-        check_starts("cloud_starts", starts, len(arrays["points"]))
-        check_starts("view_starts", view_starts, len(arrays["cloud_views"]))
-        check_range("cloud_views", arrays["cloud_views"], 0, n_views)
-        for name in ("group", "view_group"):
-            check_range(name, arrays[name], NO_GROUP, len(arrays["points"]) + n_views + 1)
-        check_range("frames", arrays["frames"][:, 1], 0, len(starts) - 1)
-        names, captions = (check_texts(name, values.get(name), n_views) for name in ("names", "captions"))
+        values = read_state(folder, _FORMS, (GroupedCloud, _View, Surface))
         self._clear()
-        self._scene = str(values["scene"])
-        parts = [
-            np.split(arrays[name], starts_of_name[1:-1])[: len(starts) - 1]
-            for name, starts_of_name in (
-                ("points", starts), ("group", starts), ("view_group", view_starts), ("cloud_views", view_starts)
-            )
-        ]  # fmt: skip
-        self._clouds = [GroupedCloud(*each) for each in zip(*parts, strict=True)]
-        frames = zip(arrays["frames"].tolist(), arrays["poses"], strict=True)
-        self._poses = {index: (place, pose) for (index, place), pose in frames}
-        rows = zip(arrays["numbers"].tolist(), arrays["features"], names, captions, arrays["scores"], strict=True)
-        self._views = [
-            _View(*numbers, feature, name, text, float(score)) for numbers, feature, name, text, score in rows
-        ]
-        if "vertices" in arrays:
-            check_range("triangles", arrays["triangles"], 0, len(arrays["vertices"]))
-            self._surface = Surface(arrays["vertices"], arrays["triangles"], arrays.get("segments"))
+        self._clouds, self._poses, self._views = values["clouds"], values["poses"], values["masks"]
+        self._surface, self._scene = values["surface"], str(values["scene"])
+        for cloud in self._clouds:
+            check_range("views", cloud.views, 0, len(self._views))
+            for group in (cloud.group, cloud.view_group):
+                check_range("group", group, NO_GROUP, len(cloud) + len(self._views) + 1)
+        if self._surface is not None:
+            check_range("triangles", self._surface.triangles, 0, len(self._surface.vertices))
 
     def _grouped(self, points: Float64Array, detection: Int64Array, detections: Detections) -> GroupedCloud:
         """The image's cloud, the last detection's group first; stores each detection as a view."""
@@ -354,22 +318,9 @@ def paint(frame: Frame, masks: BoolArray) -> Int64Array:
     return detection
 
 
-# C clouds of N points and W views in total, V views of F dimensions, P frames with a pose.
 _FORMS = {
-    "cloud_starts": "i8 C+1",
-    "points": "f8 N 3",
-    "group": "i8 N",
-    "view_starts": "i8 C+1",
-    "view_group": "i8 W",
-    "cloud_views": "i8 W",
-    "frames": "i8 P 2",
-    "poses": "f8 P 4 4",
-    "numbers": "i8 V 3",
-    "features": "f4 V F",
-    "scores": "f8 V",
-    "vertices": "?f4 M 3",
-    "triangles": "?i4 T 3",
-    "segments": "?i4 M",
-}
+    "points": "f8 N 3", "group": "i8 N", "view_group": "i8 W", "views": "i8 W", "feature": "f4 F",
+    "vertices": "f4 M 3", "triangles": "i4 T 3", "segments": "i4 M",
+}  # fmt: skip
 _NO_IDS = np.zeros(0, np.int64)
 _EMPTY = GroupedCloud(np.zeros((0, 3)), _NO_IDS, _NO_IDS, _NO_IDS)

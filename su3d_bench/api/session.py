@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from su3d_bench.core import registry
-from su3d_bench.core.arguments import typed
+from su3d_bench.core.arguments import several, typed
 from su3d_bench.core.config import Setting, Settings
-from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.core.types import SceneInfo
-from su3d_bench.online.session import Session
-from su3d_bench.runs.job import Part
+from su3d_bench.online.saved import SessionRecord, check_key, read_session, scene_of, session_record
+from su3d_bench.online.session import Session, check_incremental
+from su3d_bench.runs.job import Part, build_method, options_model
 from su3d_bench.runs.plan import method_part, named_method
 
 Place = str | Path
@@ -56,33 +59,25 @@ def session(
     su3d_bench.core.errors.ConfigError: session: openmask3d works on the whole scene; use su3d.run
     """
     from su3d_bench.core.config import resolve
-    from su3d_bench.online.saved import check_key, read_session, session_record
-    from su3d_bench.online.session import check_incremental
     from su3d_bench.perception.profiles import PerceptionConfig, build_perception, check_models
-    from su3d_bench.runs.job import build_method
     from su3d_bench.runs.scene import warm_up
     from su3d_bench.runs.scenes import cache_root
 
     folder = None if load is None else Path(load)
     saved = None if folder is None else read_session(folder)
     if saved is not None:
-        profile = profile or saved.profile
-        scene_info = scene_info or SceneInfo(**asdict(saved.scene))
+        profile = profile or saved.key.get("profile")
+        scene_info = scene_info or scene_of(saved)
     if scene_info is None:
         raise ConfigError("session: scene_info is missing; pass a su3d.SceneInfo")
-    of_method = {key: value for key, value in (settings or {}).items() if not key.startswith("perception.")}
-    if folder is not None and saved is not None and method is None:
-        if saved.target not in registry.METHODS:
-            raise ConfigError(f"{folder}: its method is not built in; pass method=")
-        method = saved.target
-        part = Part(saved.target, saved.name, saved.options) if not of_method else _part(method, of_method)
-    else:
-        part = _part(method or "opensu3d", of_method)
+    of_perception = {key: value for key, value in (settings or {}).items() if key.startswith("perception.")}
+    of_method = {key: value for key, value in (settings or {}).items() if key not in of_perception}
+    part = _part(method or "opensu3d", of_method) if saved is None or method else _saved_part(saved, of_method)
     found = build_method(part)
     check_incremental(found)
-    given = {key: value for key, value in (settings or {}).items() if key not in of_method}
-    config = resolve(_settings((), given | ({"perception.models.device": device} if device else {})),
-                     ("perception",), PerceptionConfig)  # fmt: skip
+    if device is not None:
+        of_perception["perception.models.device"] = device
+    config = resolve(_settings((), of_perception), ("perception",), PerceptionConfig)
     profile = profile or "auto"
     if profile == "oracle":
         raise ConfigError("session: profile 'oracle' needs ground truth, which a session does not have")
@@ -98,11 +93,26 @@ def session(
 
 def _part(method: str | type, values: Mapping[str, Any]) -> Part:
     """The method with its settings; ``ConfigError`` for an unknown one."""
-    named = named_method(registry.target_of("method", method) if isinstance(method, type) else method)
+    (given,) = several("method", method, str | type)
+    named = named_method(registry.target_of("method", given) if isinstance(given, type) else given)
+    if named.corruption:
+        raise ConfigError(f"session: {named.name}: corruptions are for runs; change the frames before you push them")
     return method_part(named, _settings(("method", named.name), values))
 
 
+def _saved_part(saved: SessionRecord, values: Mapping[str, Any]) -> Part:
+    """The built-in method of a saved session; no other, because the folder may come from others."""
+    if saved.target not in registry.METHODS:
+        raise ConfigError("session: the saved method is not built in; pass method=")
+    if values:
+        return _part(saved.target, values)
+    try:
+        options_model("method", saved.target).model_validate_json(saved.options)
+    except ValidationError as error:
+        raise StoreError(f"session: the saved settings of {saved.target} are invalid; start a new session") from error
+    return Part(saved.target, saved.key.get("method", ""), saved.options)
+
+
 def _settings(prefix: tuple[str, ...], values: Mapping[str, Any]) -> Settings:
-    return Settings(
-        tuple(Setting((*prefix, *str(key).split(".")), value, "session(settings=...)") for key, value in values.items())
-    )
+    paths = {(*prefix, *str(key).split(".")): value for key, value in values.items()}
+    return Settings(tuple(Setting(path, value, "session(settings=...)") for path, value in paths.items()))

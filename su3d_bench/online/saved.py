@@ -9,15 +9,15 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from su3d_bench.core import registry
 from su3d_bench.core.digests import code_digest, digest_file
-from su3d_bench.core.errors import StoreError, printable, reading, shown
+from su3d_bench.core.errors import DataError, StoreError, printable, reading, shown
 from su3d_bench.core.files.atomic import DAMAGE, make_folder, write_json
 from su3d_bench.core.interfaces import Method, Saves
-from su3d_bench.core.types import ImageDomain, SceneInfo
+from su3d_bench.core.types import SceneInfo
 from su3d_bench.core.version import __version__
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.job import Part, settings_key
@@ -29,30 +29,16 @@ SAVE_AGAIN = "save the session again"
 
 
 @dataclass(frozen=True)
-class SceneRecord:
-    """The scene of a session, as in ``SceneInfo``."""
-
-    dataset: str
-    scene: str
-    n_frames: Count
-    stride: int
-    image_domain: ImageDomain
-    seed: Count
-
-
-@dataclass(frozen=True)
 class SessionRecord:
     """``session.json``: the key of the state, what continues it, and size and SHA-256 of the ``files`` in ``state``.
 
-    ``target``, ``name`` and ``options`` are those of the method's ``Part``.
+    ``target`` and ``options`` are those of the method's ``Part``, ``scene`` the fields of ``SceneInfo``.
     """
 
     key: Mapping[str, str]
     target: str
-    name: str
     options: str
-    profile: str
-    scene: SceneRecord
+    scene: Mapping[str, str | int]
     n_updates: Count = 0
     as_of: tuple[int | None, int | None] = (None, None)
     state: str = ""
@@ -67,20 +53,19 @@ def session_record(
     key = {"method": part.name, **settings_key(sections, method), "profile": perception.profile}
     key |= {"encoder": perception.encoder.digest, "code.method": registry.code_key(part.target) or "built in"}
     key |= {"version": __version__, "code": code_digest()}
-    of_scene = SceneRecord(**{name: getattr(scene, name) for name in SceneRecord.__dataclass_fields__})
-    return SessionRecord(key, part.target, part.name, part.options, perception.profile, of_scene)
+    of_scene = {one.name: getattr(scene, one.name) for one in fields(scene) if one.compare}
+    return SessionRecord(key, part.target, part.options, of_scene)
 
 
 def write_session(path: Path, method: Saves, record: SessionRecord) -> None:
     """Store the state of ``method`` in ``path``, described by ``record``, in place of an earlier session there."""
     make_folder(path)
-    states = [STATE.fullmatch(child.name) for child in path.iterdir()]
-    others = [child.name for child in path.iterdir() if child.name != RECORD and not STATE.fullmatch(child.name)]
-    if others:
+    states = {child.name: STATE.fullmatch(child.name) for child in path.iterdir() if child.name != RECORD}
+    if others := [name for name, is_state in states.items() if not is_state]:
         raise StoreError(
             f"{shown(path)}: contains other files ({printable(others[0], 80)}); choose a folder of its own"
         )
-    state = path / f"state-{1 + max((int(found[1]) for found in states if found), default=0)}"
+    state = path / f"state-{1 + max((int(found[1]) for found in states.values() if found), default=0)}"
     make_folder(state)
     try:
         method.save_state(state)
@@ -89,9 +74,8 @@ def write_session(path: Path, method: Saves, record: SessionRecord) -> None:
     except BaseException:
         shutil.rmtree(state, ignore_errors=True)
         raise
-    for child in path.iterdir():
-        if child.name not in (RECORD, state.name):
-            shutil.rmtree(child, ignore_errors=True)
+    for name in states:
+        shutil.rmtree(path / name, ignore_errors=True)
 
 
 def read_session(path: Path) -> SessionRecord:
@@ -102,6 +86,14 @@ def read_session(path: Path) -> SessionRecord:
     if STATE.fullmatch(record.state) is None:
         raise StoreError(f"{shown(path)}: {RECORD}: '{printable(record.state, 40)}' is no state; {SAVE_AGAIN}")
     return record
+
+
+def scene_of(record: SessionRecord) -> SceneInfo:
+    """The scene of a saved session, without the scan's mesh."""
+    try:
+        return SceneInfo(**record.scene)  # type: ignore[arg-type]  # checked there
+    except (TypeError, DataError) as error:
+        raise StoreError(f"session: its scene is invalid ({printable(str(error), 120)})") from error
 
 
 def check_key(path: Path, record: SessionRecord, key: Mapping[str, str]) -> None:
@@ -126,4 +118,6 @@ def load_state(path: Path, method: Saves, record: SessionRecord) -> None:
     try:
         method.load_state(state)
     except (*DAMAGE, LookupError, AttributeError) as error:
-        raise StoreError(f"{shown(state)}: is no state of {record.name} ({printable(str(error), 120)})") from error
+        raise StoreError(
+            f"{shown(state)}: is not a valid state ({printable(str(error), 120)}); {SAVE_AGAIN}"
+        ) from error

@@ -59,9 +59,7 @@ class PendingSnapshot:
         self._map, self._message = self._folder.path / "map.npz", self._folder.path / "error.txt"
         if self.reason_for_blocking is not None:
             logger.info("snapshot: computed at once: %s", self.reason_for_blocking)
-            write_prediction(
-                self._map, method.finish()
-            )  # a file, because the map may have views of what updates change
+            write_prediction(self._map, method.finish())  # the map itself may have views of what updates change
             return
         with warnings.catch_warnings():  # Python 3.12 warns if there are other threads; ``finish`` needs none of them
             warnings.simplefilter("ignore", DeprecationWarning)

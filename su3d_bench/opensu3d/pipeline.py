@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.core.files.atomic import Scratch
 from su3d_bench.core.files.state import check_range, read_state, write_state
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
-from su3d_bench.opensu3d import saved_state, tracking, voxel_map
+from su3d_bench.opensu3d import tracking, voxel_map
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
@@ -165,23 +165,31 @@ class OpenSU3D:
 
     def save_state(self, folder: Path) -> None:
         """Store the map, Q and all detections."""
-        arrays, texts = saved_state.image_arrays(self._images)
-        arrays |= self._map.state() | saved_state.table_arrays(self._table, self._seeds)
-        counts = {"next_id": self._next_id, "n_detections": self._n_detections, "losses": self._losses}
-        write_state(folder, arrays, {**texts, **counts, "last_losses": self.losses})
+        tables = {key: [[view.position, view.detection] for view in views] for key, views in self._table.items()}
+        counts = {"next_id": self._next_id, "n_detections": self._n_detections}
+        losses = {"losses": dict(self._losses), "last_losses": self.losses}
+        images = [image.content() for image in self._images]
+        write_state(
+            folder,
+            {"map": self._map.state(), "images": images, "table": tables, "seeds": self._seeds, **counts, **losses},
+        )
 
     def load_state(self, folder: Path) -> None:
         """Continue from a stored state."""
-        arrays, values = read_state(folder, {**voxel_map.FORMS, **saved_state.FORMS})
+        values = read_state(folder, {**voxel_map.FORMS, **tracking.FORMS})
         self._clear()
         self._next_id, self._n_detections = int(values["next_id"]), int(values["n_detections"])
-        check_range("ids", arrays["ids"], NO_INSTANCE, min(self._next_id, IDS))
-        self._map.restore(arrays)
-        self._images = saved_state.images_of(arrays, values, self._scratch)
-        self._table.update(saved_state.table_of(arrays, self._next_id))
-        self._seeds = dict(arrays["seeds"].tolist())
-        self._losses.update({str(name): int(n) for name, n in values["losses"].items()})
-        self.losses = {str(name): int(n) for name, n in values["last_losses"].items()}
+        check_range("ids", values["map"]["ids"], NO_INSTANCE, min(self._next_id, IDS))
+        self._map.restore(values["map"])
+        self._images = [tracking.image_of(content, self._scratch) for content in values["images"]]
+        for key, views in values["table"].items():
+            for position, detection in views:
+                if min(position, detection) < 0 or detection >= len(self._images[position].names):
+                    raise StoreError(f"saved state: segment {key} has a view that does not exist")
+            self._table[int(key)] = [tracking.View(*view) for view in views]
+        self._seeds = {int(key): int(place) for key, place in values["seeds"].items()}
+        self._losses.update(values["losses"])
+        self.losses = dict(values["last_losses"])
 
     def close(self) -> None:
         """Reset the state, log dropped points, and free memory and disk space."""

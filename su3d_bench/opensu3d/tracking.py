@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.core.files.atomic import Scratch, StoredRows
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import BEST_FIT_RATIO, Fusion, MultiScale, MultiView, OverlapRule
@@ -124,6 +126,13 @@ class View:
 TrackingTable = defaultdict[int, list[View]]
 
 
+# K detections with features of F dimensions, H hits.
+FORMS = {
+    "rows": "i8 K", "scores": "f8 K", "multi_scale": "f8 K F", "global_feature": "f8 1 F", "hit_indptr": "i8 K+1",
+    "hits": "i4 H",
+}  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class ImageRecord:
     """Names, captions, scores and features of the detections of one image.
@@ -143,6 +152,11 @@ class ImageRecord:
     global_feature: StoredRows
     hit_indptr: Int64Array
     hits: StoredRows
+
+    def content(self) -> dict[str, Any]:
+        """Its fields, with the arrays in the scratch file."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: v.rows(0, v.shape[0]) if isinstance(v, StoredRows) else v for name, v in values.items()}
 
     @property
     def n_dimensions(self) -> int:
@@ -167,6 +181,20 @@ class ImageRecord:
         """Map points hit by the mask of ``detection``, ascending."""
         first, last = (int(end) for end in self.hit_indptr[detection : detection + 2])
         return self.hits.rows(first, last).astype(np.int64)
+
+
+def image_of(content: Mapping[str, Any], scratch: Scratch) -> ImageRecord:
+    """The image with this ``content``, whose arrays have the forms ``FORMS``."""
+    starts, names = content["hit_indptr"], content["names"]
+    if (
+        starts[0] != 0
+        or starts[-1] != len(content["hits"])
+        or {len(names), len(content["captions"])} != {len(starts) - 1}
+    ):
+        raise StoreError("saved state: hits, names and captions of an image do not fit")
+    large = {name: scratch.put(content[name]) for name in ("multi_scale", "global_feature", "hits")}
+    texts = {name: tuple(map(sys.intern, content[name])) for name in ("names", "captions")}
+    return ImageRecord(**{**content, **large, **texts})
 
 
 def record_of(

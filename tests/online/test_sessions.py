@@ -128,10 +128,7 @@ def test_snapshot_while_updates_go_on_is_the_map_of_its_frame(walk: Walk, method
         late.result()
 
 
-def test_query_ranks_as_the_command_does(
-    walk: Walk, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(walk.run.path.parent)
+def test_query_ranks_as_the_command_does(walk: Walk, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["query", "text", walk.address, "a lamp", "--run", "run", "--method", "opensu3d", "--top", "4", "--json"]
     assert main(words) == 0
     expected = json.loads(capsys.readouterr().out)["ranking"]
@@ -297,8 +294,8 @@ def test_a_folder_of_another_method_or_settings_or_version_is_refused(
     refused("saved with another method opensu3d, here sam3d", method="sam3d", load=saved)
     refused("another method.opensu3d.top_m 3, here 5", method="opensu3d", load=saved)
     refused("another method.opensu3d.top_m 3, here 4", settings={"top_m": 4}, load=saved)
-    naming = {"perception.segmenter.min_pixels": 7}
-    refused("another perception.segmenter.min_pixels", settings=naming, load=saved)
+    narrower = {"perception.segmenter.max_width": 320}
+    refused("another perception.segmenter.max_width 640, here 320", settings=narrower, load=saved)
     with su3d.session("opensu3d", settings={"top_m": 3}, load=saved) as s:
         assert s.n_updates == 2
     monkeypatch.setattr("su3d_bench.online.saved.__version__", "0.0.9")
@@ -310,7 +307,7 @@ def test_a_user_defined_method_is_not_loaded_from_a_folder(saved: Path, tmp_path
     file.write_text("raise SystemExit('imported')")
     record = json.loads((saved / "session.json").read_text())
     (saved / "session.json").write_text(json.dumps(record | {"target": f"{file}:Method"}))
-    refused("its method is not built in; pass method=", load=saved)
+    refused("the saved method is not built in; pass method=", load=saved)
 
 
 def test_saving_replaces_the_state_and_spares_other_files(saved: Path) -> None:
@@ -353,28 +350,34 @@ def test_every_damage_of_a_saved_session_is_one_line(method: str, tmp_path: Path
 
 @pytest.mark.parametrize("method", ["opensu3d", "conceptfusion", "conceptgraphs", "sam3d"])
 def test_states_with_matching_digests_are_checked_too(method: str, tmp_path: Path) -> None:
-    """Every array cut, of another type or with NaN; the record is made to match."""
+    """Every array shortened, of another type, with NaN or numbers out of range; the record is made to match."""
     with su3d.session(method, SCENE) as s:
         s.push(desk())
         s.save(tmp_path / "whole")
     arrays = dict(np.load(tmp_path / "whole/state-1/arrays.npz"))
+    assert {"f8"} <= arrays.keys()
     for name, array in arrays.items():
-        changes = [array[:-1], array.astype(np.float16)]
-        if array.dtype.kind == "f" and array.size:
-            changes.append(np.where(np.arange(len(array)).reshape(-1, *[1] * (array.ndim - 1)) == 0, np.nan, array))
-        if name.endswith("starts"):
-            changes.append(array + 1)
-        for n, changed in enumerate(changes):
-            if not array.size:
-                continue
+        worst = np.append(array[:-1], np.nan) if array.dtype.kind == "f" else array + (1 << 29)
+        for n, changed in enumerate((array[:-1], array.astype(np.float16), worst)):
             forged = tmp_path / f"{name}-{n}"
             shutil.copytree(tmp_path / "whole", forged)
             file = forged / "state-1" / "arrays.npz"
             np.savez(file, **arrays | {name: changed})
-            record = json.loads((forged / "session.json").read_text())
-            record["files"]["arrays.npz"] = [file.stat().st_size, digest_file(file)]
-            (forged / "session.json").write_text(json.dumps(record))
+            matched(forged)
             refused(".", load=forged)
+    for n, text in enumerate(("[]", "{}", '"map"', '{"map": []}', '{"os": []}', '{"array": ["f8", [99999999999]]}')):
+        forged = tmp_path / f"values-{n}"
+        shutil.copytree(tmp_path / "whole", forged)
+        (forged / "state-1" / "values.json").write_text(text)
+        matched(forged)
+        refused(".", load=forged)
+
+
+def matched(folder: Path) -> None:
+    """Write sizes and digests of the files into the record."""
+    record = json.loads((folder / "session.json").read_text())
+    files = {file.name: [file.stat().st_size, digest_file(file)] for file in (folder / "state-1").iterdir()}
+    (folder / "session.json").write_text(json.dumps(record | {"files": files}))
 
 
 def test_revising_poses_moves_the_frames_of_a_tree() -> None:
