@@ -18,7 +18,7 @@ def frame(depth_m: np.ndarray, pose: np.ndarray | None = None) -> Frame:
 
 
 def from_the_front() -> Frame:
-    """The front of a box at z = 2 m before a wall at 4 m, a pillar at 1 m at the left border, and no depth at the top."""
+    """The front of a box at z = 2 m before a wall at 4 m, a pillar at 1 m at the left, and no depth at the top."""
     depth_m = np.full(SIZE, 4.0, np.float32)
     depth_m[:, 10:31] = 2.0
     depth_m[:, :10] = 1.0
