@@ -448,7 +448,7 @@ class _Scene:
             own = folder.prediction if is_oracle or point is None else folder.anytime(point)
             refined_in = folder if point is None else None
             of_map, _ = self.scores(part, encoder, read_prediction(own), refined_in, seen)
-            of_truth, _ = self.scores(ceiling, encoder, perfect.finish(), None, seen)
+            of_truth = of_map if part == ceiling else self.scores(ceiling, encoder, perfect.finish(), None, seen)[0]
             by_file[folder.curve_counts("seen", point)] = of_map
             by_file[folder.curve_counts("ceiling", point)] = of_truth
         return n

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scored_room import headline, room, truth_as_prediction
 
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
@@ -83,3 +84,13 @@ def test_protocols_about_the_complete_scene_name_the_reason(name: str) -> None:
 )
 def test_area_is_the_mean_over_time(curve: list[tuple[float, float | None]], area: float | None) -> None:
     assert area_under(curve) == (area if area is None else pytest.approx(area))
+
+
+@pytest.mark.parametrize("name", ["rooms-semantic", "rooms-instance", "rooms-panoptic"])
+@pytest.mark.parametrize("is_map_empty", [False, True])
+def test_scores_are_undefined_before_anything_is_seen(name: str, is_map_empty: bool) -> None:
+    truth = room()
+    left = restricted(truth, [np.zeros(len(truth.points), bool)])
+    assert isinstance(left, GroundTruth)
+    prediction = truth_as_prediction(left if is_map_empty else truth, with_labels=True)
+    assert np.isnan(headline(name, left, prediction)).all()

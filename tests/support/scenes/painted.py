@@ -223,7 +223,8 @@ class Twins(Painted):
 
 
 class Noisy(Painted):
-    """Scenes whose depth has 2 cm of noise and holes; b has half as many frames."""
+    """Scenes whose depth has 2 cm of noise and holes, black in the image: the left half of the first frames, and single
+    pixels. Scene b has half as many frames."""
 
     name = "noisy"
 
@@ -233,8 +234,10 @@ class Noisy(Painted):
     def frame(self, scene: str, index: int) -> Frame:
         frame, rng = super().frame(scene, index), np.random.default_rng(index)
         noisy = frame.depth_m + 0.02 * rng.standard_normal(frame.depth_m.shape)
-        depth_m = np.where(rng.random(frame.depth_m.shape) < 0.1, 0, noisy)
-        return replace(frame, depth_m=depth_m.astype(np.float32))
+        has_depth = rng.random(frame.depth_m.shape) > 0.1
+        has_depth[:, : WIDTH // 2 if index < 2 else 0] = False
+        depth_m = np.where(has_depth, noisy, 0).astype(np.float32)
+        return replace(frame, depth_m=depth_m, rgb=np.where(has_depth[..., None], frame.rgb, 0).astype(np.uint8))
 
 
 class Renamer(Collector):
