@@ -6,7 +6,7 @@ import re
 import textwrap
 import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import quote, unquote
 
@@ -40,6 +40,7 @@ _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
 REPORTED = "as reported, not measured here"
 GAP_PT, SMALLEST_GAP_PT = 4, 2
+MAX_PAGE_ROWS = 62  # of the smallest type on a page, titles included
 MAX_TITLE = 22  # characters of a line of a column's title, which may have several
 MAX_LABEL_PT = 150  # of labels in a table wider than the page; longer labels are wrapped
 # Column and page width of a two-column paper (IEEEtran: 252 pt and 516 pt), slightly reduced.
@@ -81,13 +82,13 @@ def _letter(character: str) -> str:
 
 
 def latex(parts: Sequence[Table | Prose]) -> str:
-    """Return each table as a float, with notes below in small type."""
+    """Return each table as a float, or several if it is too long for a page, with notes below in small type."""
     blocks = [HEADER]
     for part in parts:
         if isinstance(part, Prose):
             blocks.append("\n".join(f"\\noindent {escape(line)}\\par" for line in part.lines))
         else:
-            blocks.append(_float(part))
+            blocks += _floats(part)
     return "\n\n".join(blocks) + "\n"
 
 
@@ -106,13 +107,24 @@ class _Place:
     parts: tuple[tuple[int, ...], ...]
 
 
-def _float(table: Table) -> str:
-    place = _place(table)
+def _floats(table: Table) -> list[str]:
+    place, name = _place(table), re.sub(r"[^A-Za-z0-9]+", "-", table.name).strip("-")
+    n_parts = max(1, MAX_PAGE_ROWS // (len(table.rows) + 2))
+    floats = []
+    for start in range(0, max(1, len(place.parts)), n_parts):
+        rest = replace(table, heading=f"{table.heading or table.caption} (continued)", caption="") if start else table
+        parts, is_last = place.parts[start : start + n_parts], start + n_parts >= len(place.parts)
+        kept = rest if is_last else replace(rest, notes=())
+        floats.append(_float(kept, replace(place, parts=parts), f"{name}-{start}" if start else name))
+    return floats
+
+
+def _float(table: Table, place: _Place, name: str) -> str:
     lines = [
         f"\\begin{{{place.kind}}}[t]",
         r"  \centering\hbadness=10000",  # no warning about short captions in a narrow column
         f"  \\caption{{{escape(table.heading + table.caption)}}}",
-        f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}",
+        f"  \\label{{tab:{name}}}",
         f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
     ]
     for k, columns in enumerate(place.parts):

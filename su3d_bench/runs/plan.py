@@ -357,7 +357,8 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
     named = [name for method in methods for name in (_all_systems() if method == "all" else [method])]
     targets = list(dict.fromkeys(named))
     for target in targets:
-        if target not in registry.names("method") and looks_like_scene(target):
+        clean = target.rpartition(MARK)[0] or target
+        if clean not in registry.names("method") and looks_like_scene(clean):
             raise ConfigError(f"--methods {target}: is a scene; write it before the flags or after --scenes")
     if not targets:
         raise ConfigError("no method named; known: " + ", ".join(registry.names("method")))

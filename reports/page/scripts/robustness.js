@@ -45,7 +45,8 @@ function sweepPlots(sweep, result) {
       const [corruption, severity] = sweep.conditions[name], lines = linesOf[corruption] ||= {};
       const line = lines[one.method] ||= { name: sideName(sweep.run, one.method), style, points: [[0, clean, [clean, clean]]] };
       if (severity && isNumber(cell.value)) {
-        line.points.push([severity, 100 * cell.value, (cell.interval || [0, 0]).map((end) => clean + 100 * end)]);
+        const changes = cell.interval || [cell.difference, cell.difference];
+        line.points.push([severity, 100 * cell.value, changes.map((end) => clean + 100 * end)]);
       }
     }
   }
