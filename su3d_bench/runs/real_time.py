@@ -59,9 +59,7 @@ def check_is_timed(config: RunConfig, profile: str, *, uses_captions: bool) -> N
         raise ConfigError(f"--realtime: {what}: perception is stored, so it cannot be timed; add --cost FILE")
 
 
-def _schedule_file(config: RunConfig, scene: str, method: str) -> Path:
-    assert config.schedule is not None
-    place = config.schedule
+def _schedule_file(place: Path, scene: str, method: str) -> Path:
     return RunFolder(place).job(scene, method).schedule if place.is_dir() else place
 
 
@@ -71,7 +69,7 @@ def clock_key(config: RunConfig, scene: str, method: str) -> dict[str, str]:
         return {}
     source = "measured"
     if config.schedule is not None:
-        file = _schedule_file(config, scene, method)
+        file = _schedule_file(config.schedule, scene, method)
         stream = read_schedule(file).stream
         if (stream.scene, stream.rate_hz, stream.stride) != (scene, config.realtime, config.stride):
             own = f"{stream.scene} at {stream.rate_hz:g} Hz, stride {stream.stride}"
@@ -89,7 +87,7 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of one job: replayed, drawn from the cost file, or with the durations that ``cost_ms`` measures."""
     if config.schedule is not None:
-        file = _schedule_file(config, scene, method)
+        file = _schedule_file(config.schedule, scene, method)
         schedule = read_schedule(file)
         if len(schedule.times) != n_frames:
             has = f"has {counted(len(schedule.times), 'frame')}, but {n_frames} arrive"

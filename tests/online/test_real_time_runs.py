@@ -158,7 +158,7 @@ def test_a_schedule_that_does_not_fit_is_refused_in_one_line(capsys: pytest.Capt
     assert run(*TEN_HZ, scenes="a") == 0
     file = str(job() / "schedule.csv")
     of_other = words("--schedule", file, "--set", "painted.n_frames=12", scenes="b", out="new")
-    assert "is the schedule of painted/a, not of painted/b" in error_of(of_other)
+    assert "is the schedule of painted/a at 10 Hz, stride 1, not of painted/b at 10 Hz" in error_of(of_other)
     assert "cannot be read" in error_of(words("--schedule", "out", scenes="b", out="new"))
     for conflict in (("--realtime", "5"), ("--stride", "2"), ("--queue", "drop-new")):
         assert "differs from the schedule" in error_of(words("--schedule", "out", *conflict, scenes="a", out="new"))
