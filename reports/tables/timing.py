@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,8 +56,8 @@ def timing_tables(
         caption = f", ms per update ({updates})"
         name = f"timing-{summary.run}-{summary.method}"
         parts.append(text_table(name, list(_stages_table(summary)), heading=summary.method, caption=caption))
-    if clocked := [each for each in times if each.realtime is not None]:
-        parts.append(text_table("timing-real-time", list(_real_time_table(clocked)), heading="Real time"))
+    if any(each.realtime is not None for each in times):
+        parts.append(text_table("timing-real-time", list(_real_time_table(times)), heading="Real time"))
     if anytime:
         parts.append(text_table("timing-midway", list(_anytime_table(anytime)), heading="Intermediate maps"))
     return parts
@@ -149,20 +150,16 @@ def _real_time_table(times: Sequence[UpdateTimes]) -> Iterator[list[str]]:
     clocks: dict[tuple[str, ...], list[RealTimeRecord]] = {}
     for each in times:
         if (clock := each.realtime) is not None:
-            queue = clock.queue if clock.queue_size == 1 else f"{clock.queue} {clock.queue_size}"
-            source = "simulated" if clock.is_simulated else "measured"
-            key = each.run, each.method, f"{clock.rate_hz:g}", queue, f"{source}: {printable(clock.device, 120)}"
+            source = f"{'simulated' if clock.is_simulated else 'measured'}: {printable(clock.device, 120)}"
+            key = each.run, each.method, f"{clock.rate_hz:g}", f"{clock.queue} {clock.queue_size}", source
             clocks.setdefault(key, []).append(clock)
-    for (run, method, rate, queue, source), scenes in clocks.items():
-        n_frames, n_processed, n_dropped = (
-            sum(getattr(clock, name) for clock in scenes) for name in ("n_frames", "n_processed", "n_dropped")
-        )
-        latency = sum(clock.n_processed * (clock.latency_ms or 0.0) for clock in scenes)
+    for (*clock_of, source), scenes in clocks.items():
+        n_processed = sum(clock.n_processed for clock in scenes)
+        latency_ms = sum(clock.n_processed * (clock.latency_ms or 0.0) for clock in scenes)
         yield [
-            *(run, method, rate, queue, str(n_frames), str(n_processed), str(n_dropped)),
-            _ms(latency / n_processed if n_processed else float("nan")),
-            f"{n_processed / sum(clock.duration_s for clock in scenes):.2f}",
-            source,
+            *(*clock_of, str(sum(clock.n_frames for clock in scenes)), str(n_processed)),
+            *(str(sum(clock.n_dropped for clock in scenes)), _ms(latency_ms / (n_processed or math.nan))),
+            *(f"{n_processed / sum(clock.duration_s for clock in scenes):.2f}", source),
         ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import output, report_files
 from su3d_bench.cli.options import Verbs, add_group, add_verb, index, output_path, positive, searched_folder
@@ -134,14 +134,9 @@ def call_timing(arguments: argparse.Namespace) -> None:
     anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate, list(chain(*times)))
-    value: dict[str, object] = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
-    clocks = [
-        {"run": each.run, "scene": each.scene, "method": each.method, **asdict(each.realtime)}
-        for each in chain(*times)
-        if each.realtime is not None
-    ]
-    if clocks:
-        value["real_time"] = clocks
+    value: dict[str, Any] = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
+    if clocked := [one for one in chain(*times) if one.realtime is not None]:
+        value["real_time"] = [{"scene": one.scene, "method": one.method, **vars(one.realtime)} for one in clocked]
     output.answer_tables(arguments, value, tables)
     if arguments.out is None:
         return

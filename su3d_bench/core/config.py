@@ -15,7 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+<<<<<<< HEAD
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+=======
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+>>>>>>> F
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.safe_output import one_line
@@ -97,25 +101,15 @@ NEUTRAL_SETTINGS = frozenset({
     "jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm",
     "memory",
 })  # fmt: skip
-SIZE = re.compile(r"(\d{1,9}(?:\.\d{1,3})?)([KMGT])(?:i?B)?")
 
 
 def size_bytes(text: str) -> int:
-    """The number of bytes in ``8G``, with units of 1024; a ``ValueError`` if it is not a size.
+    """The number of bytes in a valid ``memory`` of a run.
 
-    >>> size_bytes("8G"), size_bytes("1.5K")
-    (8589934592, 1536)
+    >>> size_bytes("8G"), size_bytes("500M")
+    (8589934592, 524288000)
     """
-    found = SIZE.fullmatch(text)
-    if found is None or not float(found[1]):
-        raise ValueError("expected a size such as 8G or 500M")
-    return int(float(found[1]) * 1024 ** (1 + "KMGT".index(found[2])))
-
-
-def _checked_size(text: str) -> str:
-    if text:
-        size_bytes(text)
-    return text
+    return int(text[:-1]) * 1024 ** (1 + "KMGT".index(text[-1]))
 
 
 class RunConfig(BaseModel):
@@ -163,7 +157,7 @@ class RunConfig(BaseModel):
     gpus_per_job: int = Field(default=0, ge=0, le=64)
     retries: int = Field(default=2, ge=0)
     slurm: tuple[str, ...] = ()
-    memory: Annotated[str, AfterValidator(_checked_size)] = ""
+    memory: str = Field(default="", pattern="^([1-9][0-9]{0,8}[KMGT])?$")
 
     @field_validator("anytime_every")
     @classmethod

@@ -1,1 +1,1 @@
-"""Online evaluation: sessions and the clock of real-time runs."""
+"""Sessions: a method fed frame by frame by the caller, with maps at any time, saved and continued."""

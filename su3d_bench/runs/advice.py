@@ -62,8 +62,7 @@ def estimate(plan: Plan) -> list[JobEstimate]:
         each_s = GUESSED_UPDATE_S if measured is None else measured
         if job.config.realtime:  # a busy method processes what fits into the recording's duration
             n_updates = min(n_updates, math.ceil(n_updates / job.config.realtime / max(each_s, 1e-9)))
-        n_passes = 2 if is_measured(job.config) else 1
-        seconds = GUESSED_SCENE_S + n_passes * n_updates * each_s
+        seconds = GUESSED_SCENE_S + (1 + is_measured(job.config)) * n_updates * each_s
         rows.append(JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark))
     return rows
 

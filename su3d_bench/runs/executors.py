@@ -193,13 +193,11 @@ def unwrap(message: tuple[str, Any]) -> Any:
 
 
 def _cause(exit_code: int | None, memory: str) -> str:
-    if memory and exit_code in (-signal.SIGABRT, -signal.SIGSEGV, -signal.SIGTRAP):
-        name = signal.Signals(-exit_code).name
-        return f"the worker crashed ({name}), as native code does when it exceeds --memory {memory}"
     if exit_code == -signal.SIGKILL:
         return "the worker was killed (signal 9), usually because memory ran out; try fewer --jobs"
     if exit_code is not None and exit_code < 0:
-        return f"the worker crashed (signal {-exit_code}, {signal.Signals(-exit_code).name})"
+        hint = f"; native code may have exceeded --memory {memory}" if memory else ""
+        return f"the worker crashed (signal {-exit_code}, {signal.Signals(-exit_code).name}){hint}"
     return f"the worker ended early (exit code {exit_code})"
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import digest_bytes, digest_file
-from su3d_bench.core.errors import ConfigError, DataError, counted, printable, reading, shown
+from su3d_bench.core.errors import ConfigError, DataError, counted, printable, shown
 from su3d_bench.core.system.timing import hardware_line
-from su3d_bench.online.clock import QUEUE_SIZE, Schedule, Stream, frame_times, read_costs, read_schedule
+from su3d_bench.runs.clock import QUEUE_SIZE, Schedule, Stream, frame_times, read_costs, read_schedule
 from su3d_bench.store.run_folder import RunFolder
 
-OF_CLOCK = ("queue", "queue_size", "cost")  # settings without effect unless frames arrive in real time
 # Perception of these profiles reads results, so that its time is not that of any perception.
 NOT_TIMED = ("oracle", "stored")
 
@@ -22,6 +22,7 @@ def with_clock(config: RunConfig) -> RunConfig:
 
     A schedule determines the rate, the queue and the stride.
     """
+<<<<<<< HEAD
     if config.schedule is None and not config.realtime:
         for name in OF_CLOCK:
             if getattr(config, name) != RunConfig.model_fields[name].default:
@@ -46,6 +47,21 @@ def with_clock(config: RunConfig) -> RunConfig:
 
 def _flag(config: RunConfig, name: str) -> str:
     return f"--{name.replace('_', '-')} {getattr(config, name)}"
+=======
+    fixed: dict[str, Any] = {"queue": "newest", "queue_size": 0, "cost": None}
+    why = "has no effect without --realtime HZ"
+    if config.schedule is not None:
+        stream = read_schedule(_any_schedule(config.schedule)).stream
+        settings = stream.model_dump(include={"queue", "queue_size", "stride"})
+        fixed, why = {"realtime": stream.rate_hz, **settings, "cost": None}, "differs from the schedule; omit it"
+    elif config.realtime:
+        size = 1 if config.queue == "newest" else config.queue_size or QUEUE_SIZE
+        fixed, why = {"queue_size": size}, "'newest' has one place; choose another --queue"
+    for name, value in fixed.items():
+        if (given := getattr(config, name)) not in (RunConfig.model_fields[name].default, value):
+            raise ConfigError(f"--{name.replace('_', '-')} {given}: {why}")
+    return config.model_copy(update=fixed)
+>>>>>>> F
 
 
 def _any_schedule(place: Path) -> Path:
@@ -70,9 +86,7 @@ def check_is_timed(config: RunConfig, profile: str, *, uses_captions: bool) -> N
         raise ConfigError(f"--realtime: {what}: perception is stored, so it cannot be timed; add --cost FILE")
 
 
-def _schedule_file(config: RunConfig, scene: str, method: str) -> Path:
-    assert config.schedule is not None
-    place = config.schedule
+def _schedule_file(place: Path, scene: str, method: str) -> Path:
     return RunFolder(place).job(scene, method).schedule if place.is_dir() else place
 
 
@@ -82,17 +96,16 @@ def clock_key(config: RunConfig, scene: str, method: str) -> dict[str, str]:
         return {}
     source = "measured"
     if config.schedule is not None:
-        file = _schedule_file(config, scene, method)
+        file = _schedule_file(config.schedule, scene, method)
         stream = read_schedule(file).stream
-        if stream.scene != scene:
-            raise DataError(f"{shown(file)}: is the schedule of {stream.scene}, not of {printable(scene, 200)}")
-        if (stream.rate_hz, stream.stride) != (config.realtime, config.stride):
-            raise DataError(f"{shown(file)}: its rate or stride is not that of the other schedules of the run")
+        if (stream.scene, stream.rate_hz, stream.stride) != (scene, config.realtime, config.stride):
+            own = f"{stream.scene} at {stream.rate_hz:g} Hz, stride {stream.stride}"
+            wanted = f"{printable(scene, 200)} at {config.realtime:g} Hz, stride {config.stride}"
+            raise DataError(f"{shown(file)}: is the schedule of {own}, not of {wanted}")
         source = digest_file(file)
     elif config.cost is not None:
-        with reading(shown(config.cost), DataError):
-            source = f"simulated {digest_file(config.cost)}"
-        read_costs(config.cost, method)
+        read_costs(config.cost, method, [])  # raises if it is unreadable
+        source = f"simulated {digest_file(config.cost)}"
     return {"realtime": f"{config.realtime} Hz, {config.queue} {config.queue_size}", "schedule": source}
 
 
@@ -101,7 +114,7 @@ def schedule_of(
 ) -> Schedule:
     """The schedule of one job: replayed, drawn from the cost file, or with the durations that ``cost_ms`` measures."""
     if config.schedule is not None:
-        file = _schedule_file(config, scene, method)
+        file = _schedule_file(config.schedule, scene, method)
         schedule = read_schedule(file)
         if len(schedule.times) != n_frames:
             has = f"has {counted(len(schedule.times), 'frame')}, but {n_frames} arrive"
@@ -109,8 +122,8 @@ def schedule_of(
         return schedule
     device = hardware_line()
     if config.cost is not None:
-        costs = read_costs(config.cost, method)
-        device, cost_ms = costs.device, costs.draws([config.seed, int(digest_bytes(scene.encode())[:15], 16)])
+        seed = [config.seed, int(digest_bytes(scene.encode())[:15], 16)]
+        device, cost_ms = read_costs(config.cost, method, seed)
     assert cost_ms is not None
     stream = Stream(
         scene=printable(scene, 300), method=printable(method, 300), rate_hz=config.realtime, stride=stride,

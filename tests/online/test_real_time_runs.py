@@ -10,11 +10,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from painted import Collector, ColourPerception
-from painted_runs import PAINTED, job, run, words
+from painted import ColourPerception
+from painted_runs import COLLECTOR, PAINTED, job, run, words
 
 from su3d_bench.cli.main import main
-from su3d_bench.online.clock import read_schedule
+from su3d_bench.core import registry
+from su3d_bench.runs.clock import read_schedule
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import scene as scene_run
@@ -38,7 +39,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         return slow
 
     monkeypatch.setattr(frame_loop, "time", fake)
-    monkeypatch.setattr(Collector, "update", lasting(0.15, Collector.update))
+    collector = registry.load("method", COLLECTOR)
+    monkeypatch.setattr(collector, "update", lasting(0.15, collector.update))
     monkeypatch.setattr(ColourPerception, "detect", lasting(0.1, ColourPerception.detect))
     return fake
 
@@ -74,7 +76,15 @@ def test_a_measured_run_feeds_the_frames_worked_out_by_hand(capsys: pytest.Captu
     assert main(["report", "timing", "out"]) == 0
     out = capsys.readouterr().out
     row = next(line for line in out.splitlines() if "measured:" in line)
-    assert [cell.strip() for cell in row.strip("| ").split("|")][2:9] == ["10", "newest", "12", "4", "7", "275", "3.33"]
+    assert [cell.strip() for cell in row.strip("| ").split("|")][2:9] == [
+        "10",
+        "newest 1",
+        "12",
+        "4",
+        "7",
+        "275",
+        "3.33",
+    ]
     assert main(["report", "timing", "out", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["real_time"][0]["n_dropped"] == 7
 
@@ -148,10 +158,10 @@ def test_a_schedule_that_does_not_fit_is_refused_in_one_line(capsys: pytest.Capt
     assert run(*TEN_HZ, scenes="a") == 0
     file = str(job() / "schedule.csv")
     of_other = words("--schedule", file, "--set", "painted.n_frames=12", scenes="b", out="new")
-    assert "is the schedule of painted/a, not of painted/b" in error_of(of_other)
+    assert "is the schedule of painted/a at 10 Hz, stride 1, not of painted/b at 10 Hz" in error_of(of_other)
     assert "cannot be read" in error_of(words("--schedule", "out", scenes="b", out="new"))
     for conflict in (("--realtime", "5"), ("--stride", "2"), ("--queue", "drop-new")):
-        assert "the schedule has" in error_of(words("--schedule", "out", *conflict, scenes="a", out="new"))
+        assert "differs from the schedule" in error_of(words("--schedule", "out", *conflict, scenes="a", out="new"))
     assert not Path("new").exists()
     capsys.readouterr()
     assert run("--schedule", file, scenes="a", out="new") == 3
@@ -168,7 +178,7 @@ def test_a_schedule_that_does_not_fit_is_refused_in_one_line(capsys: pytest.Capt
         (("--realtime", "5", "--queue-size", "4"), "'newest' has one place"),
         (("--realtime", "5", "--cost", "missing.csv"), "missing.csv: cannot be read"),
         (("--schedule", "."), "has no schedules"),
-        (("--memory", "8 apples"), "expected a size such as 8G"),
+        (("--memory", "8 apples"), "string should match pattern"),
         (("--memory", "8G", "--executor", "inline"), "needs Linux and the executor 'processes'"),
     ],
 )
@@ -225,7 +235,7 @@ def test_a_method_that_exceeds_the_memory_limit_fails_alone(capsys: pytest.Captu
     errors = [line for line in capsys.readouterr().err.splitlines() if "painted/a" in line]
     assert sorted(line.partition("painted/a: ")[2] for line in errors) == [
         "exceeded --memory 1500M; allow more, or use a smaller --limit",
-        "the worker crashed (SIGABRT), as native code does when it exceeds --memory 1500M",
+        "the worker crashed (signal 6, SIGABRT); native code may have exceeded --memory 1500M",
     ]
     assert (job(method="modest") / "prediction.npz").is_file()
     assert (job(method="oracle") / "prediction.npz").is_file()

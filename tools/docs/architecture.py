@@ -34,7 +34,7 @@ PURPOSE = {
     "predictions": "prediction formats of other programs: reading and export",
     "questions": "queries and questions with known answers; reasoning over a map",
     "baselines": "one folder per method: baselines, external programs, the oracle",
-    "online": "sessions, fed frame by frame by the caller, with snapshots and saved states; the real-time clock",
+    "online": "sessions: a method fed frame by frame by the caller; snapshots, saved states",
     "runs": "splits a run into jobs, in processes or on clusters; resuming",
     "evaluation": "scores of predictions from files",
     "human_eval": "annotation sheets: creation, answers, scores",

@@ -16,17 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.core.errors import DataError, counted, printable, reading, shown
-from su3d_bench.core.system.files import opened_text
+from su3d_bench.core.errors import DataError, printable, reading, shown
+from su3d_bench.core.system.files import file_text, regular
 
 Queue = Literal["newest", "drop-new", "drop-old"]
 QUEUE_SIZE = 10  # of the queues that are not ``newest``, unless requested otherwise
 MAX_RATE_HZ = 1e6
 MAX_TIME_S = 1e7  # four months
 MAX_FRAMES = 10_000_000
-MAX_LINE = 4000  # characters
+MAX_BYTES = 1 << 28  # about five million frames
+MAX_COST_MS = 1e9
 NS = 1_000_000_000
 COLUMNS = ["frame", "arrived_s", "started_s", "finished_s", "dropped"]
 
@@ -74,13 +75,7 @@ def frame_times(
     return tuple(times)
 
 
-def _is_printable(text: str) -> str:
-    if text != printable(text, 300):
-        raise ValueError("must be printable text of at most 300 characters")
-    return text
-
-
-Text = Annotated[str, AfterValidator(_is_printable)]
+Text = Annotated[str, Field(max_length=300)]
 
 
 class Stream(BaseModel):
@@ -161,114 +156,79 @@ class Schedule:
 
 def read_schedule(file: Path) -> Schedule:
     """The schedule in ``file``; a ``DataError`` that names the line if it is not one."""
-    lines = _lines(file)
-    first = lines[0] if lines else ""
-    try:
-        stream = Stream.model_validate_json(first.removeprefix("# "))
-    except ValidationError as error:
-        problem = error.errors()[0]
-        what = ": ".join([*map(str, problem["loc"]), problem["msg"]])
-        raise DataError(f"{shown(file)}:1: is not a schedule of su3d-bench ({printable(what, 200)})") from error
-    if lines[1:2] != [",".join(COLUMNS)]:
-        raise DataError(f"{shown(file)}:2: expected the columns {','.join(COLUMNS)}")
+    lines = [*_lines(file), "", ""]
+    number, free_ns = 1, 0
     times: list[FrameTimes] = []
-    last_ns = 0
-    for number, line in enumerate(lines[2:], 3):
-        try:
-            times.append(_frame_times(line, len(times), times[-1].arrived_ns if times else 0, last_ns))
-        except ValueError as error:
-            raise DataError(f"{shown(file)}:{number}: {printable(str(error), 200)}") from error
-        last_ns = times[-1].finished_ns or last_ns
-    if not times:
-        raise DataError(f"{shown(file)}: has no frames")
+    try:
+        stream = Stream.model_validate_json(lines[0].removeprefix("# "))
+        number = 2
+        if lines[1] != ",".join(COLUMNS) or not lines[2]:
+            raise ValueError(f"expected the columns {','.join(COLUMNS)} and one row per frame")
+        for line in lines[2:-2]:
+            number += 1
+            times.append(_frame_times(line, len(times), times[-1].arrived_ns if times else 0, free_ns))
+            free_ns = times[-1].finished_ns or free_ns
+    except ValueError as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        what = f"is not a schedule: {'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
+        raise DataError(f"{shown(file)}:{number}: {printable(what, 200)}") from error
     return Schedule(stream, tuple(times))
 
 
-def _frame_times(line: str, frame: int, arrived_last_ns: int, finished_last_ns: int) -> FrameTimes:
+def _frame_times(line: str, frame: int, arrived_before_ns: int, free_ns: int) -> FrameTimes:
+    """The times in a row; ``free_ns``: the end of the previous update. A ``ValueError`` if it is invalid."""
     values = line.split(",")
-    if len(values) != len(COLUMNS):
-        raise ValueError(f"has {counted(len(values), 'value')}, expected {len(COLUMNS)}")
-    if values[0] != str(frame):
-        raise ValueError(f"is frame '{values[0]}', expected {frame}: every frame that arrives has one row, in order")
-    arrived, started, finished = (_ns(value) for value in values[1:4])
-    if arrived is None or arrived < arrived_last_ns:
-        raise ValueError(f"arrived_s is '{values[1]}', expected a time not before the previous frame's")
-    if values[4] != str(int(started is None)) or (started is None) != (finished is None):
-        raise ValueError("a frame is either dropped (1, without times) or has started_s, finished_s and 0")
-    if started is not None and finished is not None and not max(arrived, finished_last_ns) <= started <= finished:
-        raise ValueError("an update starts after its frame arrived and the previous one finished, and then finishes")
+    if len(values) != len(COLUMNS) or values[0] != str(frame):
+        raise ValueError(f"expected frame {frame}: every frame that arrives has one row of {len(COLUMNS)} values")
+    arrived, started, finished = (round(_limited(one, MAX_TIME_S) * NS) if one else None for one in values[1:4])
+    if values[4] not in ("0", "1") or not (started is None) == (finished is None) == (values[4] == "1"):
+        raise ValueError("expected started_s, finished_s and 0, or neither and 1 if the frame was dropped")
+    known = [ns for ns in (arrived, started, finished) if ns is not None]
+    is_overlapping = started is not None and started < free_ns
+    if arrived is None or arrived < arrived_before_ns or is_overlapping or known != sorted(known):
+        raise ValueError("times are not in order: an update starts after its frame arrived and the previous one ended")
     return FrameTimes(arrived, started, finished)
 
 
-def _ns(value: str) -> int | None:
-    if not value:
-        return None
-    seconds = float(value)
-    if not 0 <= seconds <= MAX_TIME_S:
-        raise ValueError(f"'{value}' is not a time in seconds")
-    return round(seconds * NS)
+def _limited(text: str, most: float) -> float:
+    value = float(text)
+    if not 0 <= value <= most:
+        raise ValueError(f"'{text}' is not a number from 0 to {most:g}")
+    return value
 
 
 def _lines(file: Path) -> list[str]:
-    """The lines of a text file; a ``DataError`` if it cannot be read or is longer than any file of this kind."""
-    lines: list[str] = []
-    with reading(shown(file), DataError), opened_text(file) as stream:
+    """The lines of a text file; a ``DataError`` if it cannot be read or is larger than any file of this kind."""
+    with reading(shown(file), DataError):
+        if regular(file).stat().st_size > MAX_BYTES:
+            raise DataError(f"{shown(file)}: has more than {MAX_BYTES} bytes")
         try:
-            while line := stream.readline(MAX_LINE):
-                if len(lines) > MAX_FRAMES or (not line.endswith("\n") and len(line) == MAX_LINE):
-                    raise DataError(f"{shown(file)}:{len(lines) + 1}: is too long")
-                lines.append(line.rstrip("\n"))
+            return file_text(file).splitlines()
         except UnicodeDecodeError as error:
             raise DataError(f"{shown(file)}: is not a UTF-8 text file") from error
-    return lines
 
 
-@dataclass(frozen=True)
-class Costs:
-    """Durations of an update with its perception, in ms: ``samples``, or a mean and a standard deviation."""
+def read_costs(file: Path, method: str, seed: list[int]) -> tuple[str, Callable[[int], float]]:
+    """The device of a cost file, and a function that draws the duration in ms of an update with its perception.
 
-    device: str
-    samples: tuple[float, ...] = ()
-    mean_sd: tuple[float, float] | None = None
+    A cost file is a CSV file with the columns ``device`` and ``duration_ms``, of which rows are drawn with replacement,
+    or ``device``, ``mean_ms`` and ``sd_ms`` with one row, of which a gamma distribution has the mean and the standard
+    deviation. A column ``method`` restricts a row to that method. Other columns are ignored.
+    """
+    import numpy as np
 
-    def draws(self, seed: list[int]) -> Callable[[int], float]:
-        """A function that returns the next duration: of ``samples`` with replacement, otherwise from a gamma
-        distribution, which has no negative values, with that mean and standard deviation."""
-        import numpy as np
-
-        generator = np.random.default_rng(seed)
-        if self.mean_sd is None:
-            return lambda frame: self.samples[int(generator.integers(len(self.samples)))]
-        mean, sd = self.mean_sd
-        return lambda frame: float(generator.gamma((mean / sd) ** 2, sd**2 / mean)) if mean and sd else mean
-
-
-def read_costs(file: Path, method: str) -> Costs:
-    """The durations of ``method`` in a cost file: a CSV file with the columns ``device`` and ``duration_ms``, or
-    ``device``, ``mean_ms`` and ``sd_ms`` with one row, and optionally ``method``; other columns are ignored."""
-    rows = list(csv.DictReader(_lines(file)))
-    names = set(rows[0]) if rows else set()
-    is_sampled = "duration_ms" in names
-    if "device" not in names or not (is_sampled or {"mean_ms", "sd_ms"} <= names):
-        raise DataError(f"{shown(file)}: expected the columns device and duration_ms, or device, mean_ms and sd_ms")
-    own = [row for row in rows if row.get("method", method) in (method, method.partition("@")[0].partition("~")[0])]
-    devices = {row["device"] for row in own}
-    if len(devices) != 1 or not (is_sampled or len(own) == 1):
-        what = "rows of one device" if is_sampled else "one row"
-        raise DataError(f"{shown(file)}: expected {what} for {printable(method, 80)}, found {counted(len(own), 'row')}")
+    generator = np.random.default_rng(seed)
+    names = method, method.partition("@")[0].partition("~")[0]
     try:
-        device = _is_printable(devices.pop() or "")
-        wanted = ["duration_ms"] if is_sampled else ["mean_ms", "sd_ms"]
-        values = [_cost_ms(row[name]) for row in own for name in wanted]
-    except (TypeError, ValueError) as error:
-        raise DataError(f"{shown(file)}: {printable(str(error), 200)}") from error
-    if not device:
-        raise DataError(f"{shown(file)}: device is empty; name the machine or GPU on which the costs were measured")
-    return Costs(device, tuple(values)) if is_sampled else Costs(device, mean_sd=(values[0], values[1]))
-
-
-def _cost_ms(value: str) -> float:
-    cost = float(value)
-    if not 0 <= cost <= MAX_TIME_S * 1e3:
-        raise ValueError(f"'{value}' is not a duration in ms")
-    return cost
+        rows = [row for row in csv.DictReader(_lines(file)) if row.get("method", method) in names]
+        (device,) = {printable(row["device"] or "", 300) for row in rows}
+        if not device:
+            raise ValueError("device is empty")
+        if "duration_ms" in rows[0]:
+            samples = [_limited(row["duration_ms"], MAX_COST_MS) for row in rows]
+            return device, lambda frame: samples[int(generator.integers(len(samples)))]
+        ((mean, sd),) = [[_limited(row[name], MAX_COST_MS) for name in ("mean_ms", "sd_ms")] for row in rows]
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
+        what = f"rows of one device for {printable(method, 80)}, with duration_ms, or one row with mean_ms and sd_ms"
+        raise DataError(f"{shown(file)}: expected {what} ({printable(str(error), 120)})") from error
+    return device, lambda frame: float(generator.gamma((mean / sd) ** 2, sd**2 / mean)) if mean and sd else mean
