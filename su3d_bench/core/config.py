@@ -15,11 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-<<<<<<< HEAD
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
-=======
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
->>>>>>> F
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.safe_output import one_line

@@ -22,32 +22,8 @@ def with_clock(config: RunConfig) -> RunConfig:
 
     A schedule determines the rate, the queue and the stride.
     """
-<<<<<<< HEAD
-    if config.schedule is None and not config.realtime:
-        for name in OF_CLOCK:
-            if getattr(config, name) != RunConfig.model_fields[name].default:
-                raise ConfigError(f"{_flag(config, name)}: has no effect without --realtime HZ")
-        return config
-    if config.anytime_every:
+    if config.realtime and config.anytime_every:
         raise ConfigError("--anytime-every: in real time updates have no fixed distance; use --anytime SHARE")
-    if config.schedule is None:
-        if config.queue == "newest" and config.queue_size > 1:
-            raise ConfigError(f"--queue-size {config.queue_size}: 'newest' has one place; choose another --queue")
-        size = config.queue_size or (1 if config.queue == "newest" else QUEUE_SIZE)
-        return config.model_copy(update={"queue_size": size})
-    if config.cost is not None:
-        raise ConfigError("--cost: has no effect with --schedule, which has its own times")
-    stream = read_schedule(_any_schedule(config.schedule)).stream
-    values = {"realtime": stream.rate_hz, **stream.model_dump(include={"queue", "queue_size", "stride"})}
-    for name, value in values.items():
-        if getattr(config, name) not in (RunConfig.model_fields[name].default, value):
-            raise ConfigError(f"{_flag(config, name)}: the schedule has {value}; omit the option")
-    return config.model_copy(update=values)
-
-
-def _flag(config: RunConfig, name: str) -> str:
-    return f"--{name.replace('_', '-')} {getattr(config, name)}"
-=======
     fixed: dict[str, Any] = {"queue": "newest", "queue_size": 0, "cost": None}
     why = "has no effect without --realtime HZ"
     if config.schedule is not None:
@@ -61,7 +37,6 @@ def _flag(config: RunConfig, name: str) -> str:
         if (given := getattr(config, name)) not in (RunConfig.model_fields[name].default, value):
             raise ConfigError(f"--{name.replace('_', '-')} {given}: {why}")
     return config.model_copy(update=fixed)
->>>>>>> F
 
 
 def _any_schedule(place: Path) -> Path:

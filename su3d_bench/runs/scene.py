@@ -43,7 +43,6 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth, pack_scores, score_located, score_scene
 from su3d_bench.metrics.seen import clouds_of, reason_against, restricted
 from su3d_bench.numerics.visibility import first_shown
-from su3d_bench.runs.clock import Schedule
 from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
@@ -54,6 +53,7 @@ from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import job as jobs
+from su3d_bench.runs.clock import Schedule
 from su3d_bench.runs.executors import Event, Report, exceeds_memory
 from su3d_bench.runs.frame_loop import SceneLog
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged

@@ -15,10 +15,10 @@ from painted_runs import COLLECTOR, PAINTED, job, run, words
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
-from su3d_bench.runs.clock import read_schedule
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.clock import read_schedule
 from su3d_bench.store.records import CostsRecord, checked
 from su3d_bench.store.run_folder import JobFolder
 
