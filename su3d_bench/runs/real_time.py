@@ -22,7 +22,7 @@ def with_clock(config: RunConfig) -> RunConfig:
 
     A schedule determines the rate, the queue and the stride.
     """
-    if config.realtime and config.anytime_every:
+    if config.anytime_every and (config.realtime or config.schedule is not None):
         raise ConfigError("--anytime-every: in real time updates have no fixed distance; use --anytime SHARE")
     fixed: dict[str, Any] = {"queue": "newest", "queue_size": 0, "cost": None}
     why = "has no effect without --realtime HZ"
