@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile -c constraints.txt
-DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
+DEMO_SCENES := homes/tuning0 homes/tuning1 homes/tuning2 homes/tuning3
+BENCH_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
 .PHONY: demo test test-quick proofs mutants bench bench-methods reference architecture docs lint clean
 
 demo: $(VENV)/core
-	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
+	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols homes-semantic homes-instance --out runs/demo
 	$(BIN)/su3d-bench report html runs/demo --out runs/demo.html
 
 test: $(VENV)/test
@@ -40,12 +41,12 @@ bench: $(VENV)/test
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks write_performance build/bench.json
 
-# All methods on the demo rooms, and on corridors long enough for maps of 5 million points: on two cores three
+# All methods on four rooms, and on corridors long enough for maps of 5 million points: on two cores three
 # quarters of an hour for the rooms and half an hour for the corridors.
 CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
 CORRIDOR := benchmarks/scale/corridor.py:Corridor
 bench-methods: $(VENV)/test
-	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
+	$(BIN)/su3d-bench run --scenes $(BENCH_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/930m --methods opensu3d conceptfusion conceptfusion-sam sam3d@incremental conceptgraphs --out runs/bench-corridor
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/310m --methods conceptgraphs-detector --out runs/bench-corridor-detector
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans

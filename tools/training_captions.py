@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -250,20 +250,25 @@ class TruthTable:
         return np.asarray(result & self._relations(captions, crops))
 
     def _relations(self, captions: Sequence[Caption], crops: NDArray[np.int64]) -> BoolArray:
-        shown = np.zeros((len(crops), len(self._pairs)), np.float32)
-        for column, crop in enumerate(crops):
-            shown[column, self._pairs_of[crop]] = 1.0
         result = np.ones((len(captions), len(crops)), bool)
         related = [row for row, caption in enumerate(captions) if caption.relation]
-        wanted: Float32Array = np.zeros((len(related), len(self._pairs)), np.float32)
-        for row, index in enumerate(related):
-            wanted[row, self._wanted_pairs(captions[index])] = 1.0
-        result[related] = wanted @ shown.T > 0
+        wanted = _rows_with_ones([self._wanted_pairs(captions[row]) for row in related], len(self._pairs))
+        shown = _rows_with_ones([self._pairs_of[crop] for crop in crops], len(self._pairs))
+        result[related] = (wanted @ shown.T).toarray() > 0
         return result
 
     def _wanted_pairs(self, caption: Caption) -> list[int]:
         keys = [(caption.relation, name, caption.other_colour) for name in caption.others or ("",)]
         return [pair for key in keys for pair in self._pairs_by_key.get(key, ())]
+
+
+def _rows_with_ones(columns: Sequence[Sequence[int] | NDArray[np.int64]], n_columns: int) -> Any:
+    """A sparse matrix with ones in the given columns of each row."""
+    from scipy.sparse import csr_array
+
+    ends = np.concatenate([[0], np.cumsum([len(row) for row in columns])])
+    places = np.concatenate([np.asarray(row, np.int64) for row in columns]) if len(columns) else np.zeros(0, np.int64)
+    return csr_array((np.ones(len(places), np.float32), places, ends), shape=(len(columns), n_columns))
 
 
 def _numbers(words: Iterable[str]) -> Names:

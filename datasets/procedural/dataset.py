@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from threading import Lock
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import GroundTruthMissing
+from su3d_bench.core.files.atomic import Scratch, StoredRows
 from su3d_bench.core.types import (
     Float64Array,
     Frame,
@@ -35,6 +38,7 @@ from su3d_bench.datasets.procedural.truth import Described, SceneObject, SceneTr
 
 FRAMES_PER_SECOND = 30.0
 SCENES_IN_MEMORY = 2
+MAX_KEPT_FRAMES = 64  # of a scene, in a temporary file: 2 MB each at 640 x 480
 
 
 class SceneOptions(BaseModel):
@@ -176,6 +180,7 @@ class GeneratedScenes(ABC):
         self.root = root
         self.options: Any = options or self.Options()
         self._built: OrderedDict[str, BuiltScene] = OrderedDict()
+        self._kept = KeptFrames("")
 
     @staticmethod
     @abstractmethod
@@ -238,9 +243,11 @@ class GeneratedScenes(ABC):
         return built.renderer.render(pose)
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """Every ``stride``-th frame, rendered on access."""
+        """Every ``stride``-th frame, rendered on first access."""
         self.check_name(scene)
-        return RenderedFrames(self, scene, range(0, self.options.n_frames, stride))
+        if self._kept.scene != scene:
+            self._kept = KeptFrames(scene)
+        return RenderedFrames(self, self._kept, range(0, self.options.n_frames, stride))
 
     @abstractmethod
     def frame(self, scene: str, index: int) -> Frame:
@@ -330,14 +337,37 @@ class GeneratedScenes(ABC):
         return self._built[scene]
 
 
-class RenderedFrames(Sequence[Frame]):
-    """Frames of one scene, each rendered on access."""
+class KeptFrames:
+    """The first frames of a scene that were rendered, in a temporary file, so that the next method need not wait."""
 
-    def __init__(self, dataset: GeneratedScenes, scene: str, indices: range) -> None:
-        self._dataset, self._scene, self._indices = dataset, scene, indices
+    def __init__(self, scene: str) -> None:
+        self.scene = scene
+        self._scratch = Scratch(most_in_memory_bytes=1)
+        self._lock = Lock()
+        self._images: dict[int, tuple[StoredRows, StoredRows, Frame]] = {}
+
+    def frame(self, index: int, render: Callable[[str, int], Frame]) -> Frame:
+        """Frame ``index``, by ``render`` unless it is kept; kept images are read-only."""
+        with self._lock:
+            if index in self._images:
+                rgb, depth_m, small = self._images[index]
+                return replace(small, rgb=rgb.rows(0, rgb.shape[0]), depth_m=depth_m.rows(0, depth_m.shape[0]))
+        frame = render(self.scene, index)
+        with self._lock:
+            if index not in self._images and len(self._images) < MAX_KEPT_FRAMES:
+                small = replace(frame, rgb=frame.rgb[:1, :1].copy(), depth_m=frame.depth_m[:1, :1].copy())
+                self._images[index] = self._scratch.put(frame.rgb), self._scratch.put(frame.depth_m), small
+        return frame
+
+
+class RenderedFrames(Sequence[Frame]):
+    """Frames of one scene, each rendered on first access."""
+
+    def __init__(self, dataset: GeneratedScenes, kept: KeptFrames, indices: range) -> None:
+        self._dataset, self._kept, self._indices = dataset, kept, indices
 
     def __len__(self) -> int:
         return len(self._indices)
 
     def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
-        return self._dataset.frame(self._scene, self._indices[position])
+        return self._kept.frame(self._indices[position], self._dataset.frame)

@@ -44,7 +44,7 @@ def call_compare(arguments: argparse.Namespace) -> None:
     """Compare two runs on their common scenes: differences with confidence intervals and exact tests.
 
     su3d-bench compare runs/before runs/after --per-class
-    su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json
+    su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols homes-instance --json
     """
     from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables

@@ -21,7 +21,7 @@ def add_parser(verbs: Verbs) -> None:
     """List, check, show, fetch and generate datasets, or create your own.
 
     su3d-bench datasets list
-    su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data
+    su3d-bench datasets make homes --scenes tuning0 --layout replica --out data
     """
     actions = add_group(verbs, "datasets", add_parser, lists=True)
     parser = add_verb(actions, "list", call_list, data=True)
@@ -57,7 +57,7 @@ def call_check(arguments: argparse.Namespace) -> int:
     """Check every file and frame of scenes, and report all problems and the dataset digest.
 
     su3d-bench datasets check 'replica/*'
-    su3d-bench datasets check rooms/living0 --set rooms.n_frames=40 --json
+    su3d-bench datasets check homes/tuning0 --set homes.n_frames=40 --json
     """
     from su3d_bench.cli import scenes  # here and below: slow to import
 
@@ -78,7 +78,7 @@ def call_show(arguments: argparse.Namespace) -> None:
 def call_make(arguments: argparse.Namespace) -> None:
     """Generate scenes on disk; the same command resumes after an interruption.
 
-    su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'
+    su3d-bench datasets make homes --layout replica --out data --scenes 'test*'
     su3d-bench datasets make rooms --layout scannet --out small --scenes bathroom0 --set n_frames=120
     """
     from su3d_bench.cli import make_scenes

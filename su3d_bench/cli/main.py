@@ -31,8 +31,8 @@ MODULE_OF = {"ablate": "run", "check": "compare"}
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
-  su3d-bench run --scenes rooms/living0 --methods opensu3d oracle
-  su3d-bench query text rooms/living0 "plant on shelf"
+  su3d-bench run --scenes homes/tuning0 --methods opensu3d oracle
+  su3d-bench query text homes/tuning0 "plant on shelf"
 """
 
 

@@ -24,9 +24,9 @@ REGISTRY_FILES = {
 KEPT = "bundles/.gitkeep"
 # Next commands; {at} is the file on the command line.
 NEXT = {
-    "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
+    "method": ("methods check {at}", "run --scenes homes/tuning0 --methods {at}"),
     "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
-    "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
+    "protocol": ("protocols show {at}", "run --scenes homes/tuning0 --protocols {at}"),
     REGISTRY: ("dev registry add BUNDLE --registry {at}", "dev registry build {at} --out site"),
 }
 

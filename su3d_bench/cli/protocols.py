@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 def add_parser(verbs: Verbs) -> None:
     """List protocols, show their rules, compare two, or create your own.
 
-    su3d-bench protocols show rooms-semantic
-    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
+    su3d-bench protocols show homes-semantic
+    su3d-bench protocols diff homes-semantic replica-mesh-ex6
     """
     actions = add_group(verbs, "protocols", add_parser, lists=True)
     add_verb(actions, "list", call_list)
@@ -67,8 +67,8 @@ def call_list(arguments: argparse.Namespace) -> None:
 def call_show(arguments: argparse.Namespace) -> None:
     """Show every rule of a protocol with its source.
 
-    su3d-bench protocols show rooms-semantic
-    su3d-bench protocols show rooms-semantic --list-texts
+    su3d-bench protocols show homes-semantic
+    su3d-bench protocols show homes-semantic --list-texts
     """
     from su3d_bench.metrics.compatibility import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
@@ -94,8 +94,8 @@ def _plain(stated: ResolvedOriginal | None) -> dict[str, Any] | None:
 def call_diff(arguments: argparse.Namespace) -> None:
     """Show the rules in which two protocols differ.
 
-    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
-    su3d-bench protocols diff rooms-instance replica-openmask3d --json
+    su3d-bench protocols diff homes-semantic replica-mesh-ex6
+    su3d-bench protocols diff homes-instance replica-openmask3d --json
     """
     from su3d_bench.metrics.protocols.loading import load_protocol, rule_differences
     from su3d_bench.reports.tables.comparison import rules_tables
@@ -145,7 +145,7 @@ EVALUATE_SUFFIXES = (".toml", ".csv")  # of queries and their objects
 def call_texts(arguments: argparse.Namespace) -> None:
     """Encode the class names or queries of a protocol, for evaluate --text-features.
 
-    su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz
+    su3d-bench protocols texts --protocol homes-semantic --encoder embedded --out texts.npz
     su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz
     """
     from su3d_bench.core.files.atomic import make_folder, write_npz

@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 def add_parser(verbs: Verbs) -> None:
     """Search a map for a text, ask it questions, or work with question sets.
 
-    su3d-bench query text rooms/living0 "plant on shelf"
+    su3d-bench query text homes/tuning0 "plant on shelf"
     su3d-bench query show paper
     """
     actions = add_group(verbs, "query", add_parser)
     parser = add_verb(actions, "text", call_text)
-    parser.option("scene SCENE", "scene, such as rooms/living0")
+    parser.option("scene SCENE", "scene, such as homes/tuning0")
     parser.option("text", "text to search for")
     parser.shared("--run", "--method")
     parser.option("--top N", "number of instances to list (default: 10)", type=count, default=10)
@@ -38,7 +38,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.option("--out FIGURE", ".pdf, .png or .svg file to write (default: next to the map)")
     parser.shared("--width")
     parser = add_verb(actions, "ask", call_ask)
-    parser.option("scene SCENE", "scene, such as rooms/living0")
+    parser.option("scene SCENE", "scene, such as homes/tuning0")
     parser.option("question", "question in English")
     parser.shared("--run", "--method")
     parser.option(
@@ -66,8 +66,8 @@ def add_parser(verbs: Verbs) -> None:
 def call_text(arguments: argparse.Namespace) -> None:
     """Rank the instances of a map by similarity to a text, and draw a heat map.
 
-    su3d-bench query text rooms/living0 "plant on shelf"
-    su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json
+    su3d-bench query text homes/tuning0 "plant on shelf"
+    su3d-bench query text homes/tuning0 "place to sit" --top 3 --method opensu3d --json
     """
     from su3d_bench.core.maps import DenseFeatures, Instances
     from su3d_bench.questions.model import best_of, rank
@@ -75,7 +75,7 @@ def call_text(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.finished import encoder_of
 
     if not arguments.text.strip():
-        raise ConfigError('the text is empty; use for example: su3d-bench query text rooms/living0 "a plant"')
+        raise ConfigError('the text is empty; use for example: su3d-bench query text homes/tuning0 "a plant"')
     run, job, prediction = options.open_map(arguments, "text", arguments.text)
     if not isinstance(prediction, Instances):
         what = "one feature per point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
@@ -104,15 +104,15 @@ def call_text(arguments: argparse.Namespace) -> None:
 def call_ask(arguments: argparse.Namespace) -> None:
     """Answer a question about a scene from its map, by geometry or a language model.
 
-    su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
-    su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --question-solver llm --dry-run
+    su3d-bench query ask homes/tuning0 "Which lamp is closer to the sofa?"
+    su3d-bench query ask homes/tuning0 "I am feeling cold, what should I do?" --question-solver llm --dry-run
     """
     from su3d_bench.core.maps import Instances
     from su3d_bench.questions.scene_map import map_of
 
     if not arguments.question.strip():
         raise ConfigError(
-            'the question is empty; use for example: su3d-bench query ask rooms/living0 "How many lamps are there?"'
+            'the question is empty; use for example: su3d-bench query ask homes/tuning0 "How many lamps are there?"'
         )
     run, job, instances = options.open_map(arguments, "ask", arguments.question)
     if not isinstance(instances, Instances):

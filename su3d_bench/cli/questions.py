@@ -25,7 +25,7 @@ MAX_CHARACTERS = 80
 
 def add_parser(verbs: Verbs) -> None:
     parser = add_verb(verbs, "make", _make, data=True)
-    parser.option("--scenes SCENE...", "scenes or patterns to use (such as 'rooms/*')", required=True)
+    parser.option("--scenes SCENE...", "scenes or patterns to use (such as 'homes/test*')", required=True)
     parser.option("--out FILE", ".toml or .csv file to write", type=output_path, required=True)
     parser.option("--per-kind N", "maximum number per kind and scene (default: all)", type=count)
     parser.option("--generated", "generate all questions (default: use the dataset's own, if any)")
@@ -45,7 +45,7 @@ def add_parser(verbs: Verbs) -> None:
 def _make(arguments: argparse.Namespace) -> None:
     """Generate a question set with known answers from the ground truth of scenes.
 
-    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'homes/test*' --per-kind 40 --exclude-ids disputed.csv --out queries.toml
     su3d-bench query make --scenes replica/room0 --generated --out queries.csv
     """
     from su3d_bench.questions.question_files import check_form, write_questions

@@ -251,7 +251,7 @@ def call_leaderboard(arguments: argparse.Namespace) -> None:
     """Rank all comparable runs in a folder.
 
     su3d-bench report leaderboard runs
-    su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html
+    su3d-bench report leaderboard submissions --protocols homes-instance --format html --out board.html
     """
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
@@ -276,7 +276,7 @@ def call_attribution(arguments: argparse.Namespace) -> None:
     """Show the gain in each metric if all errors of one type were corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
-    su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json
+    su3d-bench report attribution runs/my-run --protocols homes-instance --oracle runs/my-oracle-run --json
     """
     from su3d_bench.analysis.attribution import attribute
     from su3d_bench.reports.tables.instances import attribution_tables
@@ -310,7 +310,7 @@ def call_power(arguments: argparse.Namespace) -> None:
     """Power analysis: scenes and seeds needed to detect a difference between two methods.
 
     su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5
-    su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json
+    su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols homes-instance --json
     """
     from su3d_bench.analysis.comparison import plan
     from su3d_bench.reports.tables.comparison import plan_tables

@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
 def add_run_options(parser: Parser) -> None:
     """Add the options of both commands; values come from the flag, then ``--config``, then the default."""
     parser.option("scene [SCENE...]", "scenes or patterns, as in --scenes")
-    parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'rooms/*')")
+    parser.option("--scenes SCENE...", "scenes or patterns to use (default: 'homes/test*')")
     headline = "protocols to use (default: the dataset's headline protocol)"
     parser.option("--protocols PROTOCOL...", headline, action="extend")
     parser.shared("--all-protocols", "--profile", "--device")
@@ -76,8 +76,8 @@ def add_run_options(parser: Parser) -> None:
 def call_run(arguments: argparse.Namespace) -> int:
     """Run methods on scenes and score them; the same command resumes an interrupted run.
 
-    su3d-bench run rooms/living0 --methods opensu3d oracle
-    su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run
+    su3d-bench run homes/tuning0 --methods opensu3d oracle
+    su3d-bench run --scenes 'homes/test*' --limit 5 --set opensu3d.top_m=10 --dry-run
     """
     return execute(plan_of(arguments), arguments)
 
@@ -166,7 +166,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
 def call_ablate(arguments: argparse.Namespace) -> int:
     """Run an ablation: vary settings of a method, one at a time, on the same scenes.
 
-    su3d-bench ablate --vary top_m=1,5,10 k=1,3,5 --also-methods conceptgraphs --scenes 'rooms/*' --out runs/sweep
+    su3d-bench ablate --vary top_m=1,5,10 k=1,3,5 --also-methods conceptgraphs --scenes 'homes/test*' --out runs/sweep
     su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run
     """
     from su3d_bench.core import registry

@@ -66,7 +66,7 @@ def call_list(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{arguments.folder}: no such folder; name a folder of runs")
     entries = list_runs(arguments.folder) if arguments.folder.is_dir() else []
     if not entries:
-        remark(f"{arguments.folder}: no runs; create one with su3d-bench run rooms/living0", quiet=arguments.quiet)
+        remark(f"{arguments.folder}: no runs; create one with su3d-bench run homes/tuning0", quiet=arguments.quiet)
     if entries or arguments.json:
         output.answer_tables(arguments, [asdict(entry) for entry in entries], [runs_table(entries)])
 

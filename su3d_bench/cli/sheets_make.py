@@ -70,7 +70,7 @@ def call(arguments: argparse.Namespace) -> None:
     """Create annotation sheets for a run or for questions: an offline page, a CSV and a workbook.
 
     su3d-bench sheets make runs/my-run --kinds retrieval annotation reasoning --annotators 3 --out sheets
-    su3d-bench sheets make --kinds questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
+    su3d-bench sheets make --kinds questions --scenes 'homes/test*' --annotators 2 --overlap 1 --out sheets
     """
     from su3d_bench.human_eval.sets import has_openpyxl
     from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run

@@ -128,7 +128,7 @@ class RunConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    scenes: tuple[str, ...] = ("rooms/*",)
+    scenes: tuple[str, ...] = ("homes/test*",)
     methods: tuple[str, ...] = ("opensu3d",)
     profile: str = "auto"
     protocols: tuple[str, ...] = ()

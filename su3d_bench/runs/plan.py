@@ -240,7 +240,7 @@ def make_plan(
     rules = [load_protocol(name) for names in protocols.values() for name in names]
     for name in asked:
         if not any(map(USES_LANGUAGE[name], rules)):
-            raise ConfigError(f"{flag_of(name)}: needs a reasoning protocol, such as --protocols rooms-reasoning")
+            raise ConfigError(f"{flag_of(name)}: needs a reasoning protocol, such as --protocols homes-reasoning")
     if out is None:
         out = Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)
         existing = existing_run(out)

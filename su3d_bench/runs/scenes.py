@@ -31,7 +31,7 @@ def cache_root() -> Path:
 
 
 def split_address(address: str) -> tuple[str, str]:
-    """Dataset target and scene (or pattern) of ``rooms/living0`` or ``path/to/file.py:Class/scene``."""
+    """Dataset target and scene (or pattern) of ``homes/tuning0`` or ``path/to/file.py:Class/scene``."""
     head, colon, tail = address.partition(".py:")
     if colon:
         name, _, scene = tail.partition("/")
@@ -51,9 +51,9 @@ def nearest_scene(text: str, known: Iterable[str]) -> str:
 
     Empty if none is similar; a matching dataset name, which many scenes share, is not enough.
 
-    >>> nearest_scene("living0", ["rooms/living0"]), nearest_scene("rooms/livng0", ["rooms/living0"])
-    ("; did you mean 'rooms/living0'?", "; did you mean 'rooms/living0'?")
-    >>> nearest_scene("rooms/studio0", ["rooms/bedroom0"])
+    >>> nearest_scene("tuning0", ["homes/tuning0"]), nearest_scene("homes/tunng0", ["homes/tuning0"])
+    ("; did you mean 'homes/tuning0'?", "; did you mean 'homes/tuning0'?")
+    >>> nearest_scene("rooms/studio0", ["homes/tuning1"])
     ''
     """
     of_name: dict[str, str] = {}
@@ -78,7 +78,7 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
         elif not os.path.exists(address):
             raise ConfigError(f"no scene matches '{address}'{_nearest_address(address)}")
     if not targets:
-        hint = next(filter(None, map(_with_dataset, addresses)), "; expected such as rooms/living0 or 'rooms/*'")
+        hint = next(filter(None, map(_with_dataset, addresses)), "; expected such as homes/tuning0 or 'homes/test*'")
         raise ConfigError(f"no scene among {', '.join(addresses) or 'no --scenes'}{hint}")
     return list(targets)
 
@@ -108,7 +108,7 @@ def expand_scenes(
             raise ConfigError(f"no scene matches '{address}'{suggest(address, known)}")
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
-        raise ConfigError(f"no scene matches {', '.join(addresses)}; expected such as rooms/living0 or 'rooms/*'")
+        raise ConfigError(f"no scene matches {', '.join(addresses)}; expected such as homes/tuning0 or 'homes/test*'")
     notes = (f"ignored, not scenes: {' '.join(ignored)}",) if ignored else ()
     return list(chosen), notes
 

@@ -158,7 +158,7 @@ def test_auto_selects_paper_on_camera_images_if_models_exist(models: Path, no_mo
     assert resolve_profile("auto", "camera", away) == "embedded"
     assert resolve_profile("auto", "camera") == "embedded"
     caveat = built(away, no_models, "auto").caveat
-    assert caveat is not None and "rendered rooms only" in caveat
+    assert caveat is not None and "rendered homes only" in caveat
 
 
 def test_missing_requested_tagger_fails_before_any_frame(models: Path, no_models: Path) -> None:

@@ -51,7 +51,7 @@ def log_size(height: int, width: int) -> tuple[float, float]:
 
 
 class EmbeddedEncoder:
-    """Two small towers trained on rendered rooms only; files are read at first use.
+    """Two small towers trained on rendered homes only; files are read at first use.
 
     Every text runs through the network alone and on one thread, so that a feature never depends on the rest of the
     batch or on the number of cores. Images run in batches if a test at first use shows that this changes no bit,
@@ -60,7 +60,7 @@ class EmbeddedEncoder:
 
     name = "su3d-embedded"
     dim = DIM
-    trained_on = "rooms rendered by the program, different from the built-in ones"
+    trained_on = "homes rendered by the program, without held-out models and novel classes"
     # questions/generator.py asks for "cushion on a sofa", training captions had "cushion on sofa", with equal relations
     relative_remark = (
         "relation words and the pattern of these queries are those of the captions that the embedded encoder was "

@@ -46,6 +46,22 @@ def test_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> None:
     assert _same(rooms.scan(SCENE), again.scan(SCENE))
 
 
+def test_frames_are_rendered_once_and_kept_for_the_next_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rooms, rendered = Rooms(tmp_path, SMALL), list[int]()
+    render = rooms.frame
+    monkeypatch.setattr(rooms, "frame", lambda scene, index: rendered.append(index) or render(scene, index))
+    first, again = ([rooms.frames(SCENE, 1)[k] for k in range(70)] for _ in range(2))
+    assert rendered == [*range(70), *range(64, 70)]  # 64 of a scene are kept
+    for one, other in zip(first, again, strict=True):
+        assert one.rgb.tobytes() == other.rgb.tobytes()
+        assert one.depth_m.tobytes() == other.depth_m.tobytes()
+        assert one.camera_to_world.tobytes() == other.camera_to_world.tobytes()
+        assert (one.index, one.timestamp_s) == (other.index, other.timestamp_s)
+    rooms.frames("living0", 1)
+    assert rooms.frames(SCENE, 1)[0].rgb.tobytes() == first[0].rgb.tobytes()
+    assert rendered[-1] == 0
+
+
 @pytest.mark.parametrize("name", ["kitchn0", "living2", "../scenes/living0"])
 def test_other_scene_name_is_rejected_with_the_rooms_there_are(rooms: Rooms, name: str) -> None:
     with pytest.raises(DataError, match=r"no scene .*living0, .*bathroom7; .*homes/seed0"):
