@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.english import with_article
-from su3d_bench.core.types import BoolArray, Float32Array
+from su3d_bench.core.types import BoolArray
 from su3d_bench.perception.embedded.lexicon import (
     AFFORDANCES,
     ANYTHING,
