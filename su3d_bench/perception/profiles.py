@@ -113,7 +113,7 @@ class EmbeddedPerception:
 def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionConfig | None = None) -> str:
     """The profile selected by ``profile``: ``auto`` is ``paper`` on camera images if its models are installed.
 
-    Otherwise ``auto`` is ``embedded``: on rendered homes and rooms, for which its encoder was trained, and without ``config``.
+    Otherwise ``auto`` is ``embedded``: on rendered scenes, for which its encoder was trained, and without ``config``.
     """
     if profile not in PROFILES:
         raise ConfigError(f"unknown profile '{profile}'{suggest(profile, PROFILES)}")
