@@ -3,8 +3,8 @@
     python -m pytest benchmarks/speed/bench_track.py --benchmark-only
 
 A 1200x680 image of 24 masks at 1.5 to 3.5 m, whose instances are always in the map. The others are plates of 0.2 m with
-100 points: ``elsewhere``, or ``in the box`` of the view's points, where no pixel sees them. A round is one update per
-size, in random order; the exponent and its 95 % interval are of the stage ``track``.
+100 points: ``elsewhere``, or ``in the box`` of the view's points, where no pixel sees them. A round is three updates
+per size, in random order; the exponent and its 95 % interval are of the shortest stage ``track`` of the three.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def filled(n_instances: int, shift_m: float, frame: Frame, detections: Detection
 
 @pytest.mark.parametrize(("where", "shift_m"), [("elsewhere", 10.0), ("in the box", 0.0)])
 def test_track(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture[str], where: str, shift_m: float) -> None:
-    benchmark.group = "updates of maps of 200 to 5,000 instances"
+    benchmark.group = "36 updates of maps of 200 to 5,000 instances"
     frame, detections = masks_at_several_distances()
     methods = [filled(n, shift_m, frame, detections) for n in SIZES]
     generator = np.random.default_rng(0)
@@ -55,10 +55,11 @@ def test_track(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture[str], 
 
     def one_round() -> None:
         for k in generator.permutation(len(SIZES)):
-            timer = Timer()
-            methods[k].update(frame, detections, timer)
+            timers = [Timer() for _ in range(3)]
+            for timer in timers:
+                methods[k].update(frame, detections, timer)
             sizes.append(SIZES[k])
-            track_ms.append(timer.take()["track"])
+            track_ms.append(min(timer.take()["track"] for timer in timers))
 
     benchmark.pedantic(one_round, rounds=ROUNDS, warmup_rounds=1)
     assert [method.n_instances for method in methods] == SIZES.tolist()  # every mask got its instance again

@@ -205,12 +205,9 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
         table[slot_of(table, keys, keys[block, 0], keys[block, 1], keys[block, 2])] = block
 
 
-@njit(cache=True)
-def _tally(instance, block, n, tallies):  # type: ignore[no-untyped-def]
-    """Add ``n`` to the number of points of ``instance`` in ``block``; nothing if it is 0, no instance."""
-    counts, pairs, pair_table, first_pair = tallies
-    if instance == 0:
-        return
+@njit(cache=True, inline="always")
+def _tally(instance, block, n, counts, pairs, pair_table, first_pair):  # type: ignore[no-untyped-def]
+    """Add ``n`` to the number of points of ``instance`` in ``block``."""
     slot = slot_of(pair_table, pairs, instance, block, 0)
     row = pair_table[slot]
     if row == ABSENT:
@@ -223,24 +220,23 @@ def _tally(instance, block, n, tallies):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def copy_pairs(old, tallies):  # type: ignore[no-untyped-def]
-    """Add those of the pairs ``old`` that have points to ``tallies``."""
+def copy_pairs(old, counts, pairs, pair_table, first_pair):  # type: ignore[no-untyped-def]
+    """Add those of the pairs ``old`` that have points to ``pairs``."""
     for row in range(len(old)):
         if old[row, N_POINTS] > 0:
-            _tally(old[row, 0], old[row, 1], old[row, N_POINTS], tallies)
+            _tally(old[row, 0], old[row, 1], old[row, N_POINTS], counts, pairs, pair_table, first_pair)
 
 
 @njit(cache=True)
 def insert(  # type: ignore[no-untyped-def]
-    new_points, new_ids, start, eps, density, placed, ids, born, tallies, points, following, keys, heads, table
-):
+    new_points, new_ids, start, eps, density, placed, ids, born,
+    counts, pairs, pair_table, first_pair, points, following, keys, heads, table,
+):  # fmt: skip
     """Insert new points from ``start`` on; stop when the blocks or pairs run out and return the point reached.
 
     ``placed`` receives the map index of each inserted point (that of the point it replaced, if any), ABSENT for the
-    others. ``tallies``: the numbers of points, of blocks, of all points inserted so far and of pairs; the pairs; their
-    hash table; the first pair of each instance.
+    others. ``counts``: the numbers of points, of blocks, of all points inserted so far and of pairs.
     """
-    counts, pairs = tallies[0], tallies[1]
     bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
     for i in range(start, len(new_points)):
         if counts[3] == len(pairs):
@@ -272,9 +268,10 @@ def insert(  # type: ignore[no-untyped-def]
             counts[0] += 1
         elif density == FRAME or (new_ids[i] == 0 and old_id != 0):
             continue
-        if new_ids[i] != old_id:
-            _tally(old_id, block, -1, tallies)
-            _tally(new_ids[i], block, 1, tallies)
+        if old_id != 0 and old_id != new_ids[i]:
+            _tally(old_id, block, -1, counts, pairs, pair_table, first_pair)
+        if new_ids[i] != 0 and old_id != new_ids[i]:
+            _tally(new_ids[i], block, 1, counts, pairs, pair_table, first_pair)
         points[target, 0], points[target, 1], points[target, 2] = x, y, z
         ids[target], born[target] = new_ids[i], born_as
         placed[i] = target
@@ -373,14 +370,13 @@ def _count_pair(pair, lower, upper, first, last, pairs, ids, points, following, 
 
 @njit(cache=True)
 def count_inside(  # type: ignore[no-untyped-def]
-    lower, upper, wanted, eps, inside, ids, tallies, points, following, keys, heads, table
+    lower, upper, wanted, eps, inside, ids, pairs, pair_table, first_pair, points, following, keys, heads, table
 ):
     """Add the points of each id of ``wanted`` in the closed box to ``inside``; return the number of blocks visited.
 
     Iterates over the blocks of the id, or over those of the box if they are fewer. Blocks between those of the box's
     faces are inside with all points.
     """
-    _, pairs, pair_table, first_pair = tallies
     first, last = np.floor(lower / eps).astype(np.int64) >> 3, np.floor(upper / eps).astype(np.int64) >> 3
     span = last - first + 1
     n_in_box = float(span[0]) * float(span[1]) * float(span[2])

@@ -59,7 +59,7 @@ class VoxelMap:
 
     @property
     def _tallies(self) -> tuple[NDArray[Any], ...]:
-        return self._counts, self._pairs, self._pair_table, self._first_pair
+        return self._pairs, self._pair_table, self._first_pair
 
     @property
     def n_bytes(self) -> int:
@@ -121,7 +121,7 @@ class VoxelMap:
         inside = np.zeros(len(wanted), np.int64)
         self._reserve_ids(wanted)
         ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-        visited = _kernels.count_inside(*ends, wanted, self.eps, inside, self._ids, self._tallies, *self._arrays)
+        visited = _kernels.count_inside(*ends, wanted, self.eps, inside, self._ids, *self._tallies, *self._arrays)
         return inside, int(visited)
 
     def insert(self, points: Float64Array, ids: Int32Array) -> Int64Array:
@@ -139,8 +139,8 @@ class VoxelMap:
         density = {"scene": _kernels.SCENE, "frame": _kernels.FRAME, "all": _kernels.ALL}[self.density]
         done = 0
         while True:
-            of_points = placed, self._ids, self._born, self._tallies
-            done = _kernels.insert(points, ids, done, self.eps, density, *of_points, *self._arrays)
+            arrays = placed, self._ids, self._born, self._counts, *self._tallies, *self._arrays
+            done = _kernels.insert(points, ids, done, self.eps, density, *arrays)
             if done == len(points):
                 return placed
             if self._counts[3] == len(self._pairs):
@@ -189,7 +189,7 @@ class VoxelMap:
         self._pair_table = np.full(4 * capacity, -1, np.int32)
         self._first_pair[:] = -1
         self._counts[3] = 0
-        _kernels.copy_pairs(old, self._tallies)
+        _kernels.copy_pairs(old, self._counts, *self._tallies)
 
     def _double_blocks(self) -> None:
         from su3d_bench.opensu3d import kernels as _kernels
