@@ -218,6 +218,9 @@ class SAM3D:
             check_range("views", cloud.views, 0, len(self._views))
             for group in (cloud.group, cloud.view_group):
                 check_range("group", group, NO_GROUP, len(cloud) + len(self._views) + 1)
+        for place, pose in self._poses.values():
+            if not 0 <= place < len(self._clouds) or pose.shape != (4, 4) or not np.isfinite(pose).all():
+                raise ValueError("a pose is invalid")
         if self._surface is not None:
             check_range("triangles", self._surface.triangles, 0, len(self._surface.vertices))
 

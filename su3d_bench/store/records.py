@@ -312,7 +312,7 @@ def plain(record: Any) -> dict[str, Any]:
 
 def checked(kind: type[Kind], value: Any) -> Kind:
     """``value`` as a record; raises ``ValidationError`` or ``RecursionError`` if it is invalid."""
-    record: Kind = _adapter(kind).validate_python(value)
+    record: Kind = _adapter(kind).validate_python(value)  # type: ignore[arg-type]  # every class is hashable
     return record
 
 
