@@ -204,8 +204,9 @@ def _cause(exit_code: int | None, memory: str) -> str:
 def limit_memory(n_bytes: int | None) -> None:
     """Limit the memory of this process and its children, each alone; None removes the limit.
 
-    The limit is ``RLIMIT_DATA``: on Linux private writable memory, which arrays and heaps use. ``RLIMIT_AS`` also
-    counts address space that is only reserved, of which CUDA takes many times the memory of the machine.
+    The limit is ``RLIMIT_DATA``: on Linux private writable memory, such as arrays and heaps. ``RLIMIT_AS`` also counts
+    libraries and reserved address space: a process with numba, ONNX Runtime and the embedded encoder has 185 MiB of the
+    former, a resident set of 200 MiB and an address space of 720 MiB.
     """
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = hard if n_bytes is None or (hard != resource.RLIM_INFINITY and n_bytes > hard) else n_bytes

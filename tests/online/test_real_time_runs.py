@@ -179,7 +179,7 @@ def test_a_schedule_that_does_not_fit_is_refused_in_one_line(capsys: pytest.Capt
         (("--realtime", "5", "--cost", "missing.csv"), "missing.csv: cannot be read"),
         (("--schedule", "."), "has no schedules"),
         (("--memory", "8 apples"), "string should match pattern"),
-        (("--memory", "8G", "--executor", "inline"), "needs Linux and the executor 'processes'"),
+        (("--memory", "8G", "--executor", "inline"), "needs Linux and --executor processes"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options: tuple[str, ...], message: str) -> None:
@@ -207,7 +207,7 @@ class Modest:
         pass
 
     def finish(self):
-        return Instances.of(np.zeros((1, 3)), [np.array([0])], None, None, labels=["chair"])
+        return Instances.of(np.array([[0.0, 0.0, 3.0]]), [np.array([0])], None, None, labels=["chair"])
 
 
 class Greedy(Modest):
