@@ -74,7 +74,8 @@ def train(crops: CropSet, plan: TrainingPlan, keep: Callable[[Towers], None]) ->
     torch's own threads would synchronize in every operation and wait for each other on a busy machine.
     """
     torch.manual_seed(plan.seed)
-    image, text = ImageTower().to(memory_format=torch.channels_last), TextTower()
+    image, text = ImageTower(), TextTower()
+    image.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     parameters = [*image.parameters(), *text.parameters()]
     optimizer = torch.optim.AdamW(parameters, plan.learning_rate, weight_decay=plan.weight_decay, fused=True)
     sources = [Batches(crops, (plan.seed, lane), plan.batch_size // plan.threads) for lane in range(plan.threads)]

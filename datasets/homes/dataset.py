@@ -73,7 +73,7 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
 class BuiltHome(BuiltScene):
     """A furnished home."""
 
-    scan_stride = 4  # between these frames the camera moves by centimetres
+    scan_stride = 8  # between these frames the camera moves by centimetres
 
     def __init__(self, scene: str, options: HomeOptions, folder: Path | None) -> None:
         super().__init__(scene, options, folder)

@@ -105,7 +105,7 @@ def size_bytes(text: str) -> int:
     >>> size_bytes("8G"), size_bytes("500M")
     (8589934592, 524288000)
     """
-    return int(text[:-1]) * 1024 ** (1 + "KMGT".index(text[-1]))
+    return int(text[:-1]) << 10 * (1 + "KMGT".index(text[-1]))
 
 
 class RunConfig(BaseModel):

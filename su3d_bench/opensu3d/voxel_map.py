@@ -151,7 +151,7 @@ class VoxelMap:
     def state(self) -> dict[str, NDArray[Any]]:
         """The arrays from which ``restore`` recreates the map."""
         born = self._born[: len(self)]
-        return {"points": self.points, "ids": self.ids, "born": born, "n_inserted": self._counts[2:]}
+        return {"points": self.points, "ids": self.ids, "born": born, "n_inserted": self._counts[2:3]}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Fill this empty map with the points of a ``state``.
@@ -184,7 +184,7 @@ class VoxelMap:
         from su3d_bench.opensu3d import kernels as _kernels
 
         old = self._pairs
-        capacity = doubled(len(old), 2 * np.count_nonzero(old[:, _kernels.N_POINTS]))
+        capacity = doubled(len(old), 2 * int(np.count_nonzero(old[:, _kernels.N_POINTS])))
         self._pairs = np.empty((capacity, old.shape[1]), np.int64)
         self._pair_table = np.full(4 * capacity, -1, np.int32)
         self._first_pair[:] = -1

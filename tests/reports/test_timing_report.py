@@ -109,10 +109,10 @@ def test_timing_report_prints_tables_and_writes_plots(
     assert [row[0] for row in seen] == ["10 %", "50 %", "100 %", "area"] and {row[2] for row in seen} == {"100.0"}
     assert "12 updates of 2 scenes" in shown
     assert "| exponent by instances |" in shown
-    rows = list(csv.DictReader((tmp_path / "timing.csv").open()))
-    assert {"points_exponent", "instances_exponent", "instances_low", "instances_high"} <= {*rows[0]}
-    assert {"map", "total"} <= {row["stage"] for row in rows}
-    assert all(int(row["n"]) == 10 and float(row["p50_ms"]) >= 0 for row in rows)
+    stages = list(csv.DictReader((tmp_path / "timing.csv").open()))
+    assert {"points_exponent", "instances_exponent", "instances_low", "instances_high"} <= {*stages[0]}
+    assert {"map", "total"} <= {row["stage"] for row in stages}
+    assert all(int(row["n"]) == 10 and float(row["p50_ms"]) >= 0 for row in stages)
     assert (tmp_path / "timing.md").read_text().startswith(str(run))
     (method,) = csv.DictReader((tmp_path / "methods.csv").open())
     assert float(method["real_time_factor"]) == pytest.approx(float(method["frames_per_s"]) / 30)

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Frame
 from su3d_bench.datasets.openscan import label_set
 from su3d_bench.datasets.procedural.rendering.mesh import SceneMesh
 from su3d_bench.datasets.procedural.scan import SceneScan
@@ -49,7 +50,12 @@ def test_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> None:
 def test_frames_are_rendered_once_and_kept_for_the_next_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rooms, rendered = Rooms(tmp_path, SMALL), list[int]()
     render = rooms.frame
-    monkeypatch.setattr(rooms, "frame", lambda scene, index: rendered.append(index) or render(scene, index))
+
+    def counted(scene: str, index: int) -> Frame:
+        rendered.append(index)
+        return render(scene, index)
+
+    monkeypatch.setattr(rooms, "frame", counted)
     first, again = ([rooms.frames(SCENE, 1)[k] for k in range(70)] for _ in range(2))
     assert rendered == [*range(70), *range(64, 70)]  # 64 of a scene are kept
     for one, other in zip(first, again, strict=True):

@@ -256,7 +256,8 @@ class Renamer(Collector):
 
     def finish(self) -> Instances:
         found = super().finish()
-        return replace(found, ids=np.arange(len(found)) + (1000 if self._n_updates > 4 else 0))
+        assert isinstance(found, Instances)
+        return replace(found, ids=np.arange(len(found), dtype=np.int64) + (1000 if self._n_updates > 4 else 0))
 
 
 class SlashCollector(Collector):
