@@ -40,5 +40,5 @@ def test_robustness_section_has_curves_pictures_and_a_row_per_method(tmp_path: P
         assert runs_page.text_of(browser, "#robustness caption").startswith("rooms-instance")
         runs_page.choose(browser, "robustness", "Protocol", "rooms-semantic")
         assert runs_page.text_of(browser, "#robustness caption").startswith("rooms-semantic")
-        assert browser.run(f"{plots}[0].querySelector('svg').getAttribute('aria-label')").startswith("mIoU against")
+        assert browser.run(f"{plots}[0].querySelector('svg').getAttribute('aria-label')").startswith("mAcc against")
         assert complaints(browser) == []
