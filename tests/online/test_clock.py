@@ -76,7 +76,8 @@ def test_the_newest_frame_is_processed_as_in_streaming_perception(case: dict[str
     assert next(durations, None) is None
     found = Schedule(STREAM.model_copy(update={"rate_hz": rate_hz}), times)
     assert list(found.fed) == case["frames"]
-    np.testing.assert_allclose([(times[frame].finished_ns or 0) / 1e9 for frame in found.fed], case["finished_s"], atol=2e-6)
+    finished_s = [(times[frame].finished_ns or 0) / 1e9 for frame in found.fed]
+    np.testing.assert_allclose(finished_s, case["finished_s"], atol=2e-6)
 
 
 def test_streaming_perception_has_200_cases_with_and_without_drops() -> None:
