@@ -9,7 +9,7 @@ BENCH_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 .PHONY: demo test test-quick proofs mutants bench bench-methods reference architecture docs lint clean
 
 demo: $(VENV)/core
-	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols homes-semantic homes-instance --out runs/demo
+	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols homes-semantic homes-instance --stride 80 --no-pictures --out runs/demo
 	$(BIN)/su3d-bench report html runs/demo --out runs/demo.html
 
 test: $(VENV)/test

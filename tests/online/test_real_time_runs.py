@@ -27,9 +27,9 @@ MAPS = ("prediction.npz", "anytime-0.1.npz", "anytime-0.5.npz", "counts.npz", "a
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Every update takes 150 ms and perception 100 ms, without waiting; reading a frame takes a second."""
-    fake = SimpleNamespace(now=0.0)
+    fake: Any = SimpleNamespace(now=0.0)
     fake.perf_counter = lambda: fake.now
 
     def lasting(seconds: float, call: Any) -> Any:
