@@ -193,7 +193,7 @@ def _changes(
         found = numbers.metrics.get(clean.headline[0]) if numbers and numbers.scenes == clean.scenes else None
         return np.nan if found is None else found
 
-    changes = {cell: value(one and one.result) - value(clean) for cell, one in cells.items()}
+    changes = {cell: value(None if one is None else one.result) - value(clean) for cell, one in cells.items()}
     yield from ((family, None if np.isnan(mean) else mean) for family, mean in family_means(changes).items())
 
 

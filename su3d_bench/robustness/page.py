@@ -58,7 +58,7 @@ def _conditions(run: FinishedRun, cells: Sequence[Cell]) -> dict[str, Any]:
         reason = printable(str(error), 400)
     for cell in cells:
         own = [condition.corruption for condition in cell.conditions]
-        about = {"family": cell.family, "unit": " + ".join(one.unit for one in own), "pictures": []}
+        about: dict[str, Any] = {"family": cell.family, "unit": " + ".join(one.unit for one in own), "pictures": []}
         if cell.corruption in corruptions:
             continue
         corruptions[cell.corruption] = about
