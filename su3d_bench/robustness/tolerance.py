@@ -53,6 +53,8 @@ def find_tolerances(
     between = {(method, corruption.address): (0.0, float(MAX_SEVERITY)) for method, corruption in pairs}
     nexts = {key: float(MAX_SEVERITY) for key in between}
     for _ in range(N_STEPS + 1):
+        if not nexts:  # all are kept at the highest severity
+            break
         cells = {
             (method, corruption.address): Cell(method, (Condition(corruption, nexts[method, corruption.address]),))
             for method, corruption in pairs

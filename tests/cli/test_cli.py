@@ -168,7 +168,7 @@ def test_each_option_has_one_name_and_one_meaning_in_all_commands() -> None:
         (f"{TYPED} --set collector.dorp=1", "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
         (f"{TYPED} --config none.toml", "none.toml: cannot read the configuration: No such file or directory"),
         ("protocols shwo", "protocols: unknown command 'shwo'; did you mean 'show'? known: list, show, "),
-        ("report runs/demo", "report: unknown command 'runs/demo'; known: tables, timing, html, "),
+        ("report runs/demo", "report: unknown command 'runs/demo'; known: tables, timing, identity, html, "),
         ("report tables r --tables VI", "report tables: unknown --tables 'VI'; did you mean 'V'? known: I, "),
         (
             f"query text {PAINTED}/a x",

@@ -249,7 +249,7 @@ def commands_of_the_action(action: Any, folder: Path, inputs: dict[str, str]) ->
         ({"scenes": "rooms/*", "arguments": "--stride 9"}, "run --scenes rooms/* --methods opensu3d --stride 9", ""),
         ({"predictions": "pred", "arguments": "--dataset replica"}, "evaluate pred --dataset replica", ""),
         ({"run": NEVER}, None, NEVER),
-        ({"package": NEVER, "reference": NEVER}, "run --scenes rooms/living0 rooms/bedroom0 --methods opensu3d", ""),
+        ({"package": NEVER, "reference": NEVER}, "run --scenes homes/tuning0 homes/tuning1 --methods opensu3d", ""),
     ],
 )
 def test_action_checks_new_and_finished_runs_and_predictions(

@@ -38,7 +38,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "robustness tolerance": (
         f"--scenes rooms/bathroom0 --limit 2 {SMALL} --corruptions depth/scale --out tolerance",
         0,
-        "depth/scale",
+        "Tolerated errors of depth",
     ),
     "evaluate": (
         "out/scenes/rooms.bathroom0/opensu3d --dataset rooms --protocols rooms-instance --out evaluated",

@@ -33,6 +33,7 @@ def evaluator(
     """``score`` is that of a scene at a severity."""
 
     def evaluate(cells: Sequence[Cell]) -> Mapping[Cell, Numbers]:
+        assert cells
         severity = {cell: cell.conditions[0].severity if cell.conditions else 0.0 for cell in cells}
         return {cell: numbers([score(severity[cell], k) for k in range(n_scenes)]) for cell in cells}
 
