@@ -26,7 +26,7 @@ WORDS = ["--data-root=", "--annot-path=", "--out-dir=.", "--runtime=runtime", "-
 
 
 class Durations:
-    """Stands in for a distribution: the durations in their order."""
+    """Returns given durations in order, in place of a distribution."""
 
     def __init__(self, durations_us: list[int]) -> None:
         self.n_drawn = 0

@@ -100,13 +100,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path)
     parser.add_argument("--deeplab2", type=Path, help="answers of the STQ in this checkout instead of trackeval's")
-    words = parser.parse_args()
-    kept = json.loads(words.file.read_text()) if words.file.exists() else {}
-    if words.deeplab2 is None:
+    arguments = parser.parse_args()
+    kept = json.loads(arguments.file.read_text()) if arguments.file.exists() else {}
+    if arguments.deeplab2 is None:
         kept["tracks"] = answers_of_trackeval()
     else:
-        kept["points"] = answers_of_deeplab2(words.deeplab2)
-    words.file.write_text(json.dumps(kept, separators=(",", ":"), sort_keys=True) + "\n")
+        kept["points"] = answers_of_deeplab2(arguments.deeplab2)
+    arguments.file.write_text(json.dumps(kept, separators=(",", ":"), sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray
 from su3d_bench.formats.tables.table import NOT_MEASURED, Table, percent, text_table
+from su3d_bench.human_eval.sources import chosen_of
 from su3d_bench.metrics.identity import LabelFlips, Step, TrackCounts, count_tracks, label_flips, step_of, track_values
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, classes_of_prediction
 from su3d_bench.metrics.matching.transfer import transfer_masks
@@ -21,8 +22,8 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.tracked_points import LabelledPoints, PointCounts, count_points, labelled_points, point_values
 from su3d_bench.runs.executors import Report
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.job import Part, SceneJob
-from su3d_bench.runs.scene import maps_over_time
+from su3d_bench.runs.job import Part, build_method
+from su3d_bench.runs.scene_data import SceneData
 from su3d_bench.store.predictions import read_prediction
 
 COLUMNS = ("HOTA", "DetA", "AssA", "LocA", "OWTA", "OWTA by object", "IDF1", "STQ", "AQ", "AQ by time", "SQ")
@@ -42,13 +43,24 @@ class Identity:
     reason: str = ""
 
 
+@dataclass(frozen=True)
+class _SceneCounts:
+    """The counts of one scene under a method and a protocol."""
+
+    tracks: TrackCounts
+    points: PointCounts
+    flips: LabelFlips
+    n_maps: int
+
+
 def identities(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str], report: Report) -> list[Identity]:
     """Identity of each of ``methods`` under each of ``protocols`` of a run with intermediate maps.
 
-    Each map is compared with the ground truth that the frames until then have shown. Raises ``ConfigError`` for a run
-    without intermediate maps or instance protocols.
+    Each map is compared with the ground truth that the frames until then have shown. Raises ``ConfigError`` for an
+    unknown name, and for a run without intermediate maps or instance protocols.
     """
-    rules = [run.rules(name) for name in protocols or run.protocols]
+    methods = chosen_of(run, "method", methods, run.methods)
+    rules = [run.rules(name) for name in chosen_of(run, "protocol", protocols, tuple(run.protocols))]
     rules = [one for one in rules if one.kind == "instance"]
     if not rules:
         raise ConfigError(f"{run.name}: identity needs an instance protocol, such as homes-instance")
@@ -56,52 +68,64 @@ def identities(run: FinishedRun, methods: Sequence[str], protocols: Sequence[str
     if not jobs or not jobs[0].config.anytime_text:
         raise ConfigError(f"{run.name}: has no intermediate maps; run with --anytime-every N or --anytime SHARE...")
     encoder = run.encoder(device_of(run))
-    return [_identity(jobs, method, one, encoder, report) for method in methods or run.methods for one in rules]
+    reasons = {part.name: reason for part in jobs[0].methods if (reason := _reason_against(part))}
+    counts: dict[tuple[str, str], list[_SceneCounts]] = {(method, one.name): [] for method in methods for one in rules}
+    for job in jobs:
+        scene = SceneData(job, report)
+        for part in job.methods:
+            for one in rules if part.name in methods else ():
+                if part.name in reasons:
+                    continue
+                try:
+                    counts[part.name, one.name].append(_counts(scene, part, one, encoder))
+                except PredictionError as error:
+                    reasons[part.name] = str(error)
+    return [
+        Identity(method, protocol, None, 0, 0, reasons[method]) if method in reasons else _joined(method, protocol, own)
+        for (method, protocol), own in counts.items()
+    ]
 
 
-def _identity(
-    jobs: Sequence[SceneJob], method: str, rules: ProtocolRules, encoder: Encoder, report: Report
-) -> Identity:
-    parts = [next(part for part in job.methods if part.name == method) for job in jobs]
-    if not getattr(registry.load("method", parts[0].target), "keeps_ids", False):
-        return Identity(method, rules.name, None, 0, 0, "its ids do not persist")
-    tracks, points, flips, n_maps = list[TrackCounts](), list[PointCounts](), list[LabelFlips](), 0
-    is_thing = np.array([entry.name not in rules.stuff for entry in rules.classes])
-    for job, part in zip(jobs, parts, strict=True):
-        try:
-            found = list(_steps(job, part, rules, encoder, report))
-        except PredictionError as error:
-            return Identity(method, rules.name, None, 0, 0, str(error))
-        steps, labelled = [step for step, _ in found], [one for _, one in found]
-        tracks.append(count_tracks(steps))
-        flips.append(label_flips(steps))
-        points.append(count_points(labelled, is_thing))
-        n_maps += len(found)
-    n_compared, n_flips = (sum(int(getattr(one, name).sum()) for one in flips) for name in ("is_compared", "is_flip"))
-    values = track_values(TrackCounts.joined(tracks)) | point_values(PointCounts.joined(points))
+def _reason_against(part: Part) -> str | None:
+    """Why the identity of a method's instances cannot be measured; None if it can."""
+    if not getattr(registry.load("method", part.target), "keeps_ids", False):
+        return "its ids do not persist"
+    return None if build_method(part).needs.frames else "it uses no frames, so its map does not change"
+
+
+def _joined(method: str, protocol: str, counts: Sequence[_SceneCounts]) -> Identity:
+    tracks, points = (
+        TrackCounts.joined([each.tracks for each in counts]),
+        PointCounts.joined([each.points for each in counts]),
+    )
+    n_compared, n_flips = (
+        sum(int(getattr(each.flips, name).sum()) for each in counts) for name in ("is_compared", "is_flip")
+    )
+    values = track_values(tracks) | point_values(points)
     values[FLIPS] = n_flips / n_compared if n_compared else float("nan")
-    return Identity(method, rules.name, values, len(jobs), n_maps)
+    return Identity(method, protocol, values, len(counts), sum(each.n_maps for each in counts))
 
 
-def _steps(
-    job: SceneJob, part: Part, rules: ProtocolRules, encoder: Encoder, report: Report
-) -> Iterator[tuple[Step, LabelledPoints]]:
-    """Each map of a scene as a step of instances and of labelled points, on the points seen until then."""
-    maps, truth, first_shown = maps_over_time(job, part, rules.ground_truth, report)
+def _counts(scene: SceneData, part: Part, rules: ProtocolRules, encoder: Encoder) -> _SceneCounts:
+    """The maps of a scene over time, as steps of instances and of labelled points, on the points seen until then."""
+    maps, truth, first_shown = scene.maps_over_time(part, rules.ground_truth)
     true_class = class_index_of_ids(rules, truth.semantic)
     instance = np.where(true_class >= 0, truth.instance, 0).astype(np.int64)
+    is_present = np.bincount(true_class[true_class >= 0], minlength=len(rules.classes)) > 0
+    cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    steps, labelled = list[Step](), list[LabelledPoints]()
     for path, n_shown in maps:
         prediction = read_prediction(path)
         if not isinstance(prediction, Instances) or len(prediction.ids) != len(prediction.scores):
             raise PredictionError("its maps have no ids")
         is_seen: BoolArray = first_shown < n_shown
-        cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
         masks = transfer_masks(prediction.points, prediction, truth.points, cap_m, voxel_m)
-        classes = classes_of_prediction(rules, prediction, encoder, np.bincount(
-            true_class[true_class >= 0], minlength=len(rules.classes)) > 0)  # fmt: skip
+        classes = classes_of_prediction(rules, prediction, encoder, is_present)
         whole = labelled_points(true_class, instance, masks, classes, prediction.ids, prediction.scores)
-        shown = LabelledPoints(*(values[is_seen] for values in vars(whole).values()))
-        yield step_of(instance, masks, prediction.ids, is_seen), shown
+        labelled.append(LabelledPoints(*(values[is_seen] for values in vars(whole).values())))
+        steps.append(step_of(instance, masks, prediction.ids, is_seen))
+    is_thing = np.array([entry.name not in rules.stuff for entry in rules.classes])
+    return _SceneCounts(count_tracks(steps), count_points(labelled, is_thing), label_flips(steps), len(maps))
 
 
 def identity_table(found: Sequence[Identity]) -> Table:

@@ -94,7 +94,7 @@ DEFAULT_SOURCE = "default"
 
 # Where scenes run and whether pictures are drawn: this changes no number.
 NEUTRAL_SETTINGS = frozenset({
-    "jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm",
+    "jobs", "pictures", "offline", "accept_poses", "executor", "gpus_per_job", "retries", "slurm",
     "memory",
 })  # fmt: skip
 

@@ -188,6 +188,7 @@ class OpenSU3D:
                     raise StoreError(f"saved state: segment {key} has a view that does not exist")
             self._table[int(key)] = [tracking.View(*view) for view in views]
         self._seeds = {int(key): int(place) for key, place in values["seeds"].items()}
+        check_range("seeds", np.array([*self._seeds.values()], np.int64), 0, len(self._map))
         self._losses.update(values["losses"])
         self.losses = dict(values["last_losses"])
 

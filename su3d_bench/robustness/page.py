@@ -14,7 +14,7 @@ from su3d_bench.reports.pictures.items import fitted
 from su3d_bench.robustness.measures import sweep_result
 from su3d_bench.robustness.pictures import clean_inputs, tiles
 from su3d_bench.robustness.tables import is_of_embedded, sweep_notes
-from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.verify import read_checked
 
 PICTURE, JPEG_QUALITY = (160, 120), 60  # width and height
@@ -27,8 +27,8 @@ def page_sweeps(folders: Sequence[Path]) -> list[dict[str, Any]]:
     """
     found = []
     for index, folder in enumerate(dict.fromkeys(folders)):
-        run = read_checked(folder)
-        if cells := [cell for own in cells_of(run.methods).values() for cell in own]:
+        if cells := [cell for own in cells_of(read_run(folder).methods).values() for cell in own]:
+            run = read_checked(folder)
             found.append({"run": index, "n_cells": len(cells), **_results(run), **_conditions(run, cells)})
     return found
 

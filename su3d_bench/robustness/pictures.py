@@ -20,7 +20,7 @@ from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.reports.pictures.canvas import figure_style, write_figure
 from su3d_bench.reports.pictures.plots import draw_legend, figure_with_panels, style_of_line
 from su3d_bench.robustness.measures import MethodResult, SweepResult
-from su3d_bench.runs.scene import poses_of
+from su3d_bench.runs.scene_data import poses_of
 from su3d_bench.runs.scenes import cache_root
 
 WIDTH, HEIGHT, TITLE = 200, 150, 22  # of a tile and its title, px

@@ -9,40 +9,33 @@ from __future__ import annotations
 import logging
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable, user_code_line
 from su3d_bench.core.files.atomic import write_bytes, write_text
-from su3d_bench.core.maps import Prediction, Proposals
+from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.safe_output import one_line
 from su3d_bench.core.system.signals import is_interrupt
 from su3d_bench.core.system.timing import MethodClock, Timer, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import (
     BoolArray,
-    Float64Array,
     Frame,
     GroundTruth,
-    InstanceMesh,
-    Int32Array,
-    ObjectBoxes,
     SceneInfo,
 )
-from su3d_bench.corruptions.apply import CorruptedFrames, CorruptedPerception, SceneCorruption, parse_conditions
+from su3d_bench.corruptions.apply import CorruptedPerception
 from su3d_bench.metrics.compatibility import kind_incompatibility
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth, pack_scores, score_located, score_scene
-from su3d_bench.metrics.seen import clouds_of, reason_against, restricted
-from su3d_bench.numerics.visibility import first_shown
+from su3d_bench.metrics.seen import reason_against, restricted
 from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
@@ -54,10 +47,11 @@ from su3d_bench.reports.tables.run import not_scored_lines
 from su3d_bench.runs import frame_loop
 from su3d_bench.runs import job as jobs
 from su3d_bench.runs.clock import Schedule
-from su3d_bench.runs.executors import Event, Report, exceeds_memory
+from su3d_bench.runs.executors import Report, exceeds_memory
 from su3d_bench.runs.frame_loop import SceneLog
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.runs.real_time import is_measured, schedule_of
+from su3d_bench.runs.scene_data import SceneData
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import UnscoredRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -104,19 +98,6 @@ def scores_again(job: jobs.SceneJob, part: jobs.Part, encoder: interfaces.Encode
     return scores
 
 
-def maps_over_time(
-    job: jobs.SceneJob, part: jobs.Part, variant: str, report: Report
-) -> tuple[list[tuple[Path, int]], GroundTruth, Int32Array]:
-    """The intermediate maps and the last one of ``part``, each with the number of frames shown until then; the ground
-    truth; and for each of its points the place of the first frame that shows it."""
-    scene = _Scene(job, report)
-    scene.report_activity(part, "finding what the frames show")
-    shown, n = scene.first_shown(part)
-    folder = RunFolder(job.folder).job(job.scene, part.name)
-    maps = [(folder.anytime(point), n_shown) for point, n_shown in job.config.anytime_points(n).items()]
-    return [*maps, (folder.prediction, n)], scene.truth(variant), shown[variant][0]
-
-
 def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     """The one place where a scene's failure, of any kind, is recorded instead of ending the run."""
     job = scene.job
@@ -158,77 +139,8 @@ def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any]
     )
 
 
-def poses_of(dataset: Any, scene: str) -> Float64Array:
-    """The poses (N, 4, 4) of all frames."""
-    if isinstance(dataset, interfaces.ProvidesPoses):
-        return dataset.poses(scene)
-    return np.stack([frame.camera_to_world for frame in dataset.frames(scene, 1)])
-
-
-class _Scene:
-    """One scene with everything its methods share: the dataset, the ground truth."""
-
-    def __init__(self, job: jobs.SceneJob, report: Report) -> None:
-        self.job = job
-        self.report = report
-        self._truths: dict[str, GroundTruth] = {}
-        self._corruptions: dict[str, SceneCorruption] = {}
-        self._shown: dict[tuple[int, str], dict[str, list[Int32Array]]] = {}
-
-    @cached_property
-    def dataset(self) -> Any:
-        return jobs.build_dataset(self.job.dataset, self.job.data_root)
-
-    @cached_property
-    def data_digest(self) -> str:
-        digest: str = self.dataset.digest(self.job.scene_name)
-        return digest
-
-    @cached_property
-    def marked(self) -> InstanceMesh | ObjectBoxes:
-        """The source of ground-truth masks: the annotated mesh, otherwise the boxes of objects."""
-        try:
-            mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
-            return mesh
-        except GroundTruthMissing:
-            with suppress(GroundTruthMissing):
-                if (boxes := self.truth("boxes").boxes) is not None:
-                    return boxes
-            raise
-
-    @cached_property
-    def poses(self) -> Float64Array:
-        """The poses (N, 4, 4) of all frames, before any corruption."""
-        return poses_of(self.dataset, self.job.scene_name)
-
-    def report_activity(self, part: jobs.Part, activity: str) -> None:
-        """Report the current activity while no frame is fed."""
-        self.report(Event(self.job.scene, part.name, activity=activity))
-
-    @cached_property
-    def is_rendered(self) -> bool:
-        return bool(getattr(self.dataset, "renders_frames", False))
-
-    @property
-    def opening(self) -> str:
-        """The description of opening the scene."""
-        return "generating the scene" if self.is_rendered else "reading the scene"
-
-    def truth(self, variant: str) -> GroundTruth:
-        if variant not in self._truths:
-            self._truths[variant] = self.dataset.ground_truth(self.job.scene_name, variant)
-        return self._truths[variant]
-
-    @cached_property
-    def first_truth(self) -> GroundTruth:
-        """The first available variant, which methods that use ground truth receive."""
-        missing = list[GroundTruthMissing]()
-        for variant in self.dataset.variants:
-            try:
-                return self.truth(variant)
-            except GroundTruthMissing as error:
-                missing.append(error)
-        raise missing[0]
+class _Scene(SceneData):
+    """One scene whose methods are run and scored."""
 
     @cached_property
     def language(self) -> tuple[ChatClient, LanguageConfig]:
@@ -240,16 +152,6 @@ class _Scene:
     def solver(self) -> MapSolver | None:
         """The solver that answers questions about maps; None: the built-in solver."""
         return None if self.job.config.question_solver == "built-in" else by_language_model(*self.language)
-
-    def corruption(self, part: jobs.Part) -> SceneCorruption | None:
-        """The corruption of the inputs of ``part``, if there is one."""
-        if part.corruption and part.name not in self._corruptions:
-            name = self.job.scene_name
-            self._corruptions[part.name] = SceneCorruption(
-                parse_conditions(part.corruption), self.job.scene, self.job.config.seed,
-                self.dataset.frames(name, 1), lambda: self.poses,
-            )  # fmt: skip
-        return self._corruptions.get(part.name)
 
     def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only if its completion record is missing or does not match."""
@@ -291,7 +193,7 @@ class _Scene:
         frames: Sequence[Frame] = ()
         points, doubts, schedule = dict[float, int](), tuple[str, ...](), None
         if inputs.method.needs.frames:
-            frames, doubts = self._frames(part), self.job.doubts or ()
+            frames, doubts = self.frames(part), self.job.doubts or ()
             points = self.job.config.anytime_points(len(frames))
             if self.job.config.realtime:
                 schedule = self._schedule(part, inputs, frames)
@@ -356,7 +258,7 @@ class _Scene:
             tools = interfaces.SceneTools(
                 frames=frames,
                 regions=frame_loop.TimedRegions(perception.regions(), clock),
-                true_proposals=self._true_proposals if method.needs.true_proposals else None,
+                true_proposals=self.true_proposals if method.needs.true_proposals else None,
             )
             with clock.running("start"):
                 method.receive_tools(tools)
@@ -385,18 +287,6 @@ class _Scene:
                 with clock.running("close"):
                     method.close()
 
-    def _frames(self, part: jobs.Part) -> frame_loop.ChosenFrames | CorruptedFrames:
-        """The frames that a method gets, or in real time those that arrive."""
-        frames = self.dataset.frames(self.job.scene_name, jobs.stride_of(self.job, part))
-        first = frame_loop.ChosenFrames(frames, range(len(frames))[: self.job.config.limit or None])
-        corruption = self.corruption(part)
-        return CorruptedFrames(first, corruption) if corruption else first
-
-    def _true_proposals(self) -> Proposals:
-        if not self.dataset.variants:
-            raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
-        return frame_loop.true_proposals(self.truth(self.dataset.variants[0]))
-
     def _score(
         self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
@@ -414,7 +304,7 @@ class _Scene:
         files = [*by_file]
         if self.job.config.pictures:
             self.report_activity(part, "drawing the map")
-            truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
+            truth_to_draw = next((known for known in self.truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         reasons = [UnscoredRecord(self.job.scene, part.name, *pair) for pair in unscored.items()]
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
@@ -453,22 +343,6 @@ class _Scene:
             by_file[folder.curve_counts("ceiling", point)] = of_truth
         return n
 
-    def first_shown(self, part: jobs.Part) -> tuple[dict[str, list[Int32Array]], int]:
-        """Which frame that a method gets shows each point first, by variant of the ground truth; and their number.
-
-        A corruption changes only which frames these are: they count as they were before it.
-        """
-        frames, key = self._frames(part), (jobs.stride_of(self.job, part), part.corruption)
-        if key not in self._shown:
-            clouds = {}
-            for rules in map(load_protocol, self.job.protocols):
-                with suppress(GroundTruthMissing):
-                    clouds[rules.ground_truth] = clouds_of(self.truth(rules.ground_truth))
-            clean = frames.clean if isinstance(frames, CorruptedFrames) else iter(frames)
-            places = iter(first_shown([cloud for each in clouds.values() for cloud in each], clean))
-            self._shown[key] = {variant: [next(places) for _ in each] for variant, each in clouds.items()}
-        return self._shown[key], len(frames)
-
     def scores(
         self,
         part: jobs.Part,
@@ -485,7 +359,7 @@ class _Scene:
         unscored: dict[str, str] = {}
         corruption = self.corruption(part)
         for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
-            if rules.ground_truth not in self._truths:
+            if rules.ground_truth not in self.truths:
                 self.report_activity(part, "computing ground truth" if self.is_rendered else "reading ground truth")
             try:
                 truth = self.truth(rules.ground_truth)
