@@ -239,7 +239,10 @@ class OpenMask3D:
 
     def start(self, scene: SceneInfo) -> None:
         """Creates or reads the proposals."""
-        self.proposals = make_proposals(self.config, scene, self._tools.true_proposals)
+        shared, key = self._tools.shared, f"{self.name} {self.config.model_dump_json()}"
+        if key not in shared:
+            shared[key] = make_proposals(self.config, scene, self._tools.true_proposals)
+        self.proposals = shared[key]
         self.finish_costs = {}
         self._scene = scene
         self._views = MaskViews(len(self.proposals), self.config.top_k)

@@ -7,7 +7,7 @@ with a misspelt one.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -43,12 +43,14 @@ class SceneTools:
     """The additional inputs of a method that works on the whole scene; never ground truth.
 
     ``frames`` are those of the updates, in order, read again at every access; ``true_proposals`` is set if
-    ``PerceptionNeeds.true_proposals`` is.
+    ``PerceptionNeeds.true_proposals`` is. ``shared`` keeps what does not depend on frames for the same method under
+    other corruptions.
     """
 
     frames: Sequence[types.Frame]
     regions: RegionPerception
     true_proposals: Callable[[], Proposals] | None = None
+    shared: dict[str, Any] = field(default_factory=dict)
 
 
 class Dataset(Protocol):

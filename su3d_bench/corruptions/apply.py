@@ -209,12 +209,22 @@ class CorruptedPerception:
         return replace(frame, camera_to_world=pose, intrinsics=intrinsics)
 
 
-@dataclass(frozen=True)
 class CorruptedRegions:
-    """Perception on demand of frames at their true poses."""
+    """Perception on demand of frames at their true poses.
 
-    inner: Any
-    seen: Callable[[Frame], Frame]
+    The last frame is remembered, because perception recognises a frame that it has seen by identity.
+    """
+
+    def __init__(self, inner: Any, seen: Callable[[Frame], Frame]) -> None:
+        self.inner = inner
+        self._seen = seen
+        self._last: tuple[Frame, Frame] | None = None
+
+    def seen(self, frame: Frame) -> Frame:
+        """What perception sees of ``frame``."""
+        if self._last is None or self._last[0] is not frame:
+            self._last = frame, self._seen(frame)
+        return self._last[1]
 
     @property
     def dim(self) -> int:

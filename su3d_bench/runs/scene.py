@@ -259,6 +259,7 @@ class _Scene(SceneData):
                 frames=frames,
                 regions=frame_loop.TimedRegions(perception.regions(), clock),
                 true_proposals=self.true_proposals if method.needs.true_proposals else None,
+                shared=self.shared if part.corruption else {},  # the time of a clean method counts
             )
             with clock.running("start"):
                 method.receive_tools(tools)

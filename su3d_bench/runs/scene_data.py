@@ -37,6 +37,7 @@ class SceneData:
         self.job = job
         self.report = report
         self.truths: dict[str, GroundTruth] = {}
+        self.shared: dict[str, Any] = {}
         self._corruptions: dict[str, SceneCorruption] = {}
         self._shown: dict[tuple[int, str], dict[str, list[Int32Array]]] = {}
 

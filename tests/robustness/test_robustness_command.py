@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from su3d_bench.baselines.openmask3d import method
 from su3d_bench.cli.main import main
 from su3d_bench.corruptions.apply import CORRUPTIONS
+from su3d_bench.perception import profiles
 
 SMALL = "--set rooms.width=160 rooms.height=120 rooms.n_frames=40 --stride 10 --profile oracle --jobs 1"
 ROOM = f"rooms/bathroom0 {SMALL} --protocols rooms-instance"
@@ -48,16 +50,33 @@ def test_cell_run_alone_equals_the_cell_of_the_sweep(
         assert prediction(str(out), name) == prediction(str(sweep), name)
 
 
+def test_corrupted_openmask3d_shares_proposals_and_segments_a_frame_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proposals: list[object] = []
+    segmented: list[int] = []
+    make, segment = method.make_proposals, profiles.cached_regions
+    monkeypatch.setattr(method, "make_proposals", lambda *given: proposals.append(given) or make(*given))
+    monkeypatch.setattr(profiles, "cached_regions", lambda *given: segmented.append(given[1].index) or segment(*given))
+    words = f"robustness run {ROOM.replace('oracle', 'embedded')} --methods openmask3d --severities 2 --corruptions"
+    assert main(f"{words} pose/jumps pose/jitter-rotation --out {tmp_path / 'both'}".split()) == 0
+    assert len(proposals) == 2  # the clean method's time counts
+    assert len(segmented) <= 3 * 4
+    assert main(f"{words} pose/jitter-rotation --out {tmp_path / 'alone'}".split()) == 0
+    name = "openmask3d~pose-jitter-rotation-2"
+    assert prediction(str(tmp_path / "both"), name) == prediction(str(tmp_path / "alone"), name)
+
+
 def test_report_has_every_family_and_writes_its_figure(
     sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
     figure = tmp_path / "figure.png"
     assert main(f"robustness report {sweep} --figure {figure} --json".split()) == 0
-    (method,) = json.loads(capsys.readouterr().out)["methods"]
-    assert list(method["families"]) == ["depth", "pose", "masks", "names", "time", "light"]
-    assert method["cells"]["masks/eroded/4"]["difference"] < 0
-    assert method["cells"]["masks/eroded/0"]["difference"] == 0
+    (found,) = json.loads(capsys.readouterr().out)["methods"]
+    assert list(found["families"]) == ["depth", "pose", "masks", "names", "time", "light"]
+    assert found["cells"]["masks/eroded/4"]["difference"] < 0
+    assert found["cells"]["masks/eroded/0"]["difference"] == 0
     assert figure.read_bytes()[:4] == b"\x89PNG"
     assert main(f"robustness report {sweep} --format latex".split()) == 0
     assert r"\begin{tabular}" in capsys.readouterr().out
