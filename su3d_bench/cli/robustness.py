@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import output
 from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, index, output_path
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from su3d_bench.analysis.sides import Numbers
     from su3d_bench.core.types import UInt8Array
     from su3d_bench.corruptions.apply import Cell
+    from su3d_bench.robustness.tolerance import Tolerance
     from su3d_bench.runs.finished import FinishedRun
 
 
@@ -50,6 +51,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("run")
     _add_metric(parser)
     parser.option("--baseline METHOD", "method that mCE is relative to (default: the first)")
+    parser.option("--tolerance", "also show the errors at which 95 % of the clean score is kept, between severities")
     parser.option("--figure FILE", "figure to write (.png or .pdf)", type=output_path)
     parser.option("--out FILE", "file to write", type=output_path)
     parser.shared("--format")
@@ -138,19 +140,26 @@ def call_run(arguments: argparse.Namespace) -> int:
 def call_report(arguments: argparse.Namespace) -> None:
     """Report a sweep: drops with intervals, means over families, mCE and resilience.
 
-    su3d-bench robustness report runs/robust --format markdown --figure robust.png
+    su3d-bench robustness report runs/robust --tolerance --format markdown --figure robust.png
     su3d-bench robustness report runs/robust --protocol homes-instance --metric AP50 --baseline conceptgraphs --json
     """
     from su3d_bench.robustness.measures import sweep_result
     from su3d_bench.robustness.pictures import draw_sweep
-    from su3d_bench.robustness.tables import is_of_embedded, sweep_tables
+    from su3d_bench.robustness.tables import is_of_embedded, sweep_tables, tolerance_tables
+    from su3d_bench.robustness.tolerance import SHARE_KEPT, swept_tolerances
     from su3d_bench.runs.verify import read_checked
 
     run = read_checked(arguments.run)
-    result = sweep_result(run, *_score_of(run, arguments), arguments.baseline)
+    score = _score_of(run, arguments)
+    result = sweep_result(run, *score, arguments.baseline)
+    value, tables = result.to_json(), sweep_tables(result, of_embedded=is_of_embedded(run))
+    if arguments.tolerance:
+        found = swept_tolerances(run, *score)
+        value["tolerances"] = _tolerances_json(found)
+        tables += tolerance_tables(found, *score, SHARE_KEPT, len(result.scenes))
     if arguments.figure is not None:
         draw_sweep(result, arguments.figure)
-    output.answer_or_write(arguments, result.to_json(), sweep_tables(result, of_embedded=is_of_embedded(run)))
+    output.answer_or_write(arguments, value, tables)
 
 
 def call_tolerance(arguments: argparse.Namespace) -> int:
@@ -200,9 +209,12 @@ def call_tolerance(arguments: argparse.Namespace) -> int:
 
     found = find_tolerances(evaluate, list(target_of), corruptions, arguments.share)
     tables = tolerance_tables(found, *score[0], arguments.share, n_scenes)
-    value = [{**vars(one), "corruption": one.corruption.address} for one in found]
-    output.answer_tables(arguments, value, tables)
+    output.answer_tables(arguments, _tolerances_json(found), tables)
     return EXIT_DONE
+
+
+def _tolerances_json(found: Sequence[Tolerance]) -> list[dict[str, Any]]:
+    return [{**vars(one), "corruption": one.corruption.address} for one in found]
 
 
 def _score_of(run: FinishedRun, arguments: argparse.Namespace) -> tuple[str, str]:

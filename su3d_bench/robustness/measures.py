@@ -84,8 +84,13 @@ def _difference_json(difference: Difference) -> dict[str, Any]:
 
 
 def sweep_result(run: FinishedRun, protocol: str, metric: str, baseline: str | None = None) -> SweepResult:
-    """The measures of a finished sweep; raises ``ConfigError`` if it has no cells or the baseline is not in it."""
-    cells = cells_of(run.methods)
+    """The measures of the methods of a finished sweep that have scores under ``protocol``.
+
+    Raises ``ConfigError`` if it has no cells or the baseline is not in it.
+    """
+    cells = {
+        method: own for method, own in cells_of(run.methods).items() if run.results[method, protocol].result is not None
+    }
     methods = list(cells)
     if not methods:
         raise ConfigError(f"{run.name}: has no method with and without corruptions; use su3d-bench robustness run")

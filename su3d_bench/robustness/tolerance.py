@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.analysis.sides import Numbers, Side, SideNumbers, headline_numbers
+from su3d_bench.analysis.sweeps import cells_of
 from su3d_bench.core.types import Float64Array, Interval
 from su3d_bench.corruptions.apply import Cell, Condition
 from su3d_bench.corruptions.model import MAX_SEVERITY, Corruption
@@ -26,8 +27,8 @@ N_STEPS = 6  # of the bisection: the severity is then known to 5 / 2^6
 class Tolerance:
     """The ``severity`` (0..5), and its ``value`` in the corruption's unit, at which ``method`` falls to the share kept.
 
-    ``interval`` of the value, None if scenes do not differ. ``is_beyond``: the share is kept at the highest severity,
-    so that the value is a lower bound.
+    ``interval`` of the value, None if scenes do not differ. ``is_beyond``: the share is kept at the highest severity
+    that was measured, so that the value is a lower bound.
     """
 
     method: str
@@ -76,12 +77,13 @@ def _tolerance(method: str, corruption: Corruption, curve: Mapping[float, Number
     severities = np.array(sorted(curve))
     values = np.array([curve[severity].without_each for severity in severities])  # (K, 1 + G)
     crossings = np.array([crossing(severities, column, share) for column in values.T])
-    interval = jackknife_interval(crossings, bounds=(0.0, float(MAX_SEVERITY)))
+    highest = float(severities[-1])
+    interval = jackknife_interval(crossings, bounds=(0.0, highest))
     severity = float(crossings[0])
     low, high = (None, None) if interval is None else map(corruption.value_at, interval)
     return Tolerance(
         method, corruption, severity, corruption.value_at(severity),
-        None if low is None or high is None else (min(low, high), max(low, high)), severity >= MAX_SEVERITY,
+        None if low is None or high is None else (min(low, high), max(low, high)), severity >= highest,
     )  # fmt: skip
 
 
@@ -105,3 +107,19 @@ def numbers_of(run: FinishedRun, protocol: str, metric: str, cells: Sequence[Cel
     sides = [Side(run, cell.name) for cell in cells]
     found = SideNumbers().over_common(protocol, sides)
     return {cell: headline_numbers([one], metric) for cell, one in zip(cells, found, strict=True)}
+
+
+def swept_tolerances(run: FinishedRun, protocol: str, metric: str, share: float = SHARE_KEPT) -> list[Tolerance]:
+    """The tolerances between the severities that a sweep has, without a search; not of pairs of corruptions."""
+    found = []
+    for method, cells in cells_of(run.methods).items():
+        if run.results[method, protocol].result is None:
+            continue
+        numbers = numbers_of(run, protocol, metric, [Cell(method, ()), *cells])
+        curves: dict[str, tuple[Corruption, dict[float, Numbers]]] = {}
+        for (condition,) in (cell.conditions for cell in cells if len(cell.conditions) == 1):
+            row = condition.corruption
+            _, curve = curves.setdefault(row.address, (row, {0.0: numbers[Cell(method, ())]}))
+            curve[condition.severity] = numbers[Cell(method, (condition,))]
+        found += [_tolerance(method, row, curve, share) for row, curve in curves.values()]
+    return found

@@ -82,6 +82,35 @@ def test_report_has_every_family_and_writes_its_figure(
     assert r"\begin{tabular}" in capsys.readouterr().out
 
 
+def test_tolerance_between_the_severities_of_a_sweep(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(f"robustness report {sweep} --tolerance --json".split()) == 0
+    answer = json.loads(capsys.readouterr().out)
+    clean, cells = answer["methods"][0]["clean"], answer["methods"][0]["cells"]
+    found = {one["corruption"]: one for one in answer["tolerances"]}
+    assert list(found) == NAMES.split()
+    for name, one in found.items():
+        worst = cells[f"{name}/4"]["value"]
+        expected = 4.0 if worst >= 0.95 * clean else 4 * 0.05 * clean / (clean - worst)
+        assert one["severity"] == pytest.approx(expected)
+        assert one["is_beyond"] == (worst >= 0.95 * clean)
+        assert one["value"] == pytest.approx(CORRUPTIONS[name].value_at(expected))
+    assert main(f"robustness report {sweep} --tolerance --format markdown".split()) == 0
+    assert "Tolerated errors of masks" in capsys.readouterr().out
+
+
+def test_method_without_instances_is_left_out_of_the_scores_of_instances(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = ROOM.replace("rooms-instance", "rooms-instance rooms-semantic")
+    words = f"robustness run {both} --only depth/holes/4 --methods opensu3d conceptfusion --out {tmp_path / 'run'}"
+    assert main(words.split()) == 0
+    for protocol, expected in (("instance", ["opensu3d"]), ("semantic", ["opensu3d", "conceptfusion"])):
+        capsys.readouterr()
+        assert main(f"robustness report {tmp_path / 'run'} --protocol rooms-{protocol} --tolerance --json".split()) == 0
+        assert [one["method"] for one in json.loads(capsys.readouterr().out)["methods"]] == expected
+
+
 def test_tolerance_is_between_the_severities_that_keep_and_lose(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
