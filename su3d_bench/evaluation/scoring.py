@@ -48,7 +48,7 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
 
     evaluate_semantic_instance.py, evaluate_semantic_label.py and their derivatives iterate over the prediction files,
     except OpenSUN3D's and those whose files have indices into a list of classes, which stop at the first scene without
-    a prediction. Custom protocols and those of the generated rooms have no original.
+    a prediction. Custom protocols and those of the generated scenes have no original.
     """
     stops = rules.class_agnostic == "numbered" or (rules.class_numbers == "lines" and rules.names_masks)
     if rules.metric != "scannet" or rules.name not in protocol_names() or stops:

@@ -24,7 +24,7 @@ from su3d_bench.perception.models.masks.grounded_sam import WORDS_CAVEAT
 from su3d_bench.perception.paper import PAPER_ENCODER
 from su3d_bench.reports.tables.paper import PAPER_PROFILE, PAPER_SCENES
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.job import GENERATED_ROOMS
+from su3d_bench.runs.job import GENERATED_SCENES
 from su3d_bench.runs.plan import named_method
 
 METHOD = "opensu3d"
@@ -130,7 +130,7 @@ def _found(facts: Facts) -> dict[str, Iterable[str]]:
     template = "" if facts.profile == "stored" else ", captions by a template"
     has_mesh = "replica-mesh-ex6" in names and "replica-conceptgraphs-ex6" not in names
     return {
-        "scenes": _if(not is_complete, "procedurally generated rooms" if GENERATED_ROOMS in facts.caveat else scenes),
+        "scenes": _if(not is_complete, "procedurally generated scenes" if GENERATED_SCENES in facts.caveat else scenes),
         "stride": _if(stride != STRIDE, str(stride)),
         "image size": [
             f"{size[0]}x{size[1]} ({name})"

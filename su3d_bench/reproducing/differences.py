@@ -25,7 +25,7 @@ from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, F
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.recipe import Experiment, Recipe, method_of_row, methods_of
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_update_times
-from su3d_bench.runs.job import GENERATED_ROOMS
+from su3d_bench.runs.job import GENERATED_SCENES
 from su3d_bench.runs.verify import read_checked
 from su3d_bench.store.predictions import read_prediction
 
@@ -194,7 +194,7 @@ def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
 
 
 def _of_scenes(figure: Figure, row: Measured) -> Iterator[str]:
-    made = next((part for part in (row.caveat or "").split("; ") if part.startswith(GENERATED_ROOMS)), None)
+    made = next((part for part in (row.caveat or "").split("; ") if part.startswith(GENERATED_SCENES)), None)
     if made is not None:
         yield f"scenes: {counted(len(row.scenes), 'procedurally generated room')}, not {figure.dataset}'s scenes"
         return

@@ -112,7 +112,7 @@ class Experiment(BaseModel):
 
 
 class Rehearsal(BaseModel):
-    """A rehearsal on procedurally generated rooms: their names, their options, and the perception backend."""
+    """A rehearsal on procedurally generated scenes: their names, their options, and the perception backend."""
 
     model_config = _STRICT
 

@@ -92,7 +92,7 @@ def with_visible_truth(
 
 # Perception settings that do not affect numbers, or whose effect is already in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
-GENERATED_ROOMS = "generated rooms in the layout of"  # prefix of their caveat
+GENERATED_SCENES = "generated scenes in the layout of"  # prefix of their caveat
 REPLACE_HINT = "--replace overwrites it, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
@@ -281,7 +281,7 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo, clock: s
         own = TRUTH_CAVEAT
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
-    made = f"{GENERATED_ROOMS} {scene.dataset}, not its scenes" if is_made else None
+    made = f"{GENERATED_SCENES} {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if sees_profile(method) else None, own, clock]
     return "; ".join(part for part in parts if part) or None
 

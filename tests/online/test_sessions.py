@@ -24,7 +24,8 @@ from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Stor
 from su3d_bench.core.types import Frame, SceneInfo
 from su3d_bench.store.predictions import prediction_arrays
 
-SCENES = ("rooms/bathroom7", "homes/seed0")
+MORE_HOMES = ("homes/seed1", "homes/test0", "homes/tuning5")
+SCENES = ("rooms/bathroom7", "homes/seed0", *(pytest.param(one, marks=pytest.mark.proof) for one in MORE_HOMES))
 N_FRAMES = 8
 IN_MEMORY = 'conceptfusion@feature_storage="memory"'
 # Presets whose state or code differs from the method's.

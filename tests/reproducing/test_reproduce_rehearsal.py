@@ -51,7 +51,7 @@ def test_labels_by_the_language_model_reach_the_table_and_the_differences(rehear
     here = {one["name"]: one["here"] for one in record["deviations"]}
     assert here["label n'"] == "the model gpt-6-luna of the refiner, names of 5 views"
     assert here["reasoning"] == "the built-in solver" and here["masks"] == "those of the profile 'embedded'"
-    assert here["scenes"] == "procedurally generated rooms"
+    assert here["scenes"] == "procedurally generated scenes"
     assert here["border"].startswith("3 px in images 160 px wide")
     assert "**Differences from the paper**" in text
     for path in rehearsed.glob("runs/*/scenes/*/opensu3d/refined_names.json"):

@@ -50,7 +50,7 @@ def test_generated_rooms_in_another_datasets_layout_are_labelled() -> None:
     perception: Any = SimpleNamespace(caveat=None, encoder=SimpleNamespace(name="embedded"))
     scene = SceneInfo("replica", "office0", 1, 1, "rendered-rooms")
     printed = caveat_of(method, perception, scene)
-    assert printed == "generated rooms in the layout of replica, not its scenes"
+    assert printed == "generated scenes in the layout of replica, not its scenes"
     assert caveat_of(method, perception, replace(scene, image_domain="camera")) is None
     assert caveat_of(method, perception, replace(scene, dataset="rooms")) is None
 

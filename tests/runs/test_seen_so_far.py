@@ -53,6 +53,18 @@ def test_oracle_scores_one_at_every_point(run: Path) -> None:
     assert_perfect(of_run)
 
 
+def test_oracle_scores_one_at_every_point_of_a_recording(tmp_path: Path) -> None:
+    """A home in ScanNet's format: compressed colour, depth in millimetres, rounded poses, annotated segments."""
+    data, run = tmp_path / "data", tmp_path / "run"
+    small = "--set n_frames=24 width=160 height=120 mesh_spacing_m=0.05"
+    assert main(f"datasets make homes --layout scannet --out {data} --scenes seed0 {small}".split()) == 0
+    words = f"run scannet/* --data {data} --methods oracle opensu3d --profile oracle --stride 4 --anytime-every 2"
+    assert main(f"{words} --seen-so-far --no-pictures --jobs 1 --out {run}".split()) == 0
+    perfect = results(run)["oracle", "scannet200-instance"]
+    assert [point["n_updates"] for point in perfect["seen"]] == [2, 4, 0]
+    assert all(headline(point["metrics"], perfect) == [1.0, 1.0, 1.0] for point in perfect["seen"])
+
+
 def test_areas_are_those_under_the_curves(run: Path) -> None:
     result = results(run)["collector", "rooms-semantic"]
     assert result["areas"]["anytime"].keys() == result["areas"]["seen"].keys() == set(result["headline"])

@@ -27,7 +27,7 @@ PURPOSE = {
     "formats": "readers of plain data: images, PLY, HDF5, npz, torch archives, pickles, CSV",
     "metrics": "protocols, matching and metrics: counts per scene, ratios over scenes",
     "opensu3d": "the reference pipeline: association, fusion, tracking, post-processing",
-    "datasets": "one folder per dataset: frames, ground truth, checks; generated rooms",
+    "datasets": "one folder per dataset: frames, ground truth, checks; generated scenes",
     "perception": "images to detections: profiles, foundation models, language models",
     "reports": "tables, pictures, HTML pages of runs and annotation sheets",
     "fetching": "downloads of published weights and data",
