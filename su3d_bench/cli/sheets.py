@@ -24,7 +24,7 @@ def add_parser(verbs: Verbs) -> None:
     """Human evaluation: create annotation sheets, score answers, and draw figures.
 
     su3d-bench sheets make runs/my-run --kinds retrieval --out sheets
-    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key
+    su3d-bench sheets score ann.csv bob.csv --key sheets-key
     """
     actions = add_group(verbs, "sheets", add_parser)
     sheets_make.add_parser(actions)
@@ -34,7 +34,7 @@ def add_parser(verbs: Verbs) -> None:
 
 def _add_score(verbs: Verbs) -> None:
     parser = add_verb(verbs, "score", call_score)
-    parser.option("files [FILE...]", "annotators' answers, .csv or .xlsx (default: answers from the ground truth)")
+    parser.option("files [FILE...]", "annotators' answers, .csv (default: answers from the ground truth)")
     parser.option("--key DIR", "folder of the key: which method made what (or its key.json)", required=True)
     parser.option("--sheet FILE", "sheet.json, or its folder (default: found near the key and answers)")
     parser.option("--out DIR", "folder for scores.json, tables and items to review", type=output_path)
@@ -47,7 +47,7 @@ def _add_score(verbs: Verbs) -> None:
 def call_score(arguments: argparse.Namespace) -> None:
     """Score the answers of all annotators: accuracy, tests, agreement, comparison with the ground truth.
 
-    su3d-bench sheets score ann.csv bob.xlsx --key sheets-key --out scores
+    su3d-bench sheets score ann.csv bob.csv --key sheets-key --out scores
     su3d-bench sheets score ann.csv bob.csv --key sheets-key --disputed disputed.csv
     """
     from dataclasses import asdict

@@ -1,4 +1,4 @@
-"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page, table and workbook, and their key."""
+"""``su3d-bench sheets make``: annotation sheets from a run or scenes, as page and table, and their key."""
 
 from __future__ import annotations
 
@@ -67,19 +67,16 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call(arguments: argparse.Namespace) -> None:
-    """Create annotation sheets for a run or for questions: an offline page, a CSV and a workbook.
+    """Create annotation sheets for a run or for questions: an offline page and a CSV.
 
     su3d-bench sheets make runs/my-run --kinds retrieval annotation reasoning --annotators 3 --out sheets
     su3d-bench sheets make --kinds questions --scenes 'homes/test*' --annotators 2 --overlap 1 --out sheets
     """
-    from su3d_bench.human_eval.sets import has_openpyxl
     from su3d_bench.human_eval.sources import RunSource, ground_truth_of_addresses, truth_of_run
     from su3d_bench.questions.query_files import read_excluded_ids
     from su3d_bench.runs.finished import read_run
 
     _check(arguments)
-    if not arguments.dry_run and not has_openpyxl():
-        remark("without workbooks (.xlsx): they need pip install 'su3d-bench[sheets]'", quiet=arguments.quiet)
     left_out = frozenset[str]() if arguments.exclude_ids is None else read_excluded_ids(arguments.exclude_ids)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kinds))
     origins: dict[SheetKind, Key] = {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -123,16 +122,6 @@ def test_question_sheets_need_no_run(capsys: pytest.CaptureFixture[str]) -> None
     Path("gone.csv").write_text(f"question_id\n{listed}\n")
     assert main([*words, "--exclude-ids", "gone.csv", "--out", "without", "--quiet"]) == 0
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
-
-
-def test_workbooks_are_left_out_with_a_remark_without_openpyxl(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "openpyxl", None)
-    words = ["sheets", "make", "--kinds", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
-    assert main([*words, "--out", "out"]) == 0
-    assert capsys.readouterr().err.startswith("without workbooks")
-    assert sorted(path.name for path in Path("out/annotator-1").iterdir()) == ["sheet.csv", "sheet.html"]
 
 
 # Scoring
