@@ -133,7 +133,6 @@ def _asked(arguments: argparse.Namespace) -> RecipeRequest:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeRequest, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.estimate import estimate, estimate_tables
     from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
@@ -141,9 +140,7 @@ def _reproduce(
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs, out)
     if arguments.dry_run:
-        costs = estimate(runs, known)
-        value = known.to_json() | {"estimate": asdict(costs)}
-        output.answer_tables(arguments, value, [*preflight_tables(known), *estimate_tables(costs)])
+        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
     remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
