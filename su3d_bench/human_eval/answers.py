@@ -202,8 +202,7 @@ class Agreement:
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the most common number. ``alpha``
     is Krippendorff's for nominal data over all items; its ``interval`` is over items and needs at least ten.
-    ``ordinal_alpha`` is for ordered answers, ``ac1`` is Gwet's. None: undefined, because there are no items or (except
-    for ``ac1``) only one answer occurs.
+    ``ac1`` is Gwet's. None: undefined, because there are no items or (except for ``ac1``) only one answer occurs.
     """
 
     n_annotators: int
@@ -215,12 +214,11 @@ class Agreement:
     n_raters: int
     alpha: float | None
     interval: Interval | None
-    ordinal_alpha: float | None = None
     ac1: float | None = None
 
 
-def agreement(ratings: Ratings, choices: Sequence[str], *, is_ordered: bool = False) -> Agreement:
-    """All coefficients for one question with these ``choices``, which may be ordered.
+def agreement(ratings: Ratings, choices: Sequence[str]) -> Agreement:
+    """All coefficients for one question with these ``choices``.
 
     Items with a single answer are ignored, except for the shares of the answers in ``ac1``.
     """
@@ -248,7 +246,6 @@ def agreement(ratings: Ratings, choices: Sequence[str], *, is_ordered: bool = Fa
         n_raters=n_raters,
         alpha=alpha,
         interval=interval,
-        ordinal_alpha=ordinal_alpha(counts) if is_ordered else None,
         ac1=gwet_ac1(every),
     )
 
@@ -316,26 +313,6 @@ def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array
     with np.errstate(invalid="ignore", divide="ignore"):
         alphas: Float64Array = np.where(expected > 0, 1.0 - observed / expected, np.nan)
     return alphas
-
-
-def ordinal_alpha(counts: Int64Array) -> float | None:
-    """Krippendorff's alpha for ordinal data [Krippendorff 2011, section D] of items (rows) by ordered answers.
-
-    The distance of two answers is the squared difference of their mean ranks among all answers. Items and None as in
-    ``krippendorff_alpha``.
-
-    >>> round(ordinal_alpha(np.array([[2, 0, 0], [0, 1, 1], [0, 0, 2], [1, 1, 0]])), 4)
-    0.7083
-    """
-    pairable = counts[counts.sum(axis=1) >= 2]
-    totals = pairable.sum(axis=0)
-    if np.count_nonzero(totals) < 2:
-        return None
-    ranks = np.cumsum(totals) - totals / 2
-    distance = np.square(ranks[:, None] - ranks)
-    sizes = pairable.sum(axis=1)
-    observed = float((np.einsum("ic,ck,ik->i", pairable, distance, pairable) / (sizes - 1)).sum())
-    return 1.0 - observed * (int(totals.sum()) - 1) / float(totals @ distance @ totals)
 
 
 def gwet_ac1(counts: Int64Array) -> float | None:
