@@ -265,8 +265,9 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: RecipeR
         encoder = asked.encoder or experiment.encoder or recipe.encoder
         for dataset, scenes in _by_dataset(experiment, asked).items():
             parts.setdefault((dataset, encoder, experiment.stride), []).append((experiment, scenes))
-    if unused := next((name for name in asked.scenes or () if name not in {dataset for dataset, *_ in parts}), None):
-        raise ConfigError(f"--scenes: no requested table uses the dataset '{printable(unused, 60)}'")
+    used = {dataset for dataset, *_ in parts}
+    if foreign := next((name for name in asked.scenes or () if name not in used), None):
+        raise ConfigError(f"--scenes: no requested table uses the dataset '{printable(foreign, 60)}'")
     usual = asked.encoder or recipe.encoder
     runs = []
     for (dataset, encoder, stride), mine in parts.items():
