@@ -18,7 +18,6 @@ from su3d_bench.core.errors import (
     ConfigError,
     RunIncomplete,
     counted,
-    printable,
 )
 
 if TYPE_CHECKING:
@@ -69,22 +68,8 @@ def call(arguments: argparse.Namespace) -> int:
         return _list_recipes(arguments)
     recipe = load_recipe(arguments.recipe)
     experiments = recipe.chosen(arguments.tables)
-    _check_device(arguments)
     out = arguments.out or Path("reproduced") / recipe.name
     return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
-
-
-def _check_device(arguments: argparse.Namespace) -> None:
-    """Raise early if the GPU does not exist, except under Slurm, whose machines have their own."""
-    from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors import SLURM
-
-    if arguments.device is None:
-        return
-    if DEVICE.fullmatch(arguments.device) is None:
-        raise ConfigError(f"--device {printable(arguments.device, 40)}: {EXPECTED_DEVICE}")
-    if not arguments.dry_run and arguments.executor != SLURM:
-        device_for(arguments.device, 0)
 
 
 def _list_recipes(arguments: argparse.Namespace) -> int:

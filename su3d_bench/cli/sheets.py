@@ -168,13 +168,19 @@ def _add_pictures(verbs: Verbs) -> None:
 
 def _with_maps_to_draw(source: RunSource, arguments: argparse.Namespace) -> RunSource:
     """``source`` without the methods whose maps have nothing to draw, unless that is all; a remark names them."""
-    needed = "features" if arguments.draw == "similarity" else "instances"
-    has = source.has_features if needed == "features" else source.has_instances
-    left_out = [method for method in source.methods if not all(has(scene, method) for scene in source.scenes)]
+    by_feature = arguments.draw == "similarity"
+
+    def has_all(scene: str, method: str) -> bool:
+        return source.has_instances(scene, method) and (not by_feature or source.has_features(scene, method))
+
+    left_out = [method for method in source.methods if not all(has_all(scene, method) for scene in source.scenes)]
     drawn = [method for method in source.methods if method not in left_out] or source.methods
     if len(drawn) < len(source.methods):
         names = ", ".join(printable(method, 80) for method in left_out)
-        remark(f"without {names}: maps without {needed} cannot be drawn", quiet=arguments.quiet)
+        remark(
+            f"without {names}: maps without instances{' with features' if by_feature else ''} cannot be drawn",
+            quiet=arguments.quiet,
+        )
     return source.of_methods(drawn)
 
 

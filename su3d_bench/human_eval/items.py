@@ -228,7 +228,6 @@ def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> R
         raise DataError(f"{where}: invalid file for su3d-bench {maker} ({place})") from error
 
 
-GUIDE = "how to judge"
 _FOR_ALL_KINDS = (
     f"'{CANNOT_TELL}' is for what the picture does not show; it is counted separately, not as an error.",
     "Two seconds are usually enough; your first impression counts.",
