@@ -177,10 +177,8 @@ def _with_maps_to_draw(source: RunSource, arguments: argparse.Namespace) -> RunS
     drawn = [method for method in source.methods if method not in left_out] or source.methods
     if len(drawn) < len(source.methods):
         names = ", ".join(printable(method, 80) for method in left_out)
-        remark(
-            f"without {names}: maps without instances{' with features' if by_feature else ''} cannot be drawn",
-            quiet=arguments.quiet,
-        )
+        needed = "instances with features" if by_feature else "instances"
+        remark(f"without {names}: maps without {needed} cannot be drawn", quiet=arguments.quiet)
     return source.of_methods(drawn)
 
 
