@@ -93,7 +93,7 @@ def _asked(arguments: argparse.Namespace) -> RecipeRequest:
         dataset, _ = split_address(address)
         scenes[dataset] = (*scenes.get(dataset, ()), address)
     chosen = arguments.profile, arguments.encoder, arguments.device
-    return RecipeRequest(*chosen, values, tuple(arguments.set), scenes or None)
+    return RecipeRequest(*chosen, values=values, assignments=tuple(arguments.set), scenes=scenes or None)
 
 
 def _reproduce(
